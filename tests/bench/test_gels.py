@@ -9,12 +9,12 @@ import pytest
 
 from tactflow.bench.gels import GELS, left_out, measure_gels
 from tactflow.bench.labels import (
-    DotMotion,
     Label,
     compare_decisions,
     compare_first_contact,
     labels_of,
     outlines_by_eye,
+    touch_of,
 )
 from tactflow.bench.pipelines import Bench
 from tactflow.bench.quantities import Tally
@@ -74,17 +74,12 @@ def test_the_outlines_of_the_bench_belong_to_known_recordings(tmp_path: Path) ->
     assert sum(len(frames) for frames in drawn.values()) == 20
 
 
-def test_rest_and_touch_are_told_by_the_dots_whatever_the_light_does() -> None:
-    scene = open_scene("press?frames=40&settle=6&shear=0.6")
-    motion = DotMotion(0)
-    for index in range(22):
-        motion.add(scene.frame(index))
-    known = motion.touched()
-    assert (known[:4] == 0).all()
-    assert known[20] == 1
-    moved = [np.percentile(np.hypot(*np.subtract(*scene.markers(i)).T), 95) for i in range(22)]
-    assert all(known[i] == 1 for i in range(22) if moved[i] > 1.7)
-    assert all(known[i] == 0 for i in range(22) if moved[i] < 0.2)
+def test_rest_and_touch_of_a_recording_are_read(tmp_path: Path) -> None:
+    touch = touch_of(tmp_path / "franka_mini" / "ball_white_thread-1-0.avi", tmp_path)
+    assert touch is not None
+    assert touch.tolist() == [1] * 5 + [0] * 8 + [1] * 184
+    assert touch_of(tmp_path / "sts_640" / "video.mp4", tmp_path) is not None
+    assert touch_of(tmp_path / "mini_box", tmp_path) is None
 
 
 def test_decisions_count_only_where_something_is_known_and_an_early_contact_must_be_seen_in_time() -> None:

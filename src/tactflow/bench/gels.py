@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench.labels import (
-    DotMotion,
     Label,
     compare_decisions,
     compare_first_contact,
     labels_of,
     outlines_by_eye,
+    touch_of,
 )
 from tactflow.bench.lockstep import TimedResult, on_recording
 from tactflow.bench.pipelines import PIPELINE, Bench, Judge
@@ -45,7 +45,6 @@ class Gel:
     folder : a video, several, or a folder of pictures. sensor : what it is. dots : counted by eye; 0 for a
     gel without, None where nobody counted.
     rest : so many first frames show the untouched gel. touched : from this frame on it is touched, or None.
-    moves : rest and touch follow from the motion of the dots against this frame, or None.
     frames : only so many first frames are used, or None for all. every : one recording of so many is used.
     chosen : whether constants were chosen on it; the others are the test.
     """
@@ -56,7 +55,6 @@ class Gel:
     downsample: int = 1
     rest: int = 0
     touched: int | None = None
-    moves: int | None = None
     frames: int | None = None
     every: int = 1
     chosen: bool = False
@@ -81,16 +79,16 @@ _ALWAYS = 1_000_000
 """Frames; more than any of the recordings has."""
 
 GELS = (
-    Gel("franka_mini", "GelSight Mini on a gripper", None, moves=12, every=2, chosen=True),
+    Gel("franka_mini", "GelSight Mini on a gripper", None, every=2, chosen=True),
     Gel("handmade_dots", "home-made gel, painted dots of many sizes", 127, 2, rest=14, chosen=True),
-    Gel("sts_640", "See-Through-your-Skin, 640 x 480", 165, 2, moves=0, chosen=True),
+    Gel("sts_640", "See-Through-your-Skin, 640 x 480", 165, 2, chosen=True),
     Gel("mini_ball", "GelSight Mini, ball", 63, rest=1, touched=1, chosen=True),
     Gel("digit_fots", "DIGIT, ball", 0, rest=1, touched=1, chosen=True),
     Gel("gelslim_ball", "GelSlim 3.0, ball", None, rest=1, touched=1, chosen=True),
     Gel("wrs_cam1", "Osaka, fisheye", 97, rest=1, touched=1, chosen=True),
     Gel("tactip_video", "TacTip", 331, rest=29, touched=29, chosen=True),
     Gel("seu_a", "SEU GelSight, never touched", 149, 2, rest=_ALWAYS),
-    Gel("sts_torque160", "See-Through-your-Skin, 160 x 120", 150, moves=0),
+    Gel("sts_torque160", "See-Through-your-Skin, 160 x 120", 150),
     Gel("simple_marks", "home-made, strongly coloured light", 140, rest=1, touched=1),
     Gel("mini_box", "GelSight Mini, edge of a box", 0, rest=1, touched=1),
     Gel("thu_real", "THU GelSight", 0, rest=1, touched=1),
@@ -145,10 +143,10 @@ def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pi
     for gel in present(data):
         name, pipeline = bare if gel.dots == 0 else marked
         sources, scene = gel.sources(data / FOLDER), RECORDING + gel.folder
-        labels = [labels_of(source, data / FOLDER, gel.downsample, drawn) for source in sources]
-        parts = [
-            (source, partial(GelJudge, gel, known)) for source, known in zip(sources, labels, strict=True)
-        ]
+        parts = []
+        for source in sources:
+            labels = labels_of(source, data / FOLDER, gel.downsample, drawn)
+            parts.append((source, partial(GelJudge, gel, labels, touch_of(source, data / FOLDER))))
         tally = bench.measure({name: prepared(pipeline, gel.downsample)}, scene, parts)[name]
         if not {"label_distance_p50", "line_angle_p50"} & set(tally.values):
             for key in ("outline_iou_p50", "outline_iou_min"):
@@ -164,20 +162,18 @@ def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pi
 class GelJudge(Judge):
     """Compares with labels of single frames, with what is known of rest and touch, and a count of dots."""
 
-    def __init__(self, gel: Gel, labels: Mapping[int, Label], tally: Tally) -> None:
+    def __init__(
+        self, gel: Gel, labels: Mapping[int, Label], touch: NDArray[np.int8] | None, tally: Tally
+    ) -> None:
         super().__init__(tally)
-        self._gel = gel
-        self._labels = labels
+        self._gel, self._labels, self._touch = gel, labels, touch
         self._found: list[bool] = []
-        self._motion = None if gel.moves is None else DotMotion(gel.moves)
         self._dots: int | None = None
 
     def add(self, result: TimedResult) -> str:
         """Take one frame's answer; returns the kind of frame."""
         contact = result.contact
         self._found.append(contact is not None)
-        if self._motion is not None:
-            self._motion.add(result.frame.image)
         if self._dots is None and result.markers is not None:
             self._dots = len(result.markers.position)
         if result.seq in self._labels and result.image is not None:
@@ -192,11 +188,9 @@ class GelJudge(Judge):
     def finish(self) -> None:
         """Compare the decisions and the number of dots with what is known of the whole recording."""
         found, counted = np.array(self._found, np.bool_), self._gel.dots
-        if self._motion is None:
-            compare_decisions(self.tally, self._gel.known(len(found)), found)
-        else:
-            touched = self._motion.touched()
-            compare_decisions(self.tally, touched, found)
+        touched = self._gel.known(len(found)) if self._touch is None else self._touch[: len(found)]
+        compare_decisions(self.tally, touched, found)
+        if self._touch is not None:
             compare_first_contact(self.tally, touched, found)
         if counted and self._dots is not None:
             self.tally.add(

@@ -1,4 +1,4 @@
-"""What is known of recordings of real gels: outlines, circles, lines, the number and the motion of dots."""
+"""What is known of recordings of real gels: outlines, circles, lines, rest and touch."""
 
 from __future__ import annotations
 
@@ -9,21 +9,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.quantities import Tally
-from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.types import Contact
-
-REST, TOUCHED = 0.35, 1.5
-"""Below the first the gel is at rest, above the second it is touched: 95th percentile of the displacement of
-the dots, px of the raw frame. From the README of the recordings of a gripper's grasps."""
-
-_LOCAL = 41
-"""Side of the square whose mean takes the light out before dots are followed, px. Chosen by hand."""
 
 PROMPT = 4
 """Frames within which a first contact has to be seen. Chosen by hand: 0.16 s at 25 frames a second."""
@@ -94,10 +85,22 @@ def labels_of(source: Path, gels: Path, downsample: int, drawn: Polygons) -> dic
     if path.exists():
         stored = json.loads(path.read_text(encoding="utf-8"))
         return {int(frame): _label(entry) for frame, entry in stored.items()}
-    name = str(source.relative_to(gels).with_suffix("")).removesuffix("/video")
-    return {
-        frame: Label((polygon * (of / downsample),)) for frame, (of, polygon) in drawn.get(name, {}).items()
-    }
+    outlines = drawn.get(_name(source, gels), {})
+    return {frame: Label((polygon * (of / downsample),)) for frame, (of, polygon) in outlines.items()}
+
+
+def touch_of(source: Path, gels: Path) -> NDArray[np.int8] | None:
+    """(N,) for the frames of a recording: 1 touched, 0 at rest, -1 neither; None where nobody knows.
+
+    From the displacement of its dots against a frame at rest, followed by Lucas and Kanade's method in
+    grey levels without the light: 95th percentile up to 0.35 px at rest, from 1.5 px on touched.
+    """
+    runs = json.loads((files("tactflow.bench") / "gel_touch.json").read_text()).get(_name(source, gels))
+    return None if runs is None else np.repeat(*np.transpose(runs)).astype(np.int8)
+
+
+def _name(source: Path, gels: Path) -> str:
+    return str(source.relative_to(gels).with_suffix("")).removesuffix("/video")
 
 
 def _label(entry: Mapping[str, Any]) -> Label:
@@ -126,38 +129,3 @@ def compare_first_contact(tally: Tally, touched: NDArray[np.int8], found: NDArra
     begun = np.flatnonzero(touched[resting[0] :] == 1) + resting[0] if len(resting) else resting
     if len(begun) and begun[0] <= EARLY:
         tally.percent(early_found=found[begun[0] : begun[0] + PROMPT].any())
-
-
-class DotMotion:
-    """Tells rest from touch by following the dots through the raw frames, independently of the pipeline.
-
-    With Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001) on grey
-    levels divided by those around, so that a change of exposure is no motion.
-
-    reference : number of a frame that shows the gel at rest.
-    """
-
-    def __init__(self, reference: int) -> None:
-        self._reference = reference
-        self._images: list[NDArray[np.uint8]] = []
-        self._dots = np.zeros((0, 1, 2), np.float32)
-
-    def add(self, image: NDArray[np.uint8]) -> None:
-        """Take the next frame, (H, W, 3) uint8 BGR."""
-        if len(self._images) == self._reference:
-            self._dots = detect_markers(image).centers.astype(np.float32).reshape(-1, 1, 2)
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
-        around = np.maximum(cv2.blur(grey, (_LOCAL, _LOCAL)), 4.0)
-        self._images.append(np.clip(128.0 * grey / around, 0, 255).astype(np.uint8))
-
-    def touched(self) -> NDArray[np.int8]:
-        """(N,): 1 touched, 0 at rest, -1 neither."""
-        touched = np.full(len(self._images), -1, np.int8)
-        for index, image in enumerate(self._images if len(self._dots) else []):
-            start, options = self._images[self._reference], {"winSize": (15, 15), "maxLevel": 3}
-            now, found, _ = cv2.calcOpticalFlowPyrLK(start, image, self._dots, None, **options)  # type: ignore[call-overload]
-            moved = metrics.distance(now, self._dots)[found[:, 0] == 1]
-            if len(moved):
-                far = float(np.percentile(moved, 95))
-                touched[index] = 0 if far < REST else 1 if far > TOUCHED else -1
-        return touched
