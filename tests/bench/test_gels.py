@@ -123,7 +123,7 @@ def test_simulated_balls_in_the_place_of_real_ones_are_measured_against_their_ci
     result, pictures = BenchResult(quick=True), tmp_path / "pictures"
     measure_gels(Bench(result, CopyUnit(), tmp_path, pictures), marked, bare, tmp_path)
     assert not result.failures
-    (found,) = result.measurements()
+    (found,) = result.measured
     assert found.key == "pipeline/default/data:mini_ball"
     assert found.values["frames"] == 3
     assert found.errors["false_contacts"] == found.errors["missed_contacts"] == 0

@@ -62,7 +62,7 @@ def test_real_presses_are_measured_against_their_labels(shared_data: Path, tmp_p
     bench = Bench(result, CopyUnit(), tmp_path)
     measure_recordings(bench, {"default": default, "again": default}, {}, data)
     assert not result.failures
-    first, second = result.measurements()
+    first, second = result.measured
     assert first.key == "pipeline/default/data:wedge_ball"
     assert first.errors == second.errors
     assert first.errors["found_percent"] == 100

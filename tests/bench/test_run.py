@@ -44,7 +44,7 @@ def test_no_error_of_the_quick_bench_got_worse_than_the_stored_one(result: Bench
 
 
 def test_every_pipeline_and_every_method_is_timed_and_judged(result: BenchResult) -> None:
-    found = {m.key: m for m in result.measurements() if m.scene == "bright_cable"}
+    found = {m.key: m for m in result.measured if m.scene == "bright_cable"}
     for key in ("pipeline/default", "pipeline/classic", "inpaint/telea", "hull/default", "tracker/classic"):
         assert found[f"{key}/bright_cable"].values["contact_ms"] > 0
     errors = found["pipeline/default/bright_cable"].errors
@@ -112,14 +112,14 @@ def test_the_command_writes_results_and_fails_when_something_got_worse(
     assert "Whole pipelines" in out
     assert "b.html" in err
     stored = json.loads((tmp_path / "b.json").read_text())
-    assert stored["schema"] == "tactflow.bench/2"
-    assert len(stored["rows"]) == len(result.rows)
+    assert stored["schema"] == "tactflow.bench/3"
+    assert len(stored["values"]) == len(result.measured)
     assert "Whole pipelines" in (tmp_path / "b.html").read_text()
     assert "| press | default |" in (tmp_path / "b.md").read_text()
     assert main(["bench", "--quick", "--against", "e.json"]) == 0
     assert "nothing got worse" in capsys.readouterr().err
     stored = json.loads((tmp_path / "e.json").read_text())
-    stored["errors"]["pipeline/default/bright_cable"]["displacement_rms"] /= 10
+    stored["values"]["pipeline/default/bright_cable"]["displacement_rms"] /= 10
     (tmp_path / "e.json").write_text(json.dumps(stored))
     assert main(["bench", "--quick", "--against", "e.json"]) == 3
     assert "pipeline/default/bright_cable: marker displacement error" in capsys.readouterr().err

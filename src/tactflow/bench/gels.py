@@ -152,8 +152,8 @@ def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pi
             for key in ("outline_iou_p50", "outline_iou_min"):
                 together.values[key] += tally.values[key]
         if gel.dots == 0:
-            source = on_recording(prepared(marked[1], gel.downsample), sources[0])
-            bench.measure_refusal(marked[0], source, scene)
+            refusing = on_recording(prepared(marked[1], gel.downsample), sources[0])
+            bench.measure_refusal(marked[0], refusing, scene)
     if errors := together.errors():
         count = len(together.values["outline_iou_p50"])
         bench.result.add(PIPELINE, marked[0], RECORDING + OUTLINES, errors, frames=count)

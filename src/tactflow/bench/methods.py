@@ -118,8 +118,7 @@ class _Judge:
     def inpaint(self, given: _Given, found: Any) -> None:
         mask = given.ports["marker_mask"]
         if mask.any():
-            mae = metrics.masked_mae(found, given.clean, mask)
-            self.tally.add(inpaint_mae=mae, inpaint_psnr=metrics.masked_psnr(found, given.clean, mask))
+            self.tally.add(inpaint_mae=metrics.masked_mae(found, given.clean, mask))
 
     def difference(self, given: _Given, found: Any) -> None:
         if score.add_decision(self.tally, bool(found.touching), given.truth, given.deep):

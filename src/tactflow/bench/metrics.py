@@ -209,11 +209,3 @@ def flow_jumps(origin: FloatArray, displacement: FloatArray, trusted: BoolArray)
 def masked_mae(image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]) -> float:
     """Mean absolute error inside a mask (H, W) that is not empty, grey levels."""
     return float(np.mean(cv2.absdiff(image, truth)[np.asarray(mask) != 0]))
-
-
-def masked_psnr(image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]) -> float:
-    """Peak signal-to-noise ratio inside a mask (H, W) that is not empty, dB (peak 255, at most 100)."""
-    error = cv2.absdiff(image, truth)[np.asarray(mask) != 0]
-    # Equal images have no finite ratio; 100 dB is a mean squared error far below one quantisation step.
-    squared = max(float(np.mean(np.square(error, dtype=np.float64))), 255.0**2 * 1e-10)
-    return float(10 * np.log10(255.0**2 / squared))

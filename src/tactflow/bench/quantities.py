@@ -115,7 +115,6 @@ _ALL = [
     Quantity("missed_contacts", "frames with contact missed", "%", slack=4.0),
     Quantity("missed_half_depth", "contact at half depth or more missed", "%"),
     Quantity("inpaint_mae", "marker removal, mean absolute error in the mask", "grey levels", slack=0.1),
-    Quantity("inpaint_psnr", "marker removal, PSNR in the mask", "dB", MEAN, "higher", 100.0, 0.3, share=0.0),
     Quantity("depth_rms", "heights, RMS error over the greatest depth", "%", slack=0.3),
     *_within("depth", "greatest-depth errors"),
     Quantity("volume_error", "indented volume, error, mean", "%", slack=1.0),

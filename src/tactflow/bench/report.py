@@ -60,7 +60,7 @@ def write_bench_report(result: BenchResult, path: Path) -> None:
     ------
     StageError : the file cannot be written. ConfigError : matplotlib is missing.
     """
-    by_title = {TITLES.get(group, group): group for group in dict.fromkeys(row.group for row in result.rows)}
+    by_title = {TITLES.get(group, group): group for group in dict.fromkeys(m.group for m in result.measured)}
     pages = []
     for section in sections(result):
         group = by_title.get(section.title)

@@ -1,4 +1,4 @@
-"""What a run of the bench measured: rows of numbers, their JSON, and the comparison with a stored run."""
+"""What a run of the bench measured, its JSON, and the comparison with a stored run."""
 
 from __future__ import annotations
 
@@ -13,37 +13,23 @@ from typing import Any
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.engine.errors import ConfigError
 
-SCHEMA, ERRORS_SCHEMA = "tactflow.bench/2", "tactflow.bench/1"
-"""Of a whole run, and of one that was stored with its errors alone."""
+SCHEMA = "tactflow.bench/3"
 
 RECORDING = "data:"
 """What the scene name of a real recording starts with."""
 
 TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
-"""Kind of frame -> quantity of the rows that hold its median CPU time, ms."""
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One number.
-
-    group : what is compared: "pipeline", or the id of a stage. method : name of the pipeline, or of the way
-    to do the stage's work. scene : simulated scene, or `RECORDING` and the name of a recording.
-    quantity : key of `QUANTITIES`, or one of `TIMES`, or "frames" for the number of frames.
-    value : finite. unit : "" for none.
-    """
-
-    group: str
-    method: str
-    scene: str
-    quantity: str
-    value: float
-    unit: str
+"""Kind of frame -> quantity that is its median CPU time, ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """The numbers of one method on one scene. values : quantity -> value."""
+    """The numbers of one method on one scene.
+
+    group : what is compared: "pipeline", or the id of a stage. method : name of the pipeline, or of the way
+    to do the stage's work. scene : simulated scene, or `RECORDING` and the name of a recording.
+    values : key of `QUANTITIES`, or one of `TIMES`, or "frames" for the number of frames -> finite value.
+    """
 
     group: str
     method: str
@@ -78,7 +64,7 @@ class BenchResult:
     machine: dict[str, str] = field(default_factory=dict[str, str])
     copy_ms: float = math.nan
     wall_s: float = 0.0
-    rows: list[Row] = field(default_factory=list[Row])
+    measured: list[Measurement] = field(default_factory=list[Measurement])
     failures: dict[str, str] = field(default_factory=dict[str, str])
 
     def add(
@@ -92,29 +78,26 @@ class BenchResult:
         frames: int | None = None,
     ) -> None:
         """Add the errors of a method on a scene, and the median of CPU times, s, of each kind of frame."""
-        values = {key: (value, QUANTITIES[key].unit) for key, value in errors.items()}
+        values = dict(errors)
         for kind, quantity in TIMES.items():
             if samples := (times or {}).get(kind):
-                values[quantity] = 1e3 * median(samples), "ms"
+                values[quantity] = 1e3 * median(samples)
         if frames is not None:
-            values["frames"] = float(frames), ""
-        self.rows += [Row(group, method, scene, key, *value) for key, value in values.items()]
+            values["frames"] = float(frames)
+        self.measured.append(Measurement(group, method, scene, values))
 
-    def measurements(self, group: str | None = None) -> list[Measurement]:
-        """The numbers by method and scene, in the order in which they were measured; of one group, or all."""
-        found: dict[tuple[str, str, str], dict[str, float]] = {}
-        for row in self.rows:
-            if group in (None, row.group):
-                found.setdefault((row.group, row.method, row.scene), {})[row.quantity] = row.value
-        return [Measurement(*key, values) for key, values in found.items()]
+    def measurements(self, group: str) -> list[Measurement]:
+        """The numbers of one group, in the order in which they were measured."""
+        return [measurement for measurement in self.measured if measurement.group == group]
 
     def errors(self) -> dict[str, dict[str, float]]:
         """group/method/scene -> quantity -> error."""
-        return {m.key: m.errors for m in self.measurements() if m.errors}
+        return {m.key: m.errors for m in self.measured if m.errors}
 
     def save(self, path: Path) -> None:
         """Write everything as JSON."""
-        _write(path, {"schema": SCHEMA, **asdict(self)})
+        run = {name: value for name, value in asdict(self).items() if name != "measured"}
+        _write(path, {"schema": SCHEMA, **run, "values": {m.key: m.values for m in self.measured}})
 
     def save_errors(self, path: Path) -> None:
         """Write only the errors, which do not depend on the machine, to compare a later run with."""
@@ -122,7 +105,7 @@ class BenchResult:
             key: {name: float(f"{value:.6g}") for name, value in sorted(values.items())}
             for key, values in self.errors().items()
         }
-        _write(path, {"schema": ERRORS_SCHEMA, "quick": self.quick, "errors": errors})
+        _write(path, {"schema": SCHEMA, "quick": self.quick, "values": errors})
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:
@@ -144,16 +127,16 @@ def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON: {error}") from error
-    numbers = {SCHEMA: "rows", ERRORS_SCHEMA: "errors"}
-    if not isinstance(stored, dict) or numbers.get(str(stored.get("schema"))) not in stored:
+    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or "values" not in stored:
         raise ConfigError(f'{path}: not a result of `tactflow bench` (required "schema": "{SCHEMA}")')
     if stored["quick"] != quick:
         kind = "quick" if stored["quick"] else "full"
         raise ConfigError(f"{path}: is the result of a {kind} run; compare it with a {kind} run")
-    if "errors" in stored:
-        errors: dict[str, dict[str, float]] = stored["errors"]
-        return errors
-    return BenchResult(quick, rows=[Row(**row) for row in stored["rows"]]).errors()
+    errors = {
+        key: {name: v for name, v in values.items() if name in QUANTITIES}
+        for key, values in stored["values"].items()
+    }
+    return {key: values for key, values in errors.items() if values}
 
 
 def regressions(
@@ -174,8 +157,8 @@ def regressions(
         if scene not in measured and left_out:
             continue
         for name, value in errors.items():
-            quantity, current = QUANTITIES.get(name), now.get(key, {}).get(name)
-            if quantity is not None and (current is None or quantity.is_worse(current, value)):
+            quantity, current = QUANTITIES[name], now.get(key, {}).get(name)
+            if current is None or quantity.is_worse(current, value):
                 found = "no longer measured" if current is None else f"now {current:.4g}"
                 allowed = quantity.allowed(value)
                 worse.append(f"{key}: {quantity.title}: was {value:.4g}, allowed {allowed:.4g}, {found}")

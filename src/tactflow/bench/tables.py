@@ -78,7 +78,7 @@ def sections(result: BenchResult) -> list[Section]:
         f"A {kind} run of {result.wall_s:.0f} s on {machine}. Times are CPU times of a frame in one thread, "
         f"medians; one copy of a raw frame of 800 x 600 px took {result.copy_ms:.3f} ms."
     )
-    groups = dict.fromkeys(row.group for row in result.rows)
+    groups = dict.fromkeys(m.group for m in result.measured)
     found = [Section("Machine", summary), *(methods(result, group) for group in groups)]
     found += [_scenes(result), *_recordings(result), *_gels(result)]
     if result.failures:
@@ -123,7 +123,7 @@ def _recordings(result: BenchResult) -> Iterator[Section]:
     """One row for each recording of the Wedge and each pipeline."""
     gels = {RECORDING + gel.folder for gel in GELS} | {RECORDING + OUTLINES}
     rows = []
-    for m in result.measurements():
+    for m in result.measured:
         if m.scene.startswith(RECORDING) and m.scene not in gels:
             errors = (f"{QUANTITIES[key].heading}: {format_number(v)}" for key, v in m.errors.items())
             rows.append([m.scene.removeprefix(RECORDING), m.method, _time(m), "; ".join(errors)])
