@@ -7,12 +7,12 @@ import json
 import logging
 import os
 import select
-import stat
 import sys
 import time
 from collections import deque
 from contextlib import suppress
 from io import BytesIO, UnsupportedOperation
+from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
@@ -62,19 +62,15 @@ class LineStream:
 
     path : the named pipe or device, for whose reader the constructor waits; "-" is standard output.
     control : the run, which knows whether it is live, and whether it is to end; or None.
+    delivered, dropped : lines. ended : there is no reader (any more), which is no error.
 
     Raises
     ------
-    StageError : the pipe cannot be opened.
-
-    Attributes
-    ----------
-    delivered, dropped : lines. ended : there is no reader (any more), which is no error.
+    StageError : from every method, if the pipe cannot be opened or written.
     """
 
     def __init__(self, path: str, control: Control | None = None) -> None:
-        self.delivered = 0
-        self.dropped = 0
+        self.delivered = self.dropped = 0
         self.ended = False
         self._control = control
         self._name = "standard output" if path == "-" else path
@@ -83,22 +79,19 @@ class LineStream:
         self._file: BinaryIO = sys.stdout.buffer if path == "-" else self._open(expanded(path))
 
     def _open(self, path: Path) -> BinaryIO:
-        waiting = False
-        while True:
+        for attempt in count():
             try:
-                number = _open_pipe(path)
+                return os.fdopen(_open_pipe(path), "wb", buffering=0)
             except OSError as error:
-                if error.errno != errno.ENXIO or not stat.S_ISFIFO(path.stat().st_mode):
+                if error.errno != errno.ENXIO or not path.is_fifo():
                     raise cannot_write(path, error) from error
-            else:
-                return os.fdopen(number, "wb", buffering=0)
-            if not waiting:
-                waiting = True
+            if attempt == 0:
                 log.info("%s: waits for a reader", path)
             if self._hurried():
-                self.ended = True
-                return BytesIO()
+                break
             time.sleep(LOOK_EVERY)
+        self.ended = True
+        return BytesIO()
 
     def _live(self) -> bool:
         source = None if self._control is None else self._control.source
@@ -108,12 +101,7 @@ class LineStream:
         return self._control is not None and self._control.hurried
 
     def send(self, line: bytes) -> None:
-        """Add a line, without its end, and write what the reader takes.
-
-        Raises
-        ------
-        StageError : it cannot be written.
-        """
+        """Add a line, without its end, and write what the reader takes."""
         self._lines.append(line + b"\n")
         self._write(0.0)
         while len(self._lines) > MOST_WAITING:
@@ -126,9 +114,7 @@ class LineStream:
     def close(self) -> None:
         """Write the rest, for `LINGER` if nobody waits for the reader, and close the file.
 
-        Raises
-        ------
-        StageError : it cannot be written, or the reader did not take all lines of a recording.
+        Also raises StageError if the reader did not take all lines of a recording.
         """
         try:
             if not self.ended:
@@ -183,15 +169,12 @@ class LineFile:
     """Writes whole lines to a regular file, and notices what other programs do to it.
 
     path : the file; created with its folder. replaces : empty it first. Otherwise lines are added after its
-    last complete line. every : longest time that lines wait before they are written, s.
+    last complete line. every : longest time that lines wait before they are written, s. delivered : lines.
 
     Raises
     ------
-    StageError : it cannot be written, or does not end with a result message.
-
-    Attributes
-    ----------
-    delivered : lines.
+    StageError : from every method, if it cannot be written; it then ends with the last line that fitted. Or
+        another program has removed or replaced it, or it does not end with a result message.
     """
 
     ended = False
@@ -217,13 +200,7 @@ class LineFile:
             raise
 
     def send(self, line: bytes) -> None:
-        """Add a line, without its end.
-
-        Raises
-        ------
-        StageError : it cannot be written; the file then ends with the last line that fitted. Or another
-        program has removed or replaced the file.
-        """
+        """Add a line, without its end."""
         self._waiting.append(line + b"\n")
         now = time.monotonic()
         if now - self._written >= self._every:
@@ -231,7 +208,7 @@ class LineFile:
             self._write()
 
     def close(self) -> None:
-        """Write what is left and close the file. Raises StageError as `send` does."""
+        """Write what is left and close the file."""
         try:
             self._write()
         finally:
