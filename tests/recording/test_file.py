@@ -140,17 +140,9 @@ def test_results_are_valid_under_the_schema_in_the_file(tmp_path: Path) -> None:
 
 
 def test_the_schema_for_plots_has_one_type_everywhere_and_no_references() -> None:
-    def check(part: dict[str, Any], path: str) -> None:
-        assert isinstance(part["type"], str), path
-        assert not {"$ref", "anyOf", "prefixItems", "const"} & set(part), path
-        for name, field in part.get("properties", {}).items():
-            check(field, f"{path}.{name}")
-        if part["type"] == "array":
-            check(part["items"], f"{path}[]")
-
     plain = plain_schema(message_schema())
-    assert plain["type"] == "object"
-    check(plain, "")
+    text = json.dumps(plain)
+    assert not [key for key in ("$ref", "$defs", "anyOf", "prefixItems", "const") if f'"{key}"' in text]
     assert plain["properties"]["contact"]["properties"]["area"]["type"] == "number"
     assert plain["properties"]["markers"]["properties"]["position"]["items"]["items"]["type"] == "number"
 
@@ -162,33 +154,20 @@ def without_nulls(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1), (480, 640)])
-def test_pixels_come_back_whatever_the_size(shape: tuple[int, int]) -> None:
-    random = np.random.default_rng(0)
-    for pixels in (random.integers(0, 256, (*shape, 3), np.uint8), np.full((*shape, 3), 255, np.uint8)):
-        packed = encode_frame(Frame("main", 3, 0.1, pixels, epoch=2))
-        stored = parse_frame(packed)
+def test_pixels_come_back_whatever_the_size_and_also_of_a_view(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    for pixels in (noise, np.full((*shape, 3), 255, np.uint8), np.repeat(noise, 2, axis=1)[::-1, ::2]):
+        stored = parse_frame(encode_frame(Frame("main", 3, 0.1, pixels, epoch=2)))
         np.testing.assert_array_equal(decode_pixels(stored), pixels)
         assert (stored.seq, stored.t, stored.epoch, stored.reference) == (3, 0.1, 2, False)
 
 
-def test_a_view_of_an_image_is_recorded_as_it_looks() -> None:
-    whole = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
-    view = whole[::-2, 3:20:3]
-    stored = parse_frame(encode_frame(Frame("main", 0, 0.0, view)))
-    np.testing.assert_array_equal(decode_pixels(stored), view)
-
-
-def test_damaged_pixels_are_refused() -> None:
+def test_a_frame_that_is_damaged_or_of_another_kind_is_refused() -> None:
     packed = encode_frame(Frame("main", 0, 0.0, np.full((9, 9, 3), 7, np.uint8)))
     with pytest.raises(ValueError, match="damaged"):
         decode_pixels(parse_frame(packed[:-1] + bytes([packed[-1] ^ 1])))
-
-
-def test_a_frame_of_another_time_or_packing_is_refused() -> None:
-    raw = RawFrame.FromString(encode_frame(Frame("main", 0, 0.0, np.zeros((9, 9, 3), np.uint8))))
     for name, value in (("t", float("nan")), ("t", 1e300), ("codec", "other"), ("encoding", "")):
-        changed = RawFrame()
-        changed.CopyFrom(raw)
+        changed = RawFrame.FromString(packed)
         setattr(changed, name, value)
         with pytest.raises(ValueError, match="required"):
             parse_frame(changed.SerializeToString())

@@ -91,14 +91,13 @@ def chunk(data: bytes, compression: str, size: int) -> bytes:
         (b"no such thing", "zstd", 100),
         (b"no such thing", "lz4", 100),
         (bytes(range(1, 101)), "", 1 << 60),
-        (lz4.frame.compress(bytes(1 << 29)), "lz4", 1 << 29),
         (lz4.frame.compress(bytes(1 << 29)), "lz4", 100),
         (zstandard.compress(bytes(1 << 24)), "zstd", 1 << 24),
         (b"\x80" + bytes(8), "", 9 * 2_000_000),
     ],
     ids=[
         *("absurd size", "garbage", "lz4 garbage", "plain garbage"),
-        *("too large", "larger than it says", "records of kind 0", "too few bytes"),
+        *("larger than it says", "records of kind 0", "too few bytes"),
     ],
 )
 def test_a_chunk_that_cannot_be_unpacked_is_passed_over(
