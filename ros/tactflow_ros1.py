@@ -61,8 +61,12 @@ def main():
     socket.connect(endpoint)
     while not rospy.is_shutdown():
         if socket.poll(100):
-            message = json.loads(socket.recv().partition(b" ")[2])
-            t = message["t"]
+            try:
+                message = json.loads(socket.recv().partition(b" ")[2])
+                t = message["t"]
+            except (ValueError, TypeError, KeyError, RecursionError):
+                rospy.logwarn_throttle(10, f"{endpoint}: a message that is not tactflow's")
+                continue
             head = Header(stamp=rospy.Time(math.floor(t), round(t % 1 * 1e9)), frame_id=frame_id)
             publish(topics, message, head)
 

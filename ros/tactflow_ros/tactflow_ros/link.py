@@ -77,7 +77,7 @@ def send_command(endpoint: str, command: str, keys: str, seconds: float) -> tupl
         try:
             answer = json.loads(socket.recv())
             return bool(answer["ok"]), str(answer["message"])
-        except (ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError, RecursionError):
             return False, f"{endpoint}: not an answer of tactflow"
 
 

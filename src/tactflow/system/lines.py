@@ -254,7 +254,7 @@ def _complete_last_line(file: BinaryIO, path: Path) -> int:
     try:
         json.loads(rest)
         file.write(b"\n")
-    except ValueError:
+    except (ValueError, RecursionError):
         # A power cut may leave NULs. Anything else belongs to another program, or to the user.
         if not rest.startswith(b"{") and rest.strip(b"\0"):
             raise StageError(
