@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ import numpy as np
 import pytest
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.pace import REST, Pace
+from tactflow.sources.base import FrameReader
+from tactflow.sources.pace import LONGEST_GAP, REST, Pace
 from tactflow.stages.capture import Capture
 from tests.clock import PATIENCE, ManualClock
 
@@ -237,6 +239,47 @@ def test_after_a_long_interruption_the_recording_continues_instead_of_rushing() 
     assert clock.now() - resumed == pytest.approx(0.1, abs=1e-9)
 
 
+def test_a_gap_of_more_than_a_minute_is_skipped_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    clock = ManualClock()
+    pace = Pace(threading.Event(), clock)
+    shown = []
+    for t in (0.0, 0.1, 0.1 + LONGEST_GAP, 1e9, 1e9 + 0.1):
+        assert pace.wait_for(t)
+        shown.append(clock.now() - shown[0] if shown else clock.now())
+    # 1e-6 s: rounding at 1e9 s.
+    np.testing.assert_allclose(np.diff(shown)[1:], [LONGEST_GAP, 0.0, 0.1], atol=1e-6)
+    assert [record.getMessage() for record in caplog.records] == [
+        "the recording pauses for 1e+09 s, which is skipped"
+    ]
+
+
+class _Stamped(FrameReader):
+    """Frames at given times."""
+
+    def __init__(self, times: list[float]) -> None:
+        super().__init__("stamped")
+        self.times = times
+
+    def _frames(self) -> Iterator[tuple[Any, ...]]:
+        for t in self.times:
+            yield np.zeros((8, 8, 3), np.uint8), t
+
+
+def test_times_that_run_back_are_counted_on_with_a_warning_and_a_count(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    times = [0.0, 0.1, 0.05, 0.15, 9e8, 0.2, 0.3]
+    stage = Capture(Capture.Params(source="stamped"), opener=lambda *_args, **_words: _Stamped(times))
+    stage.open()
+    counted = [frame.t for frame in stage.frames()]
+    # 1e-6 s: rounding at 9e8 s.
+    np.testing.assert_allclose(counted, [0.0, 0.1, 0.1, 0.2, 9e8 + 0.05, 9e8 + 0.05, 9e8 + 0.15], atol=1e-6)
+    assert [record.getMessage() for record in caplog.records] == [
+        "stamped: its times run back by 0.05 s; they are counted on from there",
+        "stamped: its times ran back at 2 frames",
+    ]
+
+
 def _played(times: list[float], reading: float) -> tuple[list[float], list[float]]:
     """When reading of each frame began, and when it was shown; nothing but reading and waiting takes time."""
     clock = ManualClock()
@@ -264,7 +307,10 @@ def test_reading_that_cannot_keep_up_is_not_slowed_down() -> None:
     np.testing.assert_allclose(begun[4:], shown[3:-1], atol=1e-9)
 
 
-def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(recording: str) -> None:
+def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(
+    recording: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactflow.sources.pace.LONGEST_GAP", np.inf)
     # At this rate the second frame is due after 1000 s; the test's own time limit is far shorter.
     stage = capture(recording, realtime=True, fps=0.001)
     frames = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -142,18 +143,30 @@ class CapturedFrames:
             held = []
 
     def _paced(self, read: Callable[[], Any]) -> Iterator[Any]:
-        """What `read` returns, each at its time if the recording is played at its own pace."""
+        """What `read` returns, at times that never run back, and at its own pace if that is asked for."""
         pace = Pace(self.stop) if self.realtime and not self.source.live else None
+        latest, ahead, steps_back = -math.inf, 0.0, 0
         while not self.stop.is_set():
             if pace is not None and not pace.wait_to_read():
-                return
+                break
             item = read()
             if item is None:
-                return
-            due = len(item) < 3 or item[2].paced
-            if pace is not None and due and not pace.wait_for(item[1]):
-                return
-            yield item
+                break
+            image, t, *stamp = item
+            t += ahead
+            if not stamp or stamp[0].paced:
+                if t < latest:
+                    if not steps_back:
+                        text = "%s: its times run back by %.3g s; they are counted on from there"
+                        logger.warning(text, self.name, latest - t)
+                    steps_back += 1
+                    ahead, t = ahead + latest - t, latest
+                latest = t
+                if pace is not None and not pace.wait_for(t):
+                    break
+            yield image, t, *stamp
+        if steps_back:
+            logger.warning("%s: its times ran back at %d frames", self.name, steps_back)
 
     def _first_frames(self) -> FirstFrames | None:
         """What examines the first frames of a live source; None if they are handed out at once."""

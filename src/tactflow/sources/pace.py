@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 
@@ -13,6 +14,11 @@ earlier takes the processor from the work on the last one, which no camera does.
 MAX_BACKLOG = 0.5
 """A recording that falls further behind than this, s, continues from there: a laptop was asleep, or the
 process was halted, and rushing through what was missed would help nobody. Chosen by hand."""
+LONGEST_GAP = 60.0
+"""A recording that pauses for longer, s, is continued at once: nobody waits for a wrong clock. Chosen by
+hand."""
+
+logger = logging.getLogger("tactflow")
 
 
 class Pace:
@@ -46,9 +52,12 @@ class Pace:
         return not self._clock.sleep(max(due - self._clock.now(), 0.0), self._stop)
 
     def wait_for(self, t: float) -> bool:
-        """Wait until time t of the recording, s; False if stopped meanwhile."""
+        """Wait until time t of the recording, s; False if stopped meanwhile. Skips gaps of a minute."""
         now = self._clock.now()
-        if self._start is None or self._start + t - now < -MAX_BACKLOG:
+        if self._start is not None and t - self._last > LONGEST_GAP:
+            logger.warning("the recording pauses for %.3g s, which is skipped", t - self._last)
+            self._start = now - t
+        elif self._start is None or self._start + t - now < -MAX_BACKLOG:
             self._start = now - t
         elif t > self._last:
             # The shortest so far: after a gap, where frames were dropped, the next one is not late.
