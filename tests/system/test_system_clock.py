@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from tactflow.sources.simulated import Simulated
+from tactflow.sources import open_source
 from tactflow.sources.watch import Watch, Watched
 from tests.conftest import REPOSITORY
 
@@ -16,7 +16,7 @@ from tests.conftest import REPOSITORY
 def test_a_watched_source_takes_no_step_for_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     steps = iter([1e9 + (-1) ** look * 3.2e7 for look in range(1000)])
     monkeypatch.setattr(time, "time", lambda: next(steps))
-    source = Watched(lambda: Simulated("sim:idle?frames=1000"), Watch(), "example")
+    source = Watched(lambda: open_source("sim:idle?frames=1000"), Watch(), "example")
     times = []
     for _ in range(10):
         item = source.read()

@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import cast
 
 from tactflow.engine.errors import SourceError
+from tactflow.recording import missing_packages
 from tactflow.sources.base import FrameReader, StampedReader
 from tactflow.sources.devices import Camera, CameraRequest, Stream
 from tactflow.sources.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_image, open_file
+from tactflow.sources.memory import MemoryFrames
 from tactflow.sources.paths import locate, split_prefix
 from tactflow.sources.watch import Arrival, Watch, Watched
 from tactflow.system.files import is_utf8
@@ -101,9 +103,7 @@ def open_source(
     if not spec:
         raise SourceError(f"the source is empty; required one of: {KINDS}")
     if spec.startswith("sim:"):
-        from tactflow.sources.simulated import Simulated
-
-        return Simulated(spec)
+        return _open_scene(spec)
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]+)://", spec)
     if scheme is not None:
         name, word = public_address(spec), scheme[1].lower()
@@ -118,10 +118,26 @@ def open_source(
     return opener() if watch is None else Watched(opener, watch, name)
 
 
+def _open_scene(spec: str) -> FrameReader:
+    from tactflow.sim import open_scene
+
+    try:
+        scene = open_scene(spec.removeprefix("sim:"))
+    except ValueError as error:
+        raise SourceError(f"{spec}: {error}") from error
+    reader = MemoryFrames(map(scene.frame, range(len(scene))), scene.fps)
+    reader.name, reader.size, reader.total = spec, scene.size, len(scene)
+    reader.description = f"{spec}, {reader.total} frames at {scene.fps:g} fps"
+    return reader
+
+
 def _open_recording(spec: str, directory: Path | None, fps: float | None) -> FrameReader:
     name, _, query = (spec, "", "") if locate(spec, directory) else spec.partition("?")
     is_pattern = glob.has_magic(name) and locate(name, directory) is None
     if name.lower().endswith(".mcap") and not query.startswith("topic=") and not is_pattern:
+        problem = missing_packages()
+        if problem is not None:
+            raise SourceError(f"{spec}: {problem}")
         from tactflow.sources.mcap import Recording
 
         return Recording(spec, directory)

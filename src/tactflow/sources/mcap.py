@@ -5,18 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tactflow.engine.errors import SourceError
-from tactflow.recording import missing_packages
+from tactflow.recording.frames import RawFrame, decode_pixels, nanoseconds, parse_frame
+from tactflow.recording.reader import look_into, messages
+from tactflow.recording.records import DAMAGE, NotARecordingError
 from tactflow.sources.base import BgrImage, Stamp, StampedReader, damaged, log
 from tactflow.sources.paths import describe_settings, find_path, split_query
-
-if TYPE_CHECKING:
-    from mcap.records import Message
-
-    from tactflow.recording.frames import RawFrame
-    from tactflow.recording.reader import Contents
 
 SETTINGS = {"start": "SECONDS (from the beginning)"}
 
@@ -42,13 +37,16 @@ class Recording(StampedReader):
     """
 
     def __init__(self, spec: str, directory: Path | None = None) -> None:
-        problem = missing_packages()
-        if problem is not None:
-            raise SourceError(f"{spec}: {problem}")
         name, start = _parse(spec, directory)
         self._path = find_path(name, directory)
         super().__init__(str(self._path))
-        contents = self._contents = _look_into(self._path)
+        try:
+            contents = look_into(self._path)
+        except NotARecordingError as error:
+            raise SourceError(f"{self._path}: {error}") from None
+        except OSError as error:
+            raise damaged(self.name, error) from error
+        self._frame_topic, self._reference_topic = contents.frame_topic, contents.reference_topic
         seconds = ((contents.end or 0) - (contents.start or 0)) / 1e9
         self._start = None if not start or contents.start is None else contents.start + round(start * 1e9)
         length = "" if contents.end is None else f"; it is {seconds:g} s long"
@@ -67,65 +65,35 @@ class Recording(StampedReader):
 
     def _frames(self) -> Iterator[tuple[BgrImage, float, Stamp]]:
         """Each frame, its time, and its stamp."""
-        from tactflow.recording.frames import decode_pixels
-        from tactflow.recording.records import DAMAGE
-
+        self._picture = str(self._path)
         try:
             for frame, paced in self._stored_frames():
                 self._picture = f"{self._path}, frame {frame.seq}"
-                try:
-                    image = decode_pixels(frame)
-                except ValueError as error:
-                    raise SourceError(f"{self._picture}: {error}") from error
+                image = decode_pixels(frame)
                 yield image, frame.t, Stamp(frame.seq, frame.reference, frame.epoch, paced)
         except DAMAGE as error:
             raise SourceError(
-                f"{self._path}: is damaged ({error or type(error).__name__}); "
-                "tactflow repair keeps all that is intact"
+                f"{self._picture}: cannot be played: {error or type(error).__name__}; "
+                "if the file is damaged, tactflow repair keeps all that is intact"
             ) from error
 
     def _stored_frames(self) -> Iterator[tuple[RawFrame, bool]]:
         """The frames, and whether each comes at its time (True) or ahead of it."""
-        from tactflow.recording.frames import nanoseconds
-        from tactflow.recording.reader import messages
-
-        contents, start = self._contents, self._start
-        topics = {contents.frame_topic, contents.reference_topic}
-        played = messages(self._path, topics, start=start)
-        if start is not None:
+        played = messages(self._path, {self._frame_topic, self._reference_topic}, start=self._start)
+        if self._start is not None:
             first = next(played, None)
             if first is None:
                 return
-            before = messages(self._path, {contents.reference_topic}, end=start)
-            references = [self._stored(message) for message in before]
+            before = messages(self._path, {self._reference_topic}, end=self._start)
+            references = [parse_frame(message.data) for message in before]
             epoch = max((frame.epoch for frame in references), default=0)
             yield from ((frame, False) for frame in references if frame.epoch == epoch)
             played = chain([first], played)
         for message in played:
-            frame = self._stored(message)
+            frame = parse_frame(message.data)
             # A recording begun late brings the references of before, at the time it began.
             late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
             yield frame, not late and frame.seq >= 0
-
-    def _stored(self, message: Message) -> RawFrame:
-        from tactflow.recording.frames import parse_frame
-
-        try:
-            return parse_frame(message.data)
-        except ValueError as error:
-            raise SourceError(f"{self._path}, {message.log_time / 1e9:g} s: {error}") from error
-
-
-def _look_into(path: Path) -> Contents:
-    from tactflow.recording.reader import look_into
-    from tactflow.recording.records import NotARecordingError
-
-    try:
-        return look_into(path)
-    except NotARecordingError as error:
-        raise SourceError(f"{path}: {error}") from None
-    except OSError as error:
-        raise damaged(str(path), error) from error
 
 
 def _parse(spec: str, directory: Path | None) -> tuple[str, float]:

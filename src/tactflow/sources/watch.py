@@ -114,8 +114,8 @@ class Watched(FrameReader):
     --------
     Any reader can stand for a camera:
 
-    >>> from tactflow.sources.simulated import Simulated
-    >>> source = Watched(lambda: Simulated("sim:idle?frames=100"), Watch(), "example")
+    >>> from tactflow.sources import open_source
+    >>> source = Watched(lambda: open_source("sim:idle?frames=100"), Watch(), "example")
     >>> image, t = source.read()
     >>> image.shape, source.state
     ((600, 800, 3), 'running')
