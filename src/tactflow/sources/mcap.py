@@ -73,8 +73,8 @@ class Recording(StampedReader):
                 yield image, frame.t, Stamp(frame.seq, frame.reference, frame.epoch, paced)
         except DAMAGE as error:
             raise SourceError(
-                f"{self._picture}: cannot be played: {error or type(error).__name__}; "
-                "if the file is damaged, tactflow repair keeps all that is intact"
+                f"{self._picture}: is damaged ({error or type(error).__name__}); "
+                "tactflow repair keeps all that is intact"
             ) from error
 
     def _stored_frames(self) -> Iterator[tuple[RawFrame, bool]]:
