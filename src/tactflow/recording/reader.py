@@ -37,26 +37,25 @@ def look_into(path: Path) -> Contents:
 
     Raises NotARecordingError if it holds none that tactflow recorded, OSError if it cannot be read.
     """
+    found = Summary()
+    start = None
     with path.open("rb") as file:
         summary = read_summary(file)
-        found = Summary() if summary is None else summary
-        if found.statistics is None:
-            start = None
-            # Its channels are described before its first message.
-            for record in intact_records(file):
-                if isinstance(record, Schema):
-                    found.schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    found.channels[record.id] = record
-                elif isinstance(record, Message):
-                    start = record.log_time
-                    break
-            return Contents(summary is not None, *_frame_topics(found), None, start, None)
-    topics, counts = _frame_topics(found), found.statistics.channel_message_counts
+        # Its channels are described before its first message.
+        for record in intact_records(file):
+            if isinstance(record, Schema):
+                found.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                found.channels[record.id] = record
+            elif isinstance(record, Message):
+                start = record.log_time
+                break
+    topics = _frame_topics(found)
+    if summary is None or summary.statistics is None:
+        return Contents(summary is not None, *topics, None, start, None)
+    counts = summary.statistics.channel_message_counts
     count = sum(counts.get(channel.id, 0) for channel in found.channels.values() if channel.topic in topics)
-    return Contents(
-        True, *topics, count, found.statistics.message_start_time, found.statistics.message_end_time
-    )
+    return Contents(True, *topics, count, start, summary.statistics.message_end_time)
 
 
 def _frame_topics(found: Summary) -> tuple[str, str]:

@@ -16,7 +16,6 @@ from mcap.records import (
     Attachment,
     Channel,
     Chunk,
-    DataEnd,
     Footer,
     Header,
     McapRecord,
@@ -43,7 +42,7 @@ RECORD_HEAD = 9
 MOST_RECORDS = 1_000_000
 """Records of a chunk, above which it counts as damaged: hours of a sensor's messages."""
 
-_DATA = (Attachment, Channel, DataEnd, Header, Message, Metadata, Schema)
+_DATA = (Attachment, Channel, Header, Message, Metadata, Schema)
 """All records outside of chunks but the index, which follows from the rest."""
 
 
@@ -73,6 +72,9 @@ def read_summary(file: BinaryIO) -> Summary | None:
 def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
     """Every intact record of a file but its index, those of a chunk one by one, and the damage between them.
 
+    Schemas and channels that the index describes come after the header too: their chunk may be damaged. The
+    footer comes only where there is an index.
+
     A damaged chunk is passed over. Where the length of a record is damaged, reading goes on at the next
     chunk that the index names; without an index it ends there. Memory is bounded by the largest chunk.
 
@@ -81,7 +83,9 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
     NotARecordingError : it is not an MCAP file. OSError : it cannot be read.
     """
     summary = read_summary(file)
-    chunks = [] if summary is None else sorted(chunk.chunk_start_offset for chunk in summary.chunk_indexes)
+    index = Summary() if summary is None else summary
+    described = [*index.schemas.values(), *index.channels.values()]
+    chunks = sorted(chunk.chunk_start_offset for chunk in index.chunk_indexes)
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
@@ -93,12 +97,16 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
         try:
             for record in reader.records:
                 start, at = at, file.tell()
-                if isinstance(record, Footer):
-                    return
+                if not isinstance(record, Header):
+                    yield from described
+                    described = []
                 if isinstance(record, Chunk):
                     yield from _unpacked(record, Damage(start, at))
                 elif isinstance(record, _DATA):
                     yield record
+                elif isinstance(record, Footer):
+                    yield from [] if summary is None else [record]
+                    return
         except DAMAGE:
             after = next((chunk for chunk in chunks if chunk > at), size)
             if at < after:

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.records import Attachment, Channel, DataEnd, Header, McapRecord, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Footer, Header, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from tactflow.recording.records import Damage, intact_records, read_summary
+from tactflow.recording.records import Damage, intact_records
 
 CHUNK_BYTES = 1 << 22
 """Size of the copy's chunks, bytes, as other writers choose it."""
@@ -37,31 +37,26 @@ def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -
     Raises NotARecordingError if it is not an MCAP file, OSError if one cannot be read or the other written.
     """
     messages = lost = 0
-    whole = False
+    has_index = False
     with path.open("rb") as source, out.open("wb") as target:
-        writer = Writer(target, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
-        summary = read_summary(source)
         records = intact_records(source)
         first = next(records, None)
         header = first if isinstance(first, Header) else Header("", "")
+        writer = Writer(target, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         writer.start(header.profile, header.library)
         copy = _Copy(writer)
-        if summary is not None:
-            # The chunk that describes them may be damaged.
-            for described in (*summary.schemas.values(), *summary.channels.values()):
-                copy.add(described)
         for record in (first, *records):
             if isinstance(record, Damage):
                 lost += record.end - record.start
             elif record is not None:
                 messages += copy.add(record)
-                whole = whole or isinstance(record, DataEnd)
+                has_index = isinstance(record, Footer)
             if report is not None:
                 report(source.tell())
         writer.finish()  # type: ignore[no-untyped-call]
         target.flush()
         os.fsync(target.fileno())
-    return Repaired(whole and summary is not None and not lost, messages, lost)
+    return Repaired(has_index and not lost, messages, lost)
 
 
 class _Copy:
