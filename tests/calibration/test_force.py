@@ -112,16 +112,6 @@ def test_a_gauge_with_one_axis_that_writes_zeros_for_the_others_gives_no_drag() 
     assert fit.entry.press == fit_force(watched, references).entry.press
 
 
-def test_hysteresis_is_the_gap_between_pressing_and_letting_go() -> None:
-    watched, references = sessions(range(3))
-    assert (fit_force(watched, references).entry.press.hysteresis or 0) < 0.05
-    slack = {}
-    for name, one in references.items():
-        falling = np.gradient(one.force[:, 2]) < 0
-        slack[name] = replace(one, force=one.force * np.where(falling, 0.6, 1.0)[:, None])
-    assert (fit_force(watched, slack).entry.press.hysteresis or 0) > 0.1
-
-
 def test_a_contact_larger_than_all_of_the_fit_is_out_of_range() -> None:
     model = fit_force(*sessions(range(3))).entry.model()
     largest = dict(model.press.greatest)

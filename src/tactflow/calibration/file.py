@@ -99,10 +99,11 @@ class LinearForceEntry(_Entry):
     """A force that is linear in features, and its errors on forces that the fit has not seen.
 
     stiffness, greatest, error : see `LinearForce`. range : least and largest force of the fit, N.
-    rmse : RMS error, N. r2 : share of the variance that is explained. hysteresis : mean distance between the
-    force while it grows and while it falls at the same prediction, over the largest of its press; None where
-    no press shows both.
+    rmse : RMS error, N. r2 : share of the variance that is explained.
     """
+
+    # Earlier files have the hysteresis, too.
+    model_config = ConfigDict(extra="ignore")
 
     stiffness: dict[str, float]
     greatest: dict[str, float]
@@ -110,7 +111,6 @@ class LinearForceEntry(_Entry):
     range: Pair
     rmse: float
     r2: float
-    hysteresis: float | None = None
 
     def model(self) -> LinearForce:
         """The model that the stage `force` evaluates."""

@@ -8,9 +8,9 @@ not seen: each recording in turn is left out, or each press where there are too 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,6 @@ FEWEST_RECORDINGS: Final = 3
 """Recordings from which on whole ones are left out to judge the fit. Chosen by hand."""
 GAP: Final = 3
 """Frames without a contact that do not end a press: a light one flickers. Chosen by hand."""
-LEVELS: Final = 20
-"""Levels of the force at which hysteresis is looked at. Chosen by hand."""
 RATIOS: Final = np.concatenate([[0.0], np.logspace(-3, 1, 41)])
 """Relative over absolute part of the standard error that are tried, per N."""
 
@@ -55,15 +53,6 @@ class Watched:
     change_at_rest: float
 
 
-class _Moment(NamedTuple):
-    """A frame. features : of the contact, None without one. change : see `ForceModel`."""
-
-    seq: int
-    t: float
-    features: Seen | None
-    change: float
-
-
 class Watcher:
     """Collects the features that the force follows from, of results that are added one after the other.
 
@@ -71,7 +60,9 @@ class Watcher:
     """
 
     def __init__(self) -> None:
-        self._moments: list[_Moment] = []
+        self._frames: list[tuple[int, float]] = []
+        self._contacts: list[Seen | None] = []
+        self._changes: list[float] = []
 
     def add(self, result: Result) -> None:
         """Look at one result."""
@@ -79,21 +70,25 @@ class Watcher:
         if scale is None or unmarked is None:
             return
         change = scale.area(total_change(unmarked, result["untouched"]))
-        features = None if contact is None else seen(contact, scale, result.depth, change, result.flow)
-        self._moments.append(_Moment(result.seq, result.t, features, change))
+        self._frames.append((result.seq, result.t))
+        self._contacts.append(
+            None if contact is None else seen(contact, scale, result.depth, change, result.flow)
+        )
+        self._changes.append(change)
 
     def watched(self) -> Watched:
         """The features of all results. Raises ConfigError if there were none."""
-        if not self._moments:
+        if not self._frames:
             raise ConfigError("calibrate force: the source has no frames")
-        contacts = [moment.features or Seen({}, {}) for moment in self._moments]
-        touched = np.array([moment.features is not None for moment in self._moments])
-        at_rest = [moment.change for moment in self._moments if moment.features is None]
+        frames, times = np.array(self._frames, float).T
+        contacts = [contact or Seen({}, {}) for contact in self._contacts]
+        touched = np.array([contact is not None for contact in self._contacts])
+        at_rest = np.array(self._changes)[~touched]
         by_depth = any("volume" in contact.press for contact in contacts)
         unknown = (math.nan, math.nan)
         return Watched(
-            frames=np.array([moment.seq for moment in self._moments], float),
-            times=np.array([moment.t for moment in self._moments], float),
+            frames=frames,
+            times=times,
             press={
                 name: np.array([contact.press.get(name, 0.0) for contact in contacts])
                 for name in (BY_DEPTH if by_depth else BY_CHANGE)
@@ -103,16 +98,8 @@ class Watcher:
                 for name in BY_SHEAR
             },
             touched=touched,
-            change_at_rest=float(np.median(at_rest or [0.0])),
+            change_at_rest=float(np.median(at_rest)) if len(at_rest) else 0.0,
         )
-
-
-def watch(results: Iterable[Result]) -> Watched:
-    """The features of results with their pictures, as `tactflow.stream(..., images=True)` gives them."""
-    watcher = Watcher()
-    for result in results:
-        watcher.add(result)
-    return watcher.watched()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -195,7 +182,7 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
     force = np.concatenate([part.force for part in aligned])
     features = np.concatenate([part.press for part in aligned])
     entry = ForceEntry(
-        press=_learn(next(iter(names)), features, force[:, 2], groups, presses),
+        press=_learn(next(iter(names)), features, force[:, 2], groups),
         change_at_rest=at_rest,
         recordings={part.name: part.offset for part in aligned},
         presses=int(first[-1]),
@@ -224,7 +211,7 @@ def _with_drag(
     sideways = (sideways.conj() if mirrored else sideways) * turn
     # The same stiffness for x and y: both are samples of one fit.
     both = [np.concatenate([part.real, part.imag]) for part in (*drag.T, sideways)]
-    learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups, 2), None)
+    learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups, 2))
     # y points down, so that a positive angle of a complex number is clockwise as seen.
     turned = -float(np.degrees(np.angle(turn)))
     return Fit(entry.model_copy(update={"drag": learned if learned.r2 > 0 else None}), turned, mirrored)
@@ -245,10 +232,9 @@ def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Referen
 
 
 def _learn(
-    names: Sequence[str], features: Double, force: Double, groups: NDArray[np.intp], presses: Any
+    names: Sequence[str], features: Double, force: Double, groups: NDArray[np.intp]
 ) -> LinearForceEntry:
-    """Fit one component. features : (n, k). force : (n,). groups : (n,), left out in turn. presses : (n,), or
-    None for no hysteresis."""
+    """Fit one component. features : (n, k). force : (n,). groups : (n,), left out in turn."""
     # Features differ by orders of magnitude.
     size = np.maximum(np.abs(features).max(axis=0), 1e-12)
     features = features / size
@@ -266,7 +252,6 @@ def _learn(
         range=(float(force.min()), float(force.max())),
         rmse=float(np.sqrt(np.mean(residual**2))),
         r2=1 - float(residual @ residual) / spread if spread else 0.0,
-        hysteresis=None if presses is None else _hysteresis(features @ fitted, force, presses),
     )
 
 
@@ -285,27 +270,6 @@ def _error(residual: Double, force: Double) -> tuple[float, float]:
     best = int(np.argmin(len(residual) * np.log(variances) + np.log(forms).sum(axis=1)))
     absolute = math.sqrt(variances[best])
     return absolute, float(RATIOS[best]) * absolute
-
-
-def _hysteresis(predicted: Double, force: Double, presses: NDArray[np.intp]) -> float | None:
-    """Mean distance of the force while the prediction grows and while it falls, over the largest force."""
-    distances: list[float] = []
-    for number in np.unique(presses):
-        chosen = presses == number
-        x, y = predicted[chosen], force[chosen]
-        top = int(x.argmax())
-        parts = [(x[: top + 1], y[: top + 1]), (x[top:], y[top:])]
-        low = max(part.min() for part, _ in parts)
-        if min(len(part) for part, _ in parts) < 2 or low >= x[top]:
-            continue
-        levels = np.linspace(low, x[top], LEVELS)
-        orders = [np.argsort(part, kind="stable") for part, _ in parts]
-        growing, falling = (
-            np.interp(levels, part[order], felt[order])
-            for (part, felt), order in zip(parts, orders, strict=True)
-        )
-        distances.append(float(np.abs(growing - falling).mean() / y.max()))
-    return float(np.mean(distances)) if distances else None
 
 
 def _turn(drag: NDArray[np.complex128], force: NDArray[np.complex128]) -> tuple[complex, bool]:

@@ -20,26 +20,21 @@ from tactflow.vision.geometry import PixelMapping
 class KeptPresses:
     """A folder with a file for each press, and one for the untouched gel they are compared with.
 
-    folder : made when there is something to keep.
+    folder : made when there is something to keep. presses : those of the session so far.
 
     Raises ConfigError if a file in it cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._files: dict[Path, Press] = {}
+        self.presses: list[Press] = []
         self._checked = False
         self._renewed = 0
         for path in sorted(folder.glob("press-*.npz")):
             stored = _read(path)
             x, y = stored.pop("center").tolist()
             seq, radius = int(stored.pop("seq")), float(stored.pop("radius"))
-            self._files[path] = Press(seq=seq, radius=radius, center=(x, y), **stored)
-
-    @property
-    def presses(self) -> list[Press]:
-        """Those of the session so far."""
-        return list(self._files.values())
+            self.presses.append(Press(seq=seq, radius=radius, center=(x, y), **stored))
 
     def update(self, finder: PressFinder) -> None:
         """Save the presses that are over, and delete those that were undone or belong to another look.
@@ -66,7 +61,7 @@ class KeptPresses:
             _save(path, untouched=untouched, corners=corners)
             return
         before = _read(path)
-        remedy = f"begin anew with --fresh, which forgets the {len(self._files)} presses in {self.folder}"
+        remedy = f"begin anew with --fresh, which forgets the {len(self.presses)} presses in {self.folder}"
         same_shape = before["untouched"].shape == untouched.shape
         if not same_shape or np.abs(np.subtract(before["corners"], corners)).max() > 1:
             raise ConfigError(f"calibrate: the session of before had another preprocess; {remedy}")
@@ -79,22 +74,22 @@ class KeptPresses:
 
     def sync(self, presses: Sequence[Press]) -> None:
         """Save new presses and delete the files of those that are gone."""
-        kept = {id(press) for press in presses}
-        for path in [path for path, press in self._files.items() if id(press) not in kept]:
-            path.unlink(missing_ok=True)
-            del self._files[path]
-        saved = {id(press) for press in self._files.values()}
-        for press in presses:
-            if id(press) not in saved:
-                number = max((int(path.stem[6:]) for path in self._files), default=0) + 1
-                path = self.folder / f"press-{number:04d}.npz"
-                _save(path, **asdict(press))
-                self._files[path] = press
+        same = 0
+        while same < min(len(self.presses), len(presses)) and self.presses[same] is presses[same]:
+            same += 1
+        for number in range(same, len(self.presses)):
+            self._path(number).unlink(missing_ok=True)
+        for number in range(same, len(presses)):
+            _save(self._path(number), **asdict(presses[number]))
+        self.presses = [*presses]
 
     def clear(self) -> None:
         """Delete all of them."""
-        self._files = {}
+        self.presses = []
         shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"press-{number + 1:04d}.npz"
 
 
 def _save(path: Path, **arrays: Any) -> None:

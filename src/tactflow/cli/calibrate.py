@@ -316,8 +316,6 @@ def _force_words(fit: force.Fit, references: Mapping[str, Reference]) -> list[st
     entry = fit.entry
     words = [f"{name}: its clock is {s:+.3f} s ahead of its CSV's" for name, s in entry.recordings.items()]
     words.append(f"force, {entry.presses} presses: {_quality(entry.press, entry.left_out)}")
-    if entry.press.hysteresis is not None:
-        words.append(f"hysteresis: {100 * entry.press.hysteresis:.0f} % of the largest force of a press")
     if "volume" not in entry.press.stiffness:
         words.append(
             "heights are not known, so it is by the change of the light and the area: good for objects "
