@@ -119,6 +119,17 @@ def test_damaged_files_are_replaced(damaged: str, content: bytes, folder: Path) 
     assert run(folder).stdout == f"3 0 {RESULTS}"
 
 
+def test_machine_code_with_flipped_bits_is_made_anew_with_a_line(folder: Path) -> None:
+    run(folder)
+    for file in (folder / "kept").rglob("loops.t*.nbc"):
+        code = np.frombuffer(file.read_bytes(), np.uint8).copy()
+        code[len(code) // 4 :: 97] ^= 0x10
+        file.write_bytes(code.tobytes())
+    second, third = run(folder), run(folder)
+    assert (second.stdout, third.stdout, third.stderr) == (f"3 2 {RESULTS}", f"3 0 {RESULTS}", "")
+    assert "loops.twice: its compiled code is damaged" in second.stderr
+
+
 def test_where_nothing_can_be_kept_loops_are_compiled_in_each_run(folder: Path) -> None:
     # Files where folders would have to be: not even root can write into them.
     (folder / "__pycache__").write_text("")

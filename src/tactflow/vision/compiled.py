@@ -23,13 +23,16 @@ overflow."""
 
 from __future__ import annotations
 
+import glob
 import logging
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
+from hashlib import sha256
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 import numpy as np
@@ -87,12 +90,16 @@ class Kernel(Generic[P, R]):
             return self.plain
         try:
             found = numba.njit(cache=True, **_OPTIONS)(self.plain)
+            files = _StoredCode(found)
+            files.remove_damaged()
             with suppress(Exception):
                 found.compile(self._signature)
             if not found.signatures:
                 # A damaged file gives way to an empty one.
                 found.recompile()
                 found.compile(self._signature)
+            if not found.stats.cache_hits:
+                files.sign()
         except (OSError, RuntimeError) as error:
             text = "%s: compiled in each run, for it cannot be kept on disk (set NUMBA_CACHE_DIR): %s"
             logging.getLogger("tactflow").warning(text, self.__name__, error)
@@ -101,6 +108,40 @@ class Kernel(Generic[P, R]):
         if not found.stats.cache_hits:
             _say_progress(sum("compiled" not in vars(each) for each in _kernels) - 1)
         return found
+
+
+class _StoredCode:
+    """The files in which numba keeps one compiled function, with a checksum of ours.
+
+    Damaged machine code would end the process when it runs, if not when it is loaded.
+    """
+
+    def __init__(self, function: Any) -> None:
+        code = function.py_func.__code__
+        self._folder = Path(function.stats.cache_path)
+        self._name = f"{function.__module__.rpartition('.')[2]}.{code.co_name}"
+        self._front = f"{self._name}-{code.co_firstlineno}."
+        self._checksum = self._folder / f"{self._front}{sys.implementation.cache_tag}.sha256"
+
+    def _files(self) -> list[Path]:
+        return sorted(self._folder.glob(f"{glob.escape(self._front)}*.nb[ic]"))
+
+    def _sum(self) -> str:
+        return sha256(b"".join(path.read_bytes() for path in self._files())).hexdigest()
+
+    def remove_damaged(self) -> None:
+        """Remove files that are not as they were written, with a line in the log."""
+        with suppress(OSError):
+            if self._checksum.read_text(errors="replace") != self._sum():
+                for path in self._files():
+                    path.unlink()
+                text = "%s: its compiled code is damaged or incomplete on disk and is made anew"
+                logging.getLogger("tactflow").warning(text, self._name)
+
+    def sign(self) -> None:
+        """Keep the checksum of what has been written."""
+        with suppress(OSError):
+            self._checksum.write_text(self._sum())
 
 
 def _writable(value: object) -> object:
