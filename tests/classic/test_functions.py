@@ -38,14 +38,6 @@ def test_contact_is_brighter_by_14_grey_levels_for_every_pair_of_values_in_every
         assert np.array_equal(centers, brighter_by >= BRIGHTER_BY)
 
 
-def test_the_scale_of_negative_differences_changes_nothing() -> None:
-    rng = np.random.default_rng(2)
-    frame, reference = rng.integers(0, 256, (2, 40, 50, 3), dtype=np.uint8)
-    masks = [difference(frame, reference, scale=scale) for scale in (0.2, 0.5, 0.7)]
-    assert np.array_equal(masks[0], masks[1])
-    assert np.array_equal(masks[1], masks[2])
-
-
 def test_brightening_in_two_channels_only_is_not_contact() -> None:
     reference = np.full((40, 40, 3), 100, np.uint8)
     frame = reference.copy()
@@ -70,14 +62,3 @@ def test_mask_marker_follows_the_description_step_by_step() -> None:
     mask = mask_marker(image)
     assert mask.any()
     assert np.array_equal(mask, expected)
-
-
-@pytest.mark.parametrize("shape", [(10, 10), (10, 10, 4), (0, 5, 3)])
-def test_an_array_that_is_not_a_colour_image_is_rejected_with_its_shape(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="required a non-empty"):
-        mask_marker(np.zeros(shape, np.uint8))
-
-
-def test_a_frame_of_another_size_than_the_reference_is_rejected() -> None:
-    with pytest.raises(ValueError, match="required a reference of shape"):
-        difference(np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4, 3), np.uint8))

@@ -51,12 +51,11 @@ def mask_marker(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     A marker is where two of three channels exceed `MASK_THRESHOLD`. Enlarging the mask shifts it by half a
     pixel.
 
-    frame : (H, W, 3) uint8, BGR; otherwise raises ValueError.
+    frame : (H, W, 3) uint8, BGR.
 
     >>> mask_marker(np.full((40, 60, 3), 150, np.uint8)).any()
     np.False_
     """
-    _require_bgr(frame, "frame")
     height, width = frame.shape[:2]
     small = cv2.pyrDown(np.ascontiguousarray(frame)).astype(np.float32)
     blur = cv2.GaussianBlur(small, (25, 25), 0)
@@ -68,16 +67,15 @@ def mask_marker(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(enlarged * np.uint8(255), np.uint8)
 
 
-def marker_center(
-    frame: NDArray[np.uint8], *, least_area: float = MARKER_AREAS[0], most_area: float = MARKER_AREAS[1]
-) -> NDArray[np.float64]:
+def marker_center(frame: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Centres of the markers (N, 2) float64, px, by contour moments, in OpenCV's contour order.
 
-    A contour counts if its area lies strictly between the limits (px^2) and the longer side of its bounding
-    box is less than twice the shorter one. Centres have the half-pixel shift of `mask_marker`.
+    A contour counts if its area lies within `MARKER_AREAS` and the longer side of its bounding box is less
+    than twice the shorter one. Centres have the half-pixel shift of `mask_marker`.
 
-    frame : (H, W, 3) uint8, BGR; otherwise raises ValueError.
+    frame : (H, W, 3) uint8, BGR.
     """
+    least_area, most_area = MARKER_AREAS
     contours, _ = cv2.findContours(mask_marker(frame), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     centers = []
     for contour in contours:
@@ -90,32 +88,21 @@ def marker_center(
     return np.array(centers, np.float64).reshape(-1, 2)
 
 
-def difference(
-    frame: NDArray[np.uint8], frame0: NDArray[np.uint8], *, normalized_lb: float = 0.5, scale: float = 0.7
-) -> NDArray[np.uint8]:
+def difference(frame: NDArray[np.uint8], frame0: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Contact mask (H, W) uint8, 0 or 255: where the gel is brighter by 14 grey levels in all channels.
 
     These are the script's steps, except that values outside 0..255 are clipped before conversion to uint8,
-    which is undefined otherwise.
+    which is undefined otherwise. Its factor on negative differences has no effect after the threshold of 140.
 
-    Parameters
-    ----------
     frame, frame0 : (H, W, 3) uint8, BGR; the gel now and untouched, both without markers.
-    normalized_lb : value of "no change" in the normalised difference, 0..1.
-    scale : factor on negative differences, 0..1; has no effect after the threshold of 140.
-
-    Raises
-    ------
-    ValueError : if the two are not images of the same size.
 
     >>> gel = np.full((40, 60, 3), 100, np.uint8)
     >>> difference(gel + np.uint8(14), gel).all(), difference(gel + np.uint8(13), gel).any()
     (np.True_, np.False_)
     """
-    _require_pair(frame, frame0)
-    diff = (frame * 1.0 - frame0) / 255.0 + normalized_lb
-    below = diff < normalized_lb
-    diff[below] = (diff[below] - normalized_lb) * scale + normalized_lb
+    diff = (frame * 1.0 - frame0) / 255.0 + 0.5
+    below = diff < 0.5
+    diff[below] = (diff[below] - 0.5) * 0.7 + 0.5
     levels = np.clip(diff * 255, 0, 255).astype(np.uint8)
     levels[levels > 140] = 255
     levels[levels <= 140] = 0
@@ -132,10 +119,9 @@ def difference(
 def get_all_contour(mask: NDArray[np.uint8]) -> NDArray[np.int32]:
     """The points of all outer contours, (N, 1, 2) int32, px; N is 0 for an empty mask.
 
-    mask : (H, W) uint8, non-zero in contact; otherwise raises ValueError.
+    mask : (H, W) uint8, non-zero in contact.
     """
-    _require_mask(mask)
-    left, top, width, height = cv2.boundingRect(mask) if mask.size else (0, 0, 0, 0)
+    left, top, width, height = cv2.boundingRect(mask)
     if width == 0:
         return np.empty((0, 1, 2), np.int32)
     inside: NDArray[Any] = mask[top : top + height, left : left + width]
@@ -197,7 +183,7 @@ def get_convex_hull_area(mask: NDArray[np.uint8]) -> Contact | None:
     `center` is the middle of that line across the image, not of the contact. `area` is that of the polygon,
     px^2.
 
-    mask : (H, W) uint8, non-zero in contact; otherwise raises ValueError.
+    mask : (H, W) uint8, non-zero in contact.
 
     >>> mask = np.zeros((40, 60), np.uint8)
     >>> mask[10:20, 15:46] = 255
@@ -233,14 +219,8 @@ def mean_flow(markers: Markers, mask: NDArray[np.uint8], dilate: int = 0) -> Flo
     Lost markers count too; positions and displacements are truncated to whole pixels. The mean is None if no
     marker is inside.
 
-    Parameters
-    ----------
     markers : from a tracker, processed pixels. mask : (H, W) uint8, 255 in contact.
     dilate : px, >= 0; dilates the mask by a square of side 2 * dilate + 1.
-
-    Raises
-    ------
-    ValueError : if the mask has another shape or dtype, or dilate is negative.
 
     >>> origin = np.array([[5.0, 5.0], [20.0, 5.0]])
     >>> markers = Markers(origin, origin + 1.5, np.zeros(2, np.uint8), np.full(2, np.nan))
@@ -249,12 +229,7 @@ def mean_flow(markers: Markers, mask: NDArray[np.uint8], dilate: int = 0) -> Flo
     >>> mean_flow(markers, mask).mean
     (1.0, 1.0)
     """
-    _require_mask(mask)
-    if dilate < 0:
-        raise ValueError(f"required dilate >= 0 px, got {dilate}")
-    dilated: NDArray[Any] = mask
-    if dilate and mask.size:
-        dilated = cv2.dilate(mask, np.ones((2 * dilate + 1, 2 * dilate + 1), np.uint8))
+    dilated = cv2.dilate(mask, np.ones((2 * dilate + 1, 2 * dilate + 1), np.uint8))
     height, width = mask.shape
     pixels = np.trunc(markers.position)
     within = (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
@@ -264,21 +239,3 @@ def mean_flow(markers: Markers, mask: NDArray[np.uint8], dilate: int = 0) -> Flo
         return Flow(None, 0)
     mean = np.trunc(markers.displacement[chosen]).mean(axis=0)
     return Flow((float(mean[0]), float(mean[1])), len(chosen))
-
-
-def _require_bgr(image: NDArray[np.uint8], name: str) -> None:
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise ValueError(
-            f"{name}: required a non-empty (H, W, 3) uint8 array, got {image.shape} {image.dtype}"
-        )
-
-
-def _require_mask(mask: NDArray[np.uint8]) -> None:
-    if mask.ndim != 2 or mask.dtype != np.uint8:
-        raise ValueError(f"required a mask of shape (H, W) and dtype uint8, got {mask.shape} {mask.dtype}")
-
-
-def _require_pair(frame: NDArray[np.uint8], frame0: NDArray[np.uint8]) -> None:
-    _require_bgr(frame, "frame")
-    if frame0.shape != frame.shape:
-        raise ValueError(f"required a reference of shape {frame.shape}, got {frame0.shape}")

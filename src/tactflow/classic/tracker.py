@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.classic.functions import MARKER_AREAS, marker_center
+from tactflow.classic.functions import marker_center
 from tactflow.vision.markers.detection import NoMarkersError
 from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.types import Markers, MarkerStatus
@@ -34,76 +34,56 @@ _OBLIQUE: Final = 0.6
 tilted by 31 degrees."""
 
 
-class GridFlow(NamedTuple):
-    """The flow as the original returns it: five arrays of shape (rows, columns).
-
-    Ox, Oy : original positions, px. Cx, Cy : current positions, px. Occupied : index of the matched centre,
-    or -1.
-    """
-
-    Ox: FloatArray
-    Oy: FloatArray
-    Cx: FloatArray
-    Cy: FloatArray
-    Occupied: NDArray[np.int64]
-
-
 class Matcher:
     """Matches centres to a grid of rows and columns by depth-first search.
 
-    The script's `m.init`, `m.run` and `m.get_flow`. Row by row, each node tries the free centres that best
-    continue the motion of its left and upper neighbours, or stays empty at a cost. A branch is pruned when it
-    costs more than the best complete assignment.
+    The script's `m`. Row by row, each node tries the free centres that best continue the motion of its left
+    and upper neighbours, or stays empty at a cost. A branch is pruned when it costs more than the best
+    complete assignment.
 
-    origin : (rows, columns, 2) float64, px; NaN where the grid has no marker.
+    grid : (rows, columns, 2) float64, px; NaN where there is no marker.
     spacing : typical distance between neighbours, px. max_visits : see `MAX_VISITS`.
     """
 
-    def __init__(self, origin: FloatArray, spacing: float, *, max_visits: int = MAX_VISITS) -> None:
-        if origin.ndim != 3 or origin.shape[2] != 2:
-            raise ValueError(f"required origin of shape (rows, columns, 2), got {origin.shape}")
-        self._origin = origin
+    def __init__(self, grid: FloatArray, spacing: float, *, max_visits: int = MAX_VISITS) -> None:
         self._spacing = spacing
         self._max_visits = max_visits
-        rows, columns = origin.shape[:2]
-        self._nodes = [
-            (row, column)
-            for row in range(rows)
-            for column in range(columns)
-            if np.isfinite(origin[row, column]).all()
-        ]
-        number = {node: index for index, node in enumerate(self._nodes)}
+        nodes = [(row, column) for row, column in np.argwhere(np.isfinite(grid[..., 0])).tolist()]
+        number = {node: index for index, node in enumerate(nodes)}
         self._before = [
             [
                 number[near]
                 for near in ((row, column - 1), (row - 1, column), (row - 1, column - 1))
                 if near in number
             ][:2]
-            for row, column in self._nodes
+            for row, column in nodes
         ]
-        self._places: list[complex] = [complex(*origin[node]) for node in self._nodes]
-        self._centers: list[complex] = []
-        self._best: list[int] = [-1] * len(self._nodes)
-        self._moves: list[complex] = [0j] * len(self._nodes)
+        self._places: list[complex] = [complex(*grid[node]) for node in nodes]
 
-    def init(self, centers: FloatArray) -> None:
-        """Set the centres (N, 2), px, of a frame."""
-        self._centers = [complex(x, y) for x, y in centers]
+    def match(self, centers: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Search for the cheapest assignment of centres (N, 2), px, within `max_visits`.
 
-    def run(self) -> None:
-        """Search for the cheapest assignment, within `max_visits`."""
-        count = len(self._nodes)
-        empty_price = self._spacing**2
-        chosen = [-1] * count
-        moves = [0j] * count
-        used: set[int] = set()
+        Returns
+        -------
+        position : (M, 2), px, of the markers of the grid, row by row; those without a centre follow their
+            neighbours. matched : (M,) index of the matched centre, or -1.
+        """
+        matched, moves = self._search([complex(x, y) for x, y in centers])
+        now = np.array(self._places) + np.array(moves)
+        return np.column_stack([now.real, now.imag]), np.array(matched, np.int64)
+
+    def _search(self, centers: list[complex]) -> tuple[list[int], list[complex]]:
+        """The centre, or -1, and the displacement of each node."""
+        count = len(self._places)
+        chosen, moves = [-1] * count, [0j] * count
+        best = chosen.copy(), moves.copy()
         best_cost = float("inf")
+        used: set[int] = set()
         costs = [0.0] * (count + 1)
         options: list[list[tuple[float, int, complex]]] = [[] for _ in range(count)]
+        options[0] = self._options(0, centers, moves, used)
         depth, visits = 0, 0
-        if count:
-            options[0] = self._options(0, moves, used, empty_price)
-        while depth >= 0 and count:
+        while depth >= 0:
             if chosen[depth] >= 0:
                 used.discard(chosen[depth])
                 chosen[depth] = -1
@@ -123,86 +103,49 @@ class Matcher:
                 used.add(center)
             if depth + 1 == count:
                 best_cost = total
-                self._best, self._moves = chosen.copy(), moves.copy()
+                best = chosen.copy(), moves.copy()
                 continue
-            costs[depth + 1] = total
             depth += 1
-            options[depth] = self._options(depth, moves, used, empty_price)
+            costs[depth] = total
+            options[depth] = self._options(depth, centers, moves, used)
+        return best
 
     def _options(
-        self, node: int, moves: list[complex], used: set[int], empty_price: float
+        self, node: int, centers: list[complex], moves: list[complex], used: set[int]
     ) -> list[tuple[float, int, complex]]:
         """Options of a node, cheapest first: (cost, centre or -1, displacement)."""
         near = [moves[neighbour] for neighbour in self._before[node]]
         expected = sum(near) / len(near) if near else 0j
-        place = self._places[node]
         candidates = []
-        for index, center in enumerate(self._centers):
-            move = center - place
+        for index, center in enumerate(centers):
+            move = center - self._places[node]
             residual = abs(move - expected)
             if index not in used and residual < _REACH * self._spacing:
                 candidates.append((residual**2, index, move))
         candidates.sort(key=lambda option: option[:2])
-        return [*candidates[:_MAX_CANDIDATES], (empty_price, -1, expected)]
-
-    def get_flow(self) -> GridFlow:
-        """The result of the last `run`; nodes without a centre follow their neighbours."""
-        shape = self._origin.shape[:2]
-        current = self._origin.copy()
-        occupied = np.full(shape, -1, np.int64)
-        for node, center, place, move in zip(self._nodes, self._best, self._places, self._moves, strict=True):
-            now = place + move
-            current[node] = now.real, now.imag
-            occupied[node] = center
-        return GridFlow(
-            self._origin[..., 0].copy(),
-            self._origin[..., 1].copy(),
-            current[..., 0],
-            current[..., 1],
-            occupied,
-        )
+        return [*candidates[:_MAX_CANDIDATES], (self._spacing**2, -1, expected)]
 
 
 class GridTracker:
     """The original tracker, on a grid found in the reference frame instead of typed in.
 
     reference : (H, W, 3) uint8, BGR.
-    least_area, most_area : see `marker_center`.
 
     Raises
     ------
     NoMarkersError : fewer than four centres, or no grid in them.
-    ValueError : the areas are not a finite range.
     """
 
-    def __init__(
-        self,
-        reference: NDArray[np.uint8],
-        *,
-        least_area: float = MARKER_AREAS[0],
-        most_area: float = MARKER_AREAS[1],
-    ) -> None:
-        if not 0 <= least_area < most_area < np.inf:
-            raise ValueError(f"required 0 <= least_area < most_area, px^2, got {least_area}, {most_area}")
-        self._areas = (least_area, most_area)
-        centers = marker_center(reference, least_area=least_area, most_area=most_area)
-        grid, spacing = grid_of(centers)
-        self._present = np.isfinite(grid[..., 0])
+    def __init__(self, reference: NDArray[np.uint8]) -> None:
+        grid, spacing = grid_of(marker_center(reference))
+        self._origin = grid[np.isfinite(grid[..., 0])]
         self._matcher = Matcher(grid, spacing)
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
         """Match one frame; markers without a centre are inferred, standard errors are NaN."""
-        least, most = self._areas
-        self._matcher.init(marker_center(image, least_area=least, most_area=most))
-        self._matcher.run()
-        flow = self._matcher.get_flow()
-        status = np.where(flow.Occupied[self._present] >= 0, MarkerStatus.TRACKED, MarkerStatus.INFERRED)
-        return Markers(
-            np.column_stack([flow.Ox[self._present], flow.Oy[self._present]]),
-            np.column_stack([flow.Cx[self._present], flow.Cy[self._present]]),
-            status.astype(np.uint8),
-            np.full(int(self._present.sum()), np.nan),
-        )
+        position, matched = self._matcher.match(marker_center(image))
+        status = np.where(matched >= 0, MarkerStatus.TRACKED, MarkerStatus.INFERRED).astype(np.uint8)
+        return Markers(self._origin.copy(), position, status, np.full(len(status), np.nan))
 
 
 def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
