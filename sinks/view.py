@@ -157,7 +157,11 @@ class View(Guiding):
     def wants(self) -> bool:
         """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""
         hub = self._hub
-        return hub is not None and (hub.owed or (hub.wanted and time.perf_counter() >= self._due))
+        if hub is None:
+            return False
+        # A frame of a paused run is a single step, which every page shall see.
+        stepped = bool(hub.pages) and self._control is not None and self._control.paused
+        return stepped or (hub.wanted and time.perf_counter() >= self._due)
 
     def counters(self) -> dict[str, int]:
         """encoded : pictures made; and those of `Hub.counters`."""

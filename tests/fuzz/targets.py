@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import zmq
 from mcap.writer import CompressionType, Writer
+from starlette.websockets import WebSocket, WebSocketState
 
 from tactflow.calibration.file import Calibration, ScaleEntry
 from tactflow.cli import listen
@@ -32,7 +33,7 @@ from tactflow.recording.schemas import channel_type
 from tactflow.recording.writer import Entry, RecordingWriter
 from tactflow.sinks.zmq import Zmq
 from tactflow.sources import open_source
-from tactflow.view.hub import Hub, Wire
+from tactflow.view.hub import Hub
 from tactflow.vision.types import Contact, Flow, Markers, Scale
 from tests.adapters.bags import TOPIC, write_bag, write_foxglove
 from tests.adapters.test_datasets import KEY, write_lerobot
@@ -271,6 +272,8 @@ def subscriptions(_: Path) -> Iterator[Parser]:
 class OneMessage:
     """A connection to the page over which one message comes."""
 
+    application_state = WebSocketState.CONNECTED
+
     def __init__(self, text: str) -> None:
         self._texts = [text]
 
@@ -299,7 +302,7 @@ def commands(_: Path) -> Iterator[Parser]:
     def feed(data: bytes) -> None:
         hub = Hub(None, "main")
         hub.run_id = secrets.token_hex(1)
-        asyncio.run(hub.serve(cast(Wire, OneMessage(data.decode("utf-8", "replace")))))
+        asyncio.run(hub.serve(cast(WebSocket, OneMessage(data.decode("utf-8", "replace")))))
 
     yield Parser(samples, feed)
 

@@ -14,9 +14,12 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import orjson
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from tactflow.engine.control import Control
 from tactflow.engine.stats import Durations
@@ -41,22 +44,6 @@ MAX_PAGES = 16
 """Maximum number of open pages; further ones are rejected."""
 
 
-class Wire(Protocol):
-    """The connection to a page."""
-
-    async def send_text(self, data: str) -> None:
-        """Send a text message; waits while the buffer is full."""
-
-    async def send_bytes(self, data: bytes) -> None:
-        """Send a binary message; waits while the buffer is full."""
-
-    async def receive_text(self) -> str:
-        """Receive a text message; raises when the connection is closed."""
-
-    async def close(self, code: int, reason: str) -> None:
-        """Close the connection."""
-
-
 class Packet(NamedTuple):
     """An encoded frame.
 
@@ -70,28 +57,28 @@ class Packet(NamedTuple):
     published: float
 
 
+@dataclass(eq=False, slots=True)
 class Page:
     """State of one open page.
 
     credit : whether the next frame may be sent. shows : layers of `ON_DEMAND` that it shows. sent, answered :
     numbers of the last frame sent and acknowledged. captured, sent_at : `time.perf_counter` of the frame
-    sent, s. screen_s : recent times from capture to screen, s. wake : set when there is something to send.
-    ended : the run is over.
+    sent, s. screen_s : recent times from capture to screen, s. texts : unsent messages, only the newest of
+    each kind, which bounds the queue of a page that does not read. wake : set when there is something to
+    send. ended : the run is over.
     """
 
-    def __init__(self, wire: Wire) -> None:
-        self.wire = wire
-        self.credit = True
-        self.shows: frozenset[str] = frozenset()
-        self.sent = 0
-        self.answered = 0
-        self.captured = 0.0
-        self.sent_at = 0.0
-        self.screen_s: deque[float] = deque(maxlen=64)
-        # Only the newest message of each kind is kept, which bounds the queue of a page that does not read.
-        self.texts: dict[str, str] = {}
-        self.wake = asyncio.Event()
-        self.ended = False
+    socket: WebSocket
+    credit: bool = True
+    shows: frozenset[str] = frozenset()
+    sent: int = 0
+    answered: int = 0
+    captured: float = 0.0
+    sent_at: float = 0.0
+    screen_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
+    texts: dict[str, str] = field(default_factory=dict)
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
+    ended: bool = False
 
     def post(self, kind: str, text: str) -> None:
         """Queue a text message, replacing an unsent one of the same kind."""
@@ -107,7 +94,7 @@ class Page:
 class Hub:
     """The open pages.
 
-    `publish`, `wanted`, `owed`, `shown` and `counters` may be used from any thread, the rest in the server's
+    `publish`, `wanted`, `shown` and `counters` may be used from any thread, the rest in the server's
     event loop.
 
     Parameters
@@ -135,9 +122,6 @@ class Hub:
         self.run_id = secrets.token_hex(8)
         self.wanted = False
         """Whether a page has credit."""
-        self.owed = False
-        """Whether the frame of a requested single step is pending; it is exempt from the rate limit."""
-        self._owed_since = 0.0
         self.shown: frozenset[str] = frozenset()
         """Layers of `ON_DEMAND` shown by at least one page."""
         self.pages: set[Page] = set()
@@ -150,7 +134,7 @@ class Hub:
         self._end: str | None = None
         self._by_name: dict[str, Callable[[Any], Any]] = {
             "pause": lambda value: self._commands.pause(value is True),
-            "step": lambda _: self._step(),
+            "step": lambda _: self._commands.step(),
             "reference": lambda _: self._commands.take_reference(),
             "record": lambda value: self._commands.record(value is True),
             "stop": lambda _: self._commands.stop(),
@@ -173,9 +157,6 @@ class Hub:
         pixels : heights of a surface, if the header describes one, followed by the JPEG picture.
         captured : `time.perf_counter` at capture, s.
         """
-        # A frame captured before the step was requested does not satisfy it.
-        if captured >= self._owed_since:
-            self.owed = False
         self._number += 1
         header = header + b',"number":%d}' % self._number
         # A little-endian length, the JSON header, the heights and the picture.
@@ -196,9 +177,9 @@ class Hub:
 
     # -- the life of a page -------------------------------------------------------------------------------
 
-    async def serve(self, wire: Wire) -> None:
+    async def serve(self, socket: WebSocket) -> None:
         """Serve a page until it disconnects or the run ends."""
-        page = Page(wire)
+        page = Page(socket)
         page.post("hello", _text(type="hello", run=self.run_id, sensors=[self.sensor]))
         page.post("state", self.state())
         if self._latest is not None and not self._fresh(self._latest):
@@ -300,9 +281,9 @@ class Hub:
             page.wake.clear()
             while page.texts:
                 kind = next(iter(page.texts))
-                await page.wire.send_text(page.texts.pop(kind))
+                await page.socket.send_text(page.texts.pop(kind))
             if page.ended:
-                await page.wire.close(1001, "the run has ended")
+                await close(page.socket, 1001, "the run has ended")
                 return
             packet = self._latest
             if page.credit and packet is not None and packet.number > page.sent:
@@ -312,16 +293,16 @@ class Hub:
                 page.sent_at = time.perf_counter()
                 self._sent += 1
                 self._recount()
-                await page.wire.send_bytes(packet.data)
+                await page.socket.send_bytes(packet.data)
 
     async def _read(self, page: Page) -> None:
         while True:
             try:
-                message = orjson.loads(await page.wire.receive_text())
+                message = orjson.loads(await page.socket.receive_text())
             except orjson.JSONDecodeError:
                 message = None
             if not isinstance(message, dict):
-                await page.wire.close(1008, "required a JSON object")
+                await close(page.socket, 1008, "required a JSON object")
                 return
             if "ack" in message:
                 self._acknowledged(page, message)
@@ -379,10 +360,12 @@ class Hub:
         """Why a command is unavailable, or None."""
         return "the run has ended" if self._end is not None else self._commands.refusal(name)
 
-    def _step(self) -> None:
-        self._owed_since = time.perf_counter()
-        self.owed = True
-        self._commands.step()
+
+async def close(socket: WebSocket, code: int, reason: str) -> None:
+    """Close a WebSocket that either side may have closed already."""
+    if socket.application_state is WebSocketState.CONNECTED:
+        with suppress(RuntimeError, WebSocketDisconnect):
+            await socket.close(code, reason)
 
 
 def _text(**fields: Any) -> str:

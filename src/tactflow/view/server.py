@@ -24,7 +24,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from starlette.websockets import WebSocket
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from tactflow.view.address import LOOPBACK_NAMES, WILDCARDS, bracketed
@@ -178,28 +178,13 @@ class Server:
         elif len(self.hub.pages) >= MAX_PAGES:
             await websocket.close(TOO_MANY, f"more than {MAX_PAGES} pages are open")
         else:
-            await self.hub.serve(_Wire(websocket))
+            await self.hub.serve(websocket)
 
     def _admits(self, websocket: WebSocket) -> bool:
         if self.token is None:
             return True
         token = parse_qs(websocket.url.query).get("token", [""])[0]
         return hmac.compare_digest(token.encode(), self.token.encode())
-
-
-class _Wire:
-    """A WebSocket that can be closed repeatedly and by both sides without errors."""
-
-    def __init__(self, websocket: WebSocket) -> None:
-        self._websocket = websocket
-        self.receive_text = websocket.receive_text
-        self.send_text = websocket.send_text
-        self.send_bytes = websocket.send_bytes
-
-    async def close(self, code: int, reason: str) -> None:
-        if self._websocket.application_state is WebSocketState.CONNECTED:
-            with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-                await self._websocket.close(code, reason)
 
 
 class _Guard:
