@@ -27,34 +27,21 @@ class LinkError(Exception):
     """Invalid address or keys; the message states the remedy."""
 
 
-def set_keys(socket: zmq.Socket, folder: str) -> None:
-    """Set the keys of a socket. folder : of the subscriber, from `tactflow keys new`; "" for no keys."""
-    if not folder:
-        return
-    path = Path(folder).expanduser()
-    try:
-        public, secret = zmq.auth.load_certificate(path / "subscriber.key_secret")
-        server, _ = zmq.auth.load_certificate(path / "publisher.key")
-    except (OSError, ValueError) as error:
-        raise LinkError(f"keys: {error}; tactflow keys new creates such a folder") from None
-    socket.curve_publickey, socket.curve_secretkey = public, secret
-    socket.curve_serverkey = server
-
-
 def connect(socket: zmq.Socket, endpoint: str, keys: str, what: str) -> None:
-    """Connect without waiting for the publisher.
-
-    Raises
-    ------
-    LinkError : invalid address, or unreadable keys.
-    """
+    """Connect without waiting for the publisher. keys : folder of the subscriber, or "". Raises LinkError."""
     socket.linger = 0
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
     # ZeroMQ accepts IPv6 addresses only with this option.
     socket.setsockopt(zmq.IPV6, endpoint.startswith("tcp://["))
-    set_keys(socket, keys)
     try:
+        if keys:
+            folder = Path(keys).expanduser()
+            public, secret = zmq.auth.load_certificate(folder / "subscriber.key_secret")
+            socket.curve_publickey, socket.curve_secretkey = public, secret
+            socket.curve_serverkey, _ = zmq.auth.load_certificate(folder / "publisher.key")
         socket.connect(endpoint)
+    except (OSError, ValueError) as error:
+        raise LinkError(f"keys: {error}; tactflow keys new creates such a folder") from None
     except zmq.ZMQError as error:
         raise LinkError(
             f"{what}: required an address such as tcp://127.0.0.1:5556, got {endpoint!r}: {error.strerror}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -25,9 +26,6 @@ from tactflow.fleet.sinks import (
 from tactflow.fleet.supervisor import Member, Supervisor
 from tactflow.system.children import python_command
 from tactflow.system.signals import ending_handled
-
-LONGEST_ADDRESS = 107
-"""Longest path of a local socket, bytes (Linux; four less elsewhere)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +65,9 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
     shared = shared_addresses(pipelines)
     supervisor = Supervisor()
     with ending_handled(supervisor.count_signal), ExitStack() as stack:
-        scratch = Path(stack.enter_context(_scratch_folder(pipelines)))
+        # The path of a local socket has 107 bytes at most (Linux), and TMPDIR may be longer.
+        short = "/tmp" if os.path.isdir("/tmp") else None
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-", dir=short)))
         for one in shared:
             upstream = [_private(scratch, sensor, node) for sensor, node in one.sinks]
             stack.enter_context(relay(one.address, upstream, one.backlog, one.linger, one.keys))
@@ -78,16 +78,6 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
             command += ["--sign-of-life", str(sign.path)]
             members.append(Member(sensor, command, sign, [WatchedSink(node) for node in pipeline.sinks]))
         return supervisor.run(members)
-
-
-def _scratch_folder(pipelines: Mapping[str, Pipeline]) -> tempfile.TemporaryDirectory[str]:
-    """A temporary folder whose path is short enough for socket addresses."""
-    longest = max(
-        len(f"{sensor}.{node.id}") for sensor, one in pipelines.items() for node in one.nodes.values()
-    )
-    room = LONGEST_ADDRESS - len("/tactflow-01234567/") - longest
-    folder = tempfile.gettempdir()
-    return tempfile.TemporaryDirectory(prefix="tactflow-", dir=folder if len(folder) <= room else "/tmp")
 
 
 def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequence[str]) -> list[str]:

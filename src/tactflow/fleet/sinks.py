@@ -16,18 +16,6 @@ from tactflow.fleet.names import STREAMS
 from tactflow.system.files import is_device, status
 
 
-class _State(NamedTuple):
-    """Identity and version of a file or folder.
-
-    size : bytes of a file; number of entries of a folder.
-    """
-
-    device: int
-    inode: int
-    size: int
-    modified_ns: int
-
-
 class WatchedSink:
     """The outputs of one sink, watched from before the first start of its sensor."""
 
@@ -48,7 +36,7 @@ class WatchedSink:
         """An existing output that the sink would refuse to replace if restarted now, or None."""
         for output in written_files(self._node, self._params):
             now = _state(output)
-            if output.refuses_existing and now is not None and now.size > 0:
+            if output.refuses_existing and now is not None and now[0] > 0:
                 return output.path
         return None
 
@@ -152,11 +140,11 @@ def _plain(params: StageParams) -> dict[str, object]:
     return params.model_dump(mode="json", by_alias=True)
 
 
-def _state(output: Output) -> _State | None:
-    """State of a regular file or folder; None if it does not exist."""
+def _state(output: Output) -> tuple[int, ...] | None:
+    """Size (of a folder: number of entries), identity and modification time; None if it does not exist."""
     there = status(str(output.path))
     is_kind = stat.S_ISDIR if output.kind == "folder" else stat.S_ISREG
     if there is None or not is_kind(there.st_mode):
         return None
     size = len(os.listdir(output.path)) if output.kind == "folder" else there.st_size
-    return _State(there.st_dev, there.st_ino, size, there.st_mtime_ns)
+    return size, there.st_dev, there.st_ino, there.st_mtime_ns

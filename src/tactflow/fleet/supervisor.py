@@ -70,14 +70,6 @@ class Member:
     code: int | None = None
     readers: list[threading.Thread] = field(default_factory=list[threading.Thread])
 
-    def next_command(self) -> list[str]:
-        """The command that (re)starts the sensor and keeps what it has written so far."""
-        command = list(self.command)
-        for sink in self.sinks:
-            for text in sink.overrides:
-                command += ["--set", text]
-        return command
-
 
 class Supervisor:
     """Keeps the processes of several sensors running until each has ended for good.
@@ -194,7 +186,10 @@ class Supervisor:
         self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
 
     def _start(self, member: Member) -> None:
-        member.process = self._start_process(member.next_command())
+        kept = [text for sink in member.sinks for text in sink.overrides]
+        member.process = self._start_process(
+            [*member.command, *(word for t in kept for word in ("--set", t))]
+        )
         member.started, member.signals_sent = self._clock(), 0
         member.sign.start(member.started)
         assert member.process.stdout is not None
