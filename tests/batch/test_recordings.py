@@ -27,7 +27,7 @@ def names(*words: str) -> list[str]:
 
 def test_a_folder_is_searched_and_one_of_pictures_is_a_recording(data: Path) -> None:
     found = find_recordings([str(data)])
-    assert [one.name for one in found] == ["a/press-2.npy", "b/press-2.npy", "press-10.npy", "pictures"]
+    assert [one.name for one in found] == ["a/press-2.npy", "b/press-2.npy", "b/press-10.npy", "pictures"]
     assert all(Path(one.source).is_absolute() for one in found)
 
 
@@ -51,7 +51,7 @@ def test_options_behind_a_pattern_hold_for_all_that_match(data: Path) -> None:
 def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (data / "b" / "list.txt").write_text("# today\npress-2.npy  # the first\n\nsim:press?seed=3\n../x.dat\n")
     monkeypatch.chdir("/")
-    assert names(str(data / "b" / "list.txt")) == ["press-2.npy", "sim:press?seed=3", "x.dat"]
+    assert names(str(data / "b" / "list.txt")) == ["b/press-2.npy", "sim:press?seed=3", "x.dat"]
 
 
 @pytest.mark.parametrize(

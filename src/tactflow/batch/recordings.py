@@ -5,10 +5,8 @@ from __future__ import annotations
 import glob
 import os
 import re
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError, SourceError
@@ -167,22 +165,7 @@ def _inside(folder: Path) -> Iterator[str]:
 
 
 def _short_names(sources: Sequence[str]) -> list[str]:
-    """Shortest unique tails of the paths."""
-    names: dict[str, str] = {}
-    for parts in count(1):
-        left = [source for source in sources if source not in names]
-        if not left:
-            return [names[source] for source in sources]
-        tails = [_tail(source, parts) for source in left]
-        counts = Counter(tails)
-        pairs = zip(left, tails, strict=True)
-        names |= {source: tail for source, tail in pairs if counts[tail] == 1 or tail == source}
-    raise AssertionError("a path has an end")
-
-
-def _tail(source: str, parts: int) -> str:
-    """The last parts of a path; simulated sources unchanged."""
-    if source.startswith("sim:"):
-        return source
-    pieces = source.split(os.sep)
-    return source if parts >= len(pieces) else os.sep.join(pieces[-parts:])
+    """Paths relative to the folder that all recordings share; simulated sources unchanged."""
+    paths = [source for source in sources if not source.startswith("sim:")]
+    shared = os.path.commonpath([os.path.dirname(path) for path in paths]) if paths else ""
+    return [source if source.startswith("sim:") else os.path.relpath(source, shared) for source in sources]

@@ -33,24 +33,21 @@ ONE_THREAD = dict.fromkeys(
 
 
 class Workers(Protocol):
-    """Run tasks. description : for log messages. slots : number of tasks that keeps all workers busy."""
+    """Run tasks. description : for log messages. slots : number of tasks that keeps all workers busy.
+
+    submit : start a task as soon as a worker is free. The future raises BrokenProcessPool if its worker died,
+    possibly because of another task, and CancelledError if the scheduler is lost; StageError if it is lost
+    already. close : stop the workers; kill : immediately, aborting running tasks.
+    """
 
     description: str
 
     @property
     def slots(self) -> int: ...
 
-    def submit(self, task: Task) -> Future[Outcome]:
-        """Start a task as soon as a worker is free.
+    def submit(self, task: Task) -> Future[Outcome]: ...
 
-        The future raises BrokenProcessPool if its worker died, possibly because of another task, and
-        CancelledError if the scheduler is lost. Raises StageError if it is lost already.
-        """
-        ...
-
-    def close(self, *, kill: bool) -> None:
-        """Stop the workers. kill : immediately, aborting running tasks."""
-        ...
+    def close(self, *, kill: bool) -> None: ...
 
 
 class LocalProcesses:
