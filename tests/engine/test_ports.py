@@ -234,8 +234,6 @@ def test_annotations_that_break_the_contract_are_reported_with_their_line(
         (Contact, Image, "the types differ"),
         (list[int], list[int], None),
         (list[int], list[str], "the types differ"),
-        (Flow, Contact | Flow, None),
-        (Markers, Contact | Flow, "the types differ"),
     ],
 )
 def test_an_output_fits_an_input_or_says_why_not(given: Any, wanted: Any, reason: str | None) -> None:
@@ -248,7 +246,6 @@ def test_an_output_fits_an_input_or_says_why_not(given: Any, wanted: Any, reason
         (Image, "(H, W, 3) uint8, grey levels, BGR"),
         (Touching, "signal"),
         (Contact, "Contact"),
-        (Contact | Flow, "Contact or Flow"),
         (list[int], "list[int]"),
     ],
 )

@@ -29,19 +29,6 @@ class Collect(Sink):
         self.params.take(result)
 
 
-class CollectReferences(Collect):
-    """The same with every reference frame, also of a reference image that is not part of the source."""
-
-    takes_references = True
-
-
-class CollectInBackground(Collect):
-    """The same from a thread of its own, so that `take` may block; of a live source it gets the newest."""
-
-    threaded = True
-    when_live = "latest"
-
-
 def with_collector(
     pipeline: Pipeline,
     kind: type[T],
@@ -81,7 +68,8 @@ def with_collector(
     passive = {port: ref for port, ref in outputs.items() if port not in inputs}
     # Any value: whether it is what its port promises is checked where it is made.
     ports = Ports([Port(port, object, True) for port in inputs], (), ResultParameter(0, len(inputs), kind))
-    cls = CollectInBackground if background else CollectReferences if references else Collect
+    policy = {"threaded": True, "when_live": "latest"} if background else {}
+    cls: type[Collect] = type("Collect", (Collect,), {"takes_references": references, **policy})
     component = Component(name, "sink", cls, cls.Params, ports, "pure", "tactflow")
     nodes[name] = Node(
         name, component, cls.Params(take=take), inputs, Mark(name, 0, 0), passive_inputs=passive

@@ -45,20 +45,6 @@ class TickState:
         self.renewed: str | None = None
 
 
-class RunningGate:
-    """A gate with its signal looked up.
-
-    slot : of the signal. absent : what the outputs are while it is closed, unless it `repeats` the last ones.
-    """
-
-    __slots__ = ("absent", "repeats", "slot")
-
-    def __init__(self, gate: Gate, slots: Slots) -> None:
-        self.slot = slots[gate.signal.node, gate.signal.port]
-        self.absent = Absent(gate.reason)
-        self.repeats = gate.otherwise == "repeat"
-
-
 class RunningNode:
     """A stage or sink at run time. Used by the one thread of its segment.
 
@@ -68,7 +54,8 @@ class RunningNode:
     Attributes
     ----------
     instance : of the class; `sink` or `stage` is the same object, the other is None.
-    slots : where its outputs go. signals : output port -> (slot, how often it was true).
+    slots : where its outputs go. gates : each with the slot of its signal.
+    signals : output port -> (slot, how often it was true).
     makers, signal_makers : nodes of the same segment that make its inputs, and the signals of its gates.
     pulled : index of the last tick in which it was evaluated. disabled : it failed and is not called again.
     last : the outputs of its last run, for gates that repeat them and for inputs that come again.
@@ -88,7 +75,8 @@ class RunningNode:
         shown = {**node.passive_inputs, **refs}
         self._shown = [(name, slots[ref.node, ref.port]) for name, ref in shown.items() if ref]
         self.slots = [slots[node.id, port.name] for port in ports.outputs]
-        self.gates = [RunningGate(gate, slots) for gate in node.gates] if skipping else []
+        gates = node.gates if skipping else ()
+        self.gates = [(gate, slots[gate.signal.node, gate.signal.port]) for gate in gates]
         self.signals = {
             port.name: (slot, SignalStats())
             for slot, port in zip(self.slots, ports.outputs, strict=True)
@@ -107,7 +95,7 @@ class RunningNode:
             skipping
             and node.component.memory == "pure"
             and self.sink is None
-            and not any(gate.repeats for gate in self.gates)
+            and all(gate.otherwise == "absent" for gate, _ in self.gates)
         )
         self.last: Sequence[Any] | None = None
         self._last_inputs: Sequence[Any] | None = None
@@ -123,15 +111,17 @@ class RunningNode:
         """Repeat nothing from before."""
         self.last = self._last_inputs = None
 
-    def closed_gate(self, table: Sequence[Any]) -> RunningGate | None:
-        """The gate that keeps it from running in this tick, or None.
+    def closed_gate(self, table: Sequence[Any]) -> tuple[Gate, int] | None:
+        """The gate that keeps it from running in this tick, with the slot of its signal, or None.
 
         A gate that makes the outputs absent takes precedence over one that repeats them.
         """
-        closed: RunningGate | None = None
-        for gate in self.gates:
-            if table[gate.slot] is not True and (closed is None or (closed.repeats and not gate.repeats)):
-                closed = gate
+        closed: tuple[Gate, int] | None = None
+        for gate, slot in self.gates:
+            if table[slot] is not True:
+                if gate.otherwise == "absent":
+                    return gate, slot
+                closed = closed or (gate, slot)
         return closed
 
     def inputs(self, tick: TickState) -> Sequence[Any] | Absent:

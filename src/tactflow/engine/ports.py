@@ -111,10 +111,18 @@ def mismatch(output: Port, input_: Port) -> str | None:
     Classes must be the same or a subclass. Arrays must agree in rank, in each dimension (an exact size fits a
     named one), in dtype and in unit. A signal fits any signal and a plain bool.
     """
-    reasons = [
-        _misfit(port_type(output.annotation), port_type(member)) for member in _members(input_.annotation)
-    ]
-    return None if None in reasons else reasons[0]
+    given, wanted = port_type(output.annotation), port_type(input_.annotation)
+    if wanted is Any or wanted is object:
+        return None
+    if isinstance(given, ArrayPort) and isinstance(wanted, ArrayPort):
+        return _array_misfit(given, wanted)
+    if isinstance(given, SignalPort):
+        fits = isinstance(wanted, SignalPort) or wanted is bool
+    elif inspect.isclass(given) and inspect.isclass(wanted):
+        fits = issubclass(given, wanted)
+    else:
+        fits = given == wanted
+    return None if fits else "the types differ"
 
 
 def port_type(annotation: Any) -> Any:
@@ -125,7 +133,14 @@ def port_type(annotation: Any) -> Any:
 
 def describe_type(annotation: Any) -> str:
     """A port type in words: `(H, W, 3) uint8, grey levels, BGR`, `signal`, `Contact`."""
-    return " or ".join(_describe(port_type(member)) for member in _members(annotation))
+    kind = port_type(annotation)
+    if isinstance(kind, ArrayPort):
+        return f"({', '.join(map(str, kind.shape))}) {kind.dtype}, {kind.unit}"
+    if isinstance(kind, SignalPort):
+        return "signal"
+    if get_origin(kind) is Annotated:
+        kind = get_args(kind)[0]
+    return kind.__name__ if inspect.isclass(kind) and not get_args(kind) else str(kind).replace("typing.", "")
 
 
 class _PortError(Exception):
@@ -195,13 +210,9 @@ def _parameter(parameter: inspect.Parameter, annotation: Any) -> Port:
 
 def _input(name: str, annotation: Any) -> Port:
     """An input; `X | None` is one that may be absent."""
-    members = _members(annotation)
-    types_ = tuple(member for member in members if member is not type(None))
-    if not types_ or Absent in types_:
+    if Absent in _members(annotation):
         raise _PortError(f"{name}: an input that may be absent is annotated X | None")
-    for member in types_:
-        _refuse_bare_array(name, member)
-    return Port(name, Union[types_], len(types_) < len(members))  # noqa: UP007 (built at run time)
+    return Port(name, *_single_type(annotation, name))
 
 
 def _outputs(annotation: Any) -> tuple[Port, ...]:
@@ -211,63 +222,43 @@ def _outputs(annotation: Any) -> tuple[Port, ...]:
         )
     result, optional = _single_type(annotation, "the return annotation")
     if inspect.isclass(result) and issubclass(result, tuple) and hasattr(result, "_fields"):
-        return tuple(_field(result, name, hint, optional) for name, hint in _hints(result).items())
+        fields = {
+            name: _single_type(hint, f"{result.__name__}.{name}") for name, hint in _hints(result).items()
+        }
+        return tuple(Port(name, type_, optional or may) for name, (type_, may) in fields.items())
     spec = port_type(result)
     if isinstance(spec, ArrayPort | SignalPort):
         return (Port(spec.name, result, optional),)
-    _refuse_bare_array("the return annotation", result)
     if not inspect.isclass(result) or result.__module__ in ("builtins", "typing"):
         raise _PortError(
-            f"the return annotation {_describe(result)} gives the output port no name; return a NamedTuple "
-            "with a field for it, as in brightness: float, a dataclass (Contact gives the port contact) or a "
-            'type of tactflow.ports; a signal is Annotated[bool, SignalPort("name", closed="reason")]'
+            f"the return annotation {describe_type(result)} gives the output port no name; return a "
+            "NamedTuple with a field for it, as in brightness: float, a dataclass (Contact gives the port "
+            "contact) or a type of tactflow.ports; a signal is Annotated[bool, "
+            'SignalPort("name", closed="reason")]'
         )
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", result.__name__).lower()
     return (Port(name, result, optional),)
-
-
-def _field(group: type, name: str, annotation: Any, all_optional: bool) -> Port:
-    what = f"{group.__name__}.{name}"
-    type_, optional = _single_type(annotation, what)
-    _refuse_bare_array(what, type_)
-    return Port(name, type_, optional or all_optional)
 
 
 def _single_type(annotation: Any, what: str) -> tuple[Any, bool]:
     """The one type of `X | Absent | None`, and whether the value may be absent."""
     members = [member for member in _members(annotation) if member not in (Absent, type(None))]
     if len(members) != 1:
-        raise _PortError(f"{what}: required one type for one port: X, X | Absent or a NamedTuple")
-    return members[0], len(_members(annotation)) > 1
-
-
-def _refuse_bare_array(what: str, annotation: Any) -> None:
-    origin = get_origin(annotation) or annotation
+        raise _PortError(
+            f"{what}: required one type for one port, X or X | None; several outputs are a NamedTuple"
+        )
+    origin = get_origin(members[0]) or members[0]
     if inspect.isclass(origin) and issubclass(origin, np.ndarray):
         raise _PortError(
             f"{what}: a bare array does not say what it holds; use a type of tactflow.ports (Image, "
             'ContactMask) or Annotated[NDArray[np.uint8], ArrayPort("name", ("H", "W"), "uint8", "unit")]'
         )
+    return members[0], len(_members(annotation)) > 1
 
 
 def _members(annotation: Any) -> tuple[Any, ...]:
-    if get_origin(annotation) in (Union, types.UnionType):
-        return get_args(annotation)
-    return (annotation,)
-
-
-def _misfit(given: Any, wanted: Any) -> str | None:
-    if wanted is Any or wanted is object:
-        return None
-    if isinstance(given, ArrayPort) and isinstance(wanted, ArrayPort):
-        return _array_misfit(given, wanted)
-    if isinstance(given, SignalPort):
-        fits = isinstance(wanted, SignalPort) or wanted is bool
-    elif inspect.isclass(given) and inspect.isclass(wanted):
-        fits = issubclass(given, wanted)
-    else:
-        fits = given == wanted
-    return None if fits else "the types differ"
+    is_union = get_origin(annotation) in (Union, types.UnionType)
+    return get_args(annotation) if is_union else (annotation,)
 
 
 def _array_misfit(given: ArrayPort, wanted: ArrayPort) -> str | None:
@@ -282,13 +273,3 @@ def _array_misfit(given: ArrayPort, wanted: ArrayPort) -> str | None:
     if given.unit != wanted.unit:
         return f"unit '{given.unit}' where '{wanted.unit}' is wanted"
     return None
-
-
-def _describe(kind: Any) -> str:
-    if isinstance(kind, ArrayPort):
-        return f"({', '.join(map(str, kind.shape))}) {kind.dtype}, {kind.unit}"
-    if isinstance(kind, SignalPort):
-        return "signal"
-    if get_origin(kind) is Annotated:
-        return _describe(get_args(kind)[0])
-    return kind.__name__ if inspect.isclass(kind) and not get_args(kind) else str(kind).replace("typing.", "")

@@ -12,34 +12,24 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from tactflow.engine.contract import Stage
-from tactflow.engine.errors import StageError, TactflowError
+from tactflow.engine.errors import StageError
 from tactflow.engine.failure import describe_failure
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.link import Link
 from tactflow.engine.node import RunningNode, TickState
-from tactflow.engine.plan import Plan, demand, dependencies, remembers
-from tactflow.engine.stats import Durations
+from tactflow.engine.plan import demand, dependencies, remembers
 from tactflow.engine.trace import Track
+
+if TYPE_CHECKING:
+    from tactflow.engine.run import Runner
 
 logger = logging.getLogger("tactflow")
 
 _DISABLED = Absent("disabled")
 _ERROR = Absent("error")
-
-
-class Run(Protocol):
-    """What a segment needs to know of the run it belongs to."""
-
-    plan: Plan
-    nodes: dict[str, RunningNode]
-    latency: Durations
-
-    def fail(self, error: TactflowError, cause: BaseException | None = None) -> None: ...
-
-    def retake_reference(self) -> None: ...
 
 
 class NodeFailedError(Exception):
@@ -90,7 +80,7 @@ class Segment:
     frames references that its stages ask for; None where other stages may have seen those frames already.
     """
 
-    def __init__(self, name: str, run: Run, track: Track | None = None) -> None:
+    def __init__(self, name: str, run: Runner, track: Track | None = None) -> None:
         self.name = name
         self.run = run
         self.track = track
@@ -168,13 +158,15 @@ class Segment:
             for maker in node.signal_makers:
                 if maker.pulled != index:
                     self._pull(maker, tick)
-            gate = node.closed_gate(tick.values)
-            if gate is not None:
-                if not gate.repeats:
+            closed = node.closed_gate(tick.values)
+            if closed is not None:
+                gate, slot = closed
+                repeat = gate.otherwise == "repeat"
+                if not repeat:
                     # There is nothing: what was before must not be repeated after it either.
                     node.forget()
-                signal = tick.values[gate.slot]
-                node.skip(tick, signal if isinstance(signal, Absent) else gate.absent, repeat=gate.repeats)
+                signal = tick.values[slot]
+                node.skip(tick, signal if isinstance(signal, Absent) else Absent(gate.reason), repeat=repeat)
                 return
         if node.disabled:
             node.skip(tick, _DISABLED)
@@ -290,7 +282,7 @@ def _of(mine: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode
     return [mine[id_] for id_ in dict.fromkeys(ids) if id_ in mine]
 
 
-def _roots(run: Run, mine: Mapping[str, RunningNode]) -> list[tuple[RunningNode, frozenset[str] | None]]:
+def _roots(run: Runner, mine: Mapping[str, RunningNode]) -> list[tuple[RunningNode, frozenset[str] | None]]:
     """Sinks, stages that remember, and what other segments take; each with the sinks that need it, or None.
 
     Gates of other segments are taken for open: too much may be computed, never too little.
