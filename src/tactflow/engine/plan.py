@@ -131,7 +131,11 @@ def _cut(
     pipeline: Pipeline,
 ) -> tuple[list[Node], dict[str, str], dict[str, list[str]], dict[str, set[str]]]:
     """Pruned nodes; node -> its segment; segment -> its nodes; segment -> those directly or not before it."""
-    needed = _needed(pipeline)
+    needed = {pipeline.source.id, *(sink.id for sink in pipeline.sinks)}
+    # Every input comes before its user.
+    for node in reversed(list(pipeline.nodes.values())):
+        if node.id in needed:
+            needed |= dependencies(node)
     pruned = [node for node in pipeline.nodes.values() if node.id not in needed]
     nodes = [node for node in pipeline.nodes.values() if node.id in needed]
     names = _segment_names(nodes)
@@ -146,18 +150,6 @@ def _cut(
         if mine != source and not dependencies(node):
             before[mine].add(source)
     return pruned, names, members, before
-
-
-def _needed(pipeline: Pipeline) -> set[str]:
-    """The source, every sink, and all that they read from."""
-    needed = {pipeline.source.id}
-    pending = [sink.id for sink in pipeline.sinks]
-    while pending:
-        node_id = pending.pop()
-        if node_id not in needed:
-            needed.add(node_id)
-            pending.extend(dependencies(pipeline.nodes[node_id]))
-    return needed
 
 
 def _segment_names(nodes: Sequence[Node]) -> dict[str, str]:

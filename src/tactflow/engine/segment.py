@@ -266,13 +266,12 @@ class Segment:
             while (tick := self._next_tick()) is not None:
                 self.handle(tick)
         except NodeFailedError:
-            for link in self.inputs:
-                link.abort()
+            pass
         except BaseException as error:
             self.run.fail(StageError(f"segment {self.name}: {type(error).__name__}: {error}"), error)
+        finally:
             for link in self.inputs:
                 link.abort()
-        finally:
             for link, _ in self.outputs:
                 link.close()
 

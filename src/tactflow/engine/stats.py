@@ -46,8 +46,8 @@ class Durations:
             counts = list(accumulate(self._bins))
         if not counts[-1]:
             return None
-        rank = max(1, math.ceil(q * counts[-1]))
-        return _SMALLEST * math.exp((bisect_left(counts, rank) + 0.5) / _BINS_PER_E)
+        index = bisect_left(counts, max(1, math.ceil(q * counts[-1])))
+        return _SMALLEST * math.exp((index + 0.5) / _BINS_PER_E)
 
     def milliseconds(self, q: float) -> float | None:
         """`quantile` in ms, rounded to 4 digits after the point."""
