@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
@@ -98,6 +98,9 @@ class Runner:
         self._end: str | None = None
         self._frames = 0
         self._began = 0.0
+        source = pipeline.source
+        self._source_segment = self.plan.segment_of(source.id)
+        self._source_slot = self.slots[source.id, source.component.ports.outputs[0].name]
         self._source_stats = NodeStats()
         self._stopping = threading.Event()
         self._hurried = False
@@ -132,7 +135,8 @@ class Runner:
         except KeyboardInterrupt:
             self._interrupted = True
             self.stop("signal")
-            self._abort_links()
+            for link in self._links:
+                link.abort()
             until = time.perf_counter() + LEAVE_SECONDS
             for thread in self._threads.values():
                 # An interrupt may have come before it was started.
@@ -213,7 +217,7 @@ class Runner:
 
     def progress(self) -> Progress:
         """How far the run is."""
-        dropped = self._dropped() + self._missed()
+        dropped = sum(self._dropped())
         return Progress(self._frames, dropped, time.perf_counter() - self._began)
 
     # -- opening and closing ------------------------------------------------------------------------------
@@ -291,15 +295,6 @@ class Runner:
         first.references = NewReferences(self._source_slot, takers)
 
     @property
-    def _source_segment(self) -> str:
-        return self.plan.segment_of(self.pipeline.source.id)
-
-    @property
-    def _source_slot(self) -> int:
-        source = self.pipeline.source
-        return self.slots[source.id, source.component.ports.outputs[0].name]
-
-    @property
     def _is_live(self) -> bool:
         return self._source is not None and self._source.live
 
@@ -330,15 +325,12 @@ class Runner:
                 since = now
             elif now - since > CLOSE_SECONDS:
                 places = [f"{name} (in {self._segments[name].current or 'its source'})" for name in alive]
-                self._abort_links()
+                for link in self._links:
+                    link.abort()
                 raise StageError(
                     f"the run was stopped, but nothing has got on for {CLOSE_SECONDS:g} s: "
                     f"{', '.join(places)} hangs"
                 )
-
-    def _abort_links(self) -> None:
-        for link in self._links:
-            link.abort()
 
     def _close(self) -> None:
         """Close whatever was opened, last opened first; every one gets its turn.
@@ -382,7 +374,7 @@ class Runner:
 
     def _capture_frames(self, segment: Segment) -> None:
         assert self._source is not None
-        name, slot, slots = self.pipeline.source.id, self._source_slot, UNCONNECTED + 1 + len(self.slots)
+        name, slots = self.pipeline.source.id, UNCONNECTED + 1 + len(self.slots)
         sinks = [node for node in self.nodes.values() if node.sink is not None]
         frames = iter(self._source.frames())
         index = 0
@@ -404,8 +396,9 @@ class Runner:
             if segment.track is not None:
                 segment.track.add(name, began, ended, {"seq": frame.seq})
             self._frames += frame.seq >= 0
-            tick = TickState(index, frame, _demand(sinks, frame), slots)
-            tick.values[slot] = frame
+            demand = frozenset([node.id for node in sinks if _wants(node, frame)])
+            tick = TickState(index, frame, demand, slots)
+            tick.values[self._source_slot] = frame
             index += 1
             segment.handle(tick)
             if self.max_frames is not None and self._frames >= self.max_frames:
@@ -422,25 +415,22 @@ class Runner:
 
     # -- statistics ---------------------------------------------------------------------------------------
 
-    def _dropped(self) -> int:
-        """Frames dropped in front of the first segment of stages."""
-        source = self._segments.get(self._source_segment) if self._segments else None
+    def _dropped(self) -> tuple[int, int]:
+        """Frames dropped in front of the first segment of stages, and before they could be taken."""
+        source = self._segments.get(self._source_segment)
         links = [link for link, only_sinks in source.outputs if only_sinks is None] if source else []
-        return max((link.drops for link in links), default=0)
-
-    def _missed(self) -> int:
-        """Frames of a live source that were overtaken before they could be taken."""
-        return 0 if self._source is None else self._source.missed
+        missed = 0 if self._source is None else self._source.missed
+        return max((link.drops for link in links), default=0), missed
 
     def snapshot(self) -> dict[str, Any]:
         """The statistics so far. From any thread."""
         # A sink may ask while others are still being opened.
         nodes = list(self.nodes.values())
-        dropped = self._dropped()
+        dropped, missed = self._dropped()
         stages = {node.id: node.stats.entry() for node in nodes if node.sink is None}
         return {
             "frames": self._frames - dropped,
-            "dropped": dropped + self._missed(),
+            "dropped": dropped + missed,
             "wall_s": round(time.perf_counter() - self._began, 6),
             "end": self._end or "eos",
             "stages": {self.pipeline.source.id: self._source_stats.entry(), **stages},
@@ -460,18 +450,14 @@ class Runner:
         }
 
 
-def _demand(sinks: Sequence[RunningNode], frame: Frame) -> frozenset[str]:
-    """The sinks that want this frame."""
-    return frozenset([node.id for node in sinks if not node.disabled and _wants(node, frame)])
-
-
 def _wants(node: RunningNode, frame: Frame) -> bool:
-    """Whether a sink wants a frame.
+    """Whether a node is a sink that wants a frame.
 
     One that takes references gets all of them; no other gets a reference image from outside the source.
     """
     sink = node.sink
-    assert sink is not None
+    if sink is None or node.disabled:
+        return False
     if frame.reference and sink.takes_references:
         return True
     return frame.seq >= 0 and node.rate_limit.due(frame.t) and sink.wants()
