@@ -22,7 +22,7 @@ from tactflow.engine.ports import (
     read_ports,
 )
 from tactflow.ports import ContactMask, Image, Picture, Touching
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.vision.types import Contact, Flow
 
 if TYPE_CHECKING:
     from tactflow.vision.types import Ellipse
