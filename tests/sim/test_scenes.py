@@ -25,8 +25,6 @@ MOVING = [
     "box",
     "ring",
     "screw",
-]
-MOVING += [
     "two",
     "border",
     "tap",

@@ -21,7 +21,7 @@ from tactflow.calibration.presses import Press, Session, find_presses
 from tactflow.calibration.scale import centre
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import Scene, open_scene
-from tactflow.sim.elastic import MM
+from tactflow.sim.gel import MM
 from tactflow.streaming import stream
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     failed.
     """
     from tactflow.sim import open_scene
-    from tactflow.sim.export import TRUTH_SUFFIXES, NotLosslessError, frames_kind, write_frames, write_truth
+    from tactflow.sim.export import TRUTH_SUFFIXES, frames_kind, write_frames, write_truth
 
     if args.list:
         _list()
@@ -75,8 +75,6 @@ def run(args: argparse.Namespace) -> int:
         except OSError as error:
             # Its text names the unfinished file.
             raise StageError(f"{option} {path}: cannot be written: {error.strerror or error}") from error
-        except NotLosslessError as error:
-            raise StageError(f"{option} {path}: {error}") from error
         if not args.quiet:
             say(f"{path}: {len(scene)} frames of {scene.name}")
     return 0

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,39 +69,6 @@ class Programme:
     partial: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    x: float
-    y: float
-    angle: float
-    direction: float
-    sign: float
-    depth: float
-
-    @property
-    def ahead(self) -> NDArray[np.float64]:
-        """Unit vector (2,) of the direction of motion."""
-        return np.array([np.cos(self.direction), np.sin(self.direction)])
-
-
-@lru_cache(maxsize=256)
-def _plan(programme: Programme, seed: int, cycle: int, size: tuple[int, int]) -> _Plan:
-    rng = np.random.default_rng([seed, cycle, 0x6D6F])
-    x = size[0] * programme.place[0] + programme.wander[0] * rng.uniform(-1, 1)
-    y = size[1] * programme.place[1] + programme.wander[1] * rng.uniform(-1, 1)
-    angle = (
-        float(np.radians(rng.uniform(*programme.angles)))
-        if programme.angles[0] != programme.angles[1]
-        else 0.0
-    )
-    direction = float(rng.uniform(0, 2 * np.pi))
-    if programme.travel:
-        # Slide towards the centre, not off the gel.
-        direction = float(np.arctan2(size[1] * programme.place[1] - y, size[0] * programme.place[0] - x))
-    depth = programme.depths[cycle % len(programme.depths)]
-    return _Plan(float(x), float(y), angle, direction, -1.0 if cycle % 2 else 1.0, depth)
-
-
 def _smooth(value: float) -> float:
     value = min(max(value, 0.0), 1.0)
     return value * value * (3.0 - 2.0 * value)
@@ -121,6 +87,11 @@ class _Timing:
     rise: float
     envelope: float
     progress: float
+
+    @property
+    def swing(self) -> float:
+        """Relative drag or turn, from 0 to 1 and back during the hold."""
+        return float(np.sin(np.pi * _smooth(self.progress)))
 
 
 def _timing(programme: Programme, moment: int, frames: int) -> _Timing | None:
@@ -149,30 +120,37 @@ def _timing(programme: Programme, moment: int, frames: int) -> _Timing | None:
     return _Timing(cycle, phase, rise, envelope, min(max((phase - rise) / hold, 0.0), 1.0))
 
 
-def _jump(timing: _Timing, seed: int, pitch: float) -> NDArray[np.float64]:
-    """Random displacement (2,), px, changed every third frame: up to 0.45 pitches."""
-    draw = np.random.default_rng([seed, timing.cycle, int(timing.phase // 3), 0x6A75])
-    angle, radius = draw.uniform(0, 2 * np.pi), _LARGEST_JUMP * pitch * np.sqrt(draw.uniform(0.3, 1))
-    return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
-
-
-def _creep(programme: Programme, timing: _Timing) -> float:
-    """Current displacement of creep, px, back and forth."""
-    distance = programme.creep * max(timing.phase - timing.rise, 0.0) % (2 * _LARGEST_CREEP)
-    return _LARGEST_CREEP - abs(distance - _LARGEST_CREEP)
+def _place(
+    programme: Programme, seed: int, cycle: int, size: tuple[int, int]
+) -> tuple[float, float, float, NDArray[np.float64]]:
+    """Where a contact begins, px, the angle of its indenter, and the direction (2,) in which it moves."""
+    rng = np.random.default_rng([seed, cycle, 0x6D6F])
+    middle = np.multiply(size, programme.place)
+    x = middle[0] + programme.wander[0] * rng.uniform(-1, 1)
+    y = middle[1] + programme.wander[1] * rng.uniform(-1, 1)
+    low, high = programme.angles
+    angle = float(np.radians(rng.uniform(low, high))) if low != high else 0.0
+    direction = rng.uniform(0, 2 * np.pi)
+    if programme.travel:
+        # Slide towards the centre, not off the gel.
+        direction = np.arctan2(middle[1] - y, middle[0] - x)
+    return float(x), float(y), angle, np.array([np.cos(direction), np.sin(direction)])
 
 
 def _dragged(
-    programme: Programme, timing: _Timing, plan: _Plan, seed: int, pitch: float, shear: float
+    programme: Programme, timing: _Timing, ahead: NDArray[np.float64], settings: Settings, pitch: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float | None, bool]:
     """Displacements (2,), px, of the gel and of the indenter; `stick` and `sliding` of `Press`."""
-    ahead = plan.ahead
-    farthest = shear * pitch
+    farthest = settings.shear * pitch
     if programme.jumps:
-        drag = _jump(timing, seed, pitch)
+        draw = np.random.default_rng([settings.seed, timing.cycle, int(timing.phase // 3), 0x6A75])
+        angle, radius = draw.uniform(0, 2 * np.pi), _LARGEST_JUMP * pitch * np.sqrt(draw.uniform(0.3, 1))
+        drag = radius * np.array([np.cos(angle), np.sin(angle)])
         return drag, drag, None, False
     if programme.creep:
-        drag = _creep(programme, timing) * ahead
+        # Back and forth.
+        distance = programme.creep * max(timing.phase - timing.rise, 0.0) % (2 * _LARGEST_CREEP)
+        drag = (_LARGEST_CREEP - abs(distance - _LARGEST_CREEP)) * ahead
         return drag, drag, None, False
     if programme.partial:
         load = timing.progress / _FULL_LOAD
@@ -185,8 +163,7 @@ def _dragged(
         distance = programme.travel * timing.progress
         sliding = 0 < farthest < distance and timing.progress < 1
         return min(distance, farthest) * ahead, distance * ahead, None, sliding
-    swing = float(np.sin(np.pi * _smooth(timing.progress)))
-    drag = farthest * swing * ahead if shear else np.zeros(2)
+    drag = farthest * timing.swing * ahead
     return drag, drag, None, False
 
 
@@ -207,19 +184,19 @@ def presses(
     if timing is None:
         return (), -1
     pitch = min(pitch, _LARGEST_STROKE)
-    plan = _plan(programme, settings.seed, timing.cycle, size)
-    swing = float(np.sin(np.pi * _smooth(timing.progress)))
-    drag, travelled, stick, sliding = _dragged(programme, timing, plan, settings.seed, pitch, settings.shear)
-    turn = np.radians(settings.twist) * plan.sign * swing
+    x, y, angle, ahead = _place(programme, settings.seed, timing.cycle, size)
+    drag, travelled, stick, sliding = _dragged(programme, timing, ahead, settings, pitch)
+    turn = float(np.radians(settings.twist)) * (-1.0 if timing.cycle % 2 else 1.0) * timing.swing
+    depth = timing.envelope * programme.depths[timing.cycle % len(programme.depths)] * settings.depth
     indenters = [
         Press(
             shape,
-            plan.x + offset_x + float(travelled[0]),
-            plan.y + offset_y + float(travelled[1]),
-            plan.angle + float(turn),
-            timing.envelope * plan.depth * settings.depth * shape.depth,
+            x + offset_x + float(travelled[0]),
+            y + offset_y + float(travelled[1]),
+            angle + turn,
+            depth * shape.depth,
             (float(drag[0]), float(drag[1])),
-            float(turn),
+            turn,
             programme.dilation * pitch,
             settings.sink,
             settings.rim,

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.sim import elastic
 from tactflow.sim.camera import Camera, Points
-from tactflow.sim.gel import Press, displacement, in_contact, reached, surface
+from tactflow.sim.gel import Press, displacement, force, in_contact, reached, surface
 from tactflow.vision.geometry import PixelMapping
 
 FLOW_POINTS: Final = 1500
@@ -133,11 +132,11 @@ class Truth:
 
     @cached_property
     def force(self) -> tuple[float, float, float]:
-        """(x, y, z), N, on the gel: x right and y down in the picture, z presses (`tactflow.sim.elastic`).
+        """(x, y, z), N, on the gel: x right and y down in the picture, z presses.
 
         x and y along the axes of the picture where the first indenter presses.
         """
-        x, y, z = elastic.force(self._presses)
+        x, y, z = force(self._presses)
         if not (x or y):
             return x, y, z
         here = np.array([[self._presses[0].x, self._presses[0].y]])
