@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
 from tactflow.sources.files import DEFAULT_FPS, decode_image, holds_frames
-from tactflow.sources.paths import find_path, refuse_devices, split_query
+from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
 SETTINGS = {
     "dataset": "name of the frames",
     "times": "name of their times (numbers with a point are s, whole ones ns)",
     "order": "rgb (bgr if not given)",
 }
-MOST_NAMED = 30
-"""Arrays that a message lists at most. Chosen by hand."""
 BLOCK = 64 << 20
 """Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
 LARGEST_CHUNK = 1 << 30
@@ -181,14 +179,13 @@ def _open(path: Path) -> _Hdf5 | _Zarr:
 def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:
     if name is not None and f"/{name.strip('/')}" in arrays:
         return arrays[f"/{name.strip('/')}"]
-    listed = [
-        f"{key} ({array.dtype} {' x '.join(map(str, array.shape))})" for key, array in sorted(arrays.items())
-    ]
-    more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+    found = [f"{key} ({_described(array)})" for key, array in sorted(arrays.items())]
     problem = f"add ?{setting}=" if name is None else f"there is no {name}; required"
-    raise SourceError(
-        f"{spec}: {problem} one of: {', '.join(listed[:MOST_NAMED]) or 'nothing: it is empty'}{more}"
-    )
+    raise SourceError(f"{spec}: {problem} one of: {listed(found)}")
+
+
+def _described(array: Any) -> str:
+    return f"{array.dtype} {' x '.join(map(str, array.shape)) or '()'}"
 
 
 def _count(array: Any, name: str) -> int:
@@ -196,7 +193,7 @@ def _count(array: Any, name: str) -> int:
     shape, dtype = array.shape, array.dtype
     encoded = (len(shape) == 1 and dtype.kind == "O") or (len(shape) == 2 and dtype == np.uint8)
     if 0 in shape or not (encoded or holds_frames(array)):
-        raise SourceError(f"{name}: {REQUIRED}; got {dtype} of shape {' x '.join(map(str, shape)) or '()'}")
+        raise SourceError(f"{name}: {REQUIRED}; got {_described(array)}")
     if not encoded:
         check_pixel_count(name, shape[2], shape[1])
     chunk = math.prod(array.chunks or (1,)) * dtype.itemsize

@@ -16,16 +16,13 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, check_pixel_count, damaged, log, require
 from tactflow.sources.files import decode_image
-from tactflow.sources.paths import find_path, refuse_devices, split_query
+from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
 if TYPE_CHECKING:
     import av
     from mcap.records import Channel, Schema
 
 SETTINGS = {"topic": "name of a topic with pictures"}
-MOST_NAMED = 20
-"""Topics that a message lists at most. Chosen by hand."""
-
 DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf", "json": "json"}
 """Encoding of the messages in an MCAP file -> package that decodes them."""
 PACKAGES = ("sensor_msgs/msg", "sensor_msgs", "foxglove", "foxglove_msgs/msg", "foxglove_msgs")
@@ -115,25 +112,20 @@ class Bag(FrameReader):
 
 def _choose(spec: str, topic: str | None, topics: Topics) -> str:
     """The requested topic, if it is there and has pictures."""
-    listed: dict[bool, list[str]] = {True: [], False: []}
+    names: dict[bool, list[str]] = {True: [], False: []}
     for name, (kind, count) in sorted(topics.items()):
         has_pictures = _decoder(kind) is not None
         if name == topic and has_pictures:
             return name
-        listed[has_pictures].append(f"{name} ({kind}{'' if count is None else f', {count}'})")
+        names[has_pictures].append(f"{name} ({kind}{'' if count is None else f', {count}'})")
     if topic is None:
         problem = "add ?topic="
     elif topic in topics:
         problem = f"{topic} has messages of type {topics[topic][0]}, which hold no picture; required"
     else:
         problem = f"there is no topic {topic}; required"
-    found, rest = (
-        ", ".join(names[:MOST_NAMED] + [f"and {len(names) - MOST_NAMED} more"] * (len(names) > MOST_NAMED))
-        for names in listed.values()
-    )
-    raise SourceError(
-        f"{spec}: {problem} one of: {found or 'none'}; topics without pictures: {rest or 'none'}"
-    )
+    found, rest = map(listed, names.values())
+    raise SourceError(f"{spec}: {problem} one of: {found}; topics without pictures: {rest}")
 
 
 # -- files with messages ------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,6 @@ SCHEME = "lerobot:"
 SETTINGS = {"camera": "key of a camera", "episode": "number of an episode"}
 CHUNK = 1000
 """Episodes in one folder of layout v2, if the dataset does not say."""
-
-
-class Place(NamedTuple):
-    """Where an episode is. data, video : files. begin : of the episode in its video, s. frames : of it."""
-
-    data: Path
-    video: Path
-    begin: float
-    frames: int
 
 
 class LeRobotEpisode(FrameReader):
@@ -55,24 +46,23 @@ class LeRobotEpisode(FrameReader):
         refuse_devices(root / "meta")
         try:
             info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
-            self._camera, self._episode, self._is_video = _choose(spec, info, settings)
-            self._place = _find(root, info, self._camera, self._episode)
-            self._rate = float(info["fps"])
+            self._camera, self._episode, is_video = _choose(spec, info, settings)
+            self._data, video, self._begin, self.total = _find(root, info, self._camera, self._episode)
+            self.fps = self._rate = float(info["fps"])
         except SourceError:
             raise
         except Exception as error:
             raise damaged(f"{root}: this LeRobot dataset", error) from error
         super().__init__(f"{root}, {self._camera}, episode {self._episode}")
-        refuse_devices(self._place.data)
-        if self._is_video:
-            refuse_playlist(self._place.video)
-        self.fps = self._rate
-        self.total = self._place.frames
+        self._video = video if is_video else None
+        refuse_devices(self._data)
+        if self._video is not None:
+            refuse_playlist(self._video)
         self._read_first()
         self.description = f"{spec}, {self.total} frames at {self.fps:g} fps"
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        pictures = self._decode_video() if self._is_video else self._read_pictures()
+        pictures = self._read_pictures() if self._video is None else self._decode_video(self._video)
         # The column `timestamp` is the same, rounded to 32 bits.
         for index, image in enumerate(pictures):
             yield image, index / self._rate
@@ -81,23 +71,21 @@ class LeRobotEpisode(FrameReader):
         import pyarrow.dataset as ds  # type: ignore[import-untyped]
 
         wanted = ds.field("episode_index") == self._episode
-        dataset = ds.dataset(self._place.data)
-        for batch in dataset.to_batches(columns=[self._camera], filter=wanted, batch_size=16):
+        for batch in ds.dataset(self._data).to_batches(columns=[self._camera], filter=wanted, batch_size=16):
             for row in batch.to_pylist():
                 yield decode_image(row[self._camera]["bytes"], self.name)
 
-    def _decode_video(self) -> Iterator[NDArray[np.uint8]]:
+    def _decode_video(self, path: Path) -> Iterator[NDArray[np.uint8]]:
         import av
 
-        place = self._place
-        left = place.frames
-        with av.open(str(place.video)) as file:
+        left = self.total or 0
+        with av.open(str(path)) as file:
             (stream, *_) = file.streams.video
             check_pixel_count(self.name, stream.width, stream.height)
             # To the key frame before; from there every picture is decoded.
-            file.seek(round(place.begin / (stream.time_base or 1)), stream=stream)
+            file.seek(round(self._begin / (stream.time_base or 1)), stream=stream)
             for frame in file.decode(stream):
-                if frame.time is not None and frame.time < place.begin - 0.5 / self._rate:
+                if frame.time is not None and frame.time < self._begin - 0.5 / self._rate:
                     continue
                 if left == 0:
                     return
@@ -124,25 +112,24 @@ def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int, b
     return camera, int(episode), cameras[camera] == "video"
 
 
-def _find(root: Path, info: Any, camera: str, episode: int) -> Place:
+def _find(root: Path, info: Any, camera: str, episode: int) -> tuple[Path, Path, float, int]:
+    """An episode's table and video, where it begins in the video, s, and the number of its frames."""
     if str(info["codebase_version"]).startswith("v2"):
         chunk = f"chunk-{episode // int(info.get('chunks_size', CHUNK)):03d}"
         data = root / "data" / chunk / f"episode_{episode:06d}.parquet"
         video = root / "videos" / chunk / camera / f"episode_{episode:06d}.mp4"
         lines = (root / "meta" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
         lengths = {line["episode_index"]: int(line["length"]) for line in map(json.loads, lines)}
-        return Place(data, video, 0.0, lengths[episode])
+        return data, video, 0.0, lengths[episode]
     import pyarrow.dataset as ds
 
     table = ds.dataset(root / "meta" / "episodes", format="parquet")
     (row,) = table.to_table(filter=ds.field("episode_index") == episode).to_pylist()
 
-    def file(key: str, suffix: str) -> str:
-        return f"chunk-{int(row[f'{key}/chunk_index']):03d}/file-{int(row[f'{key}/file_index']):03d}{suffix}"
+    def file(key: str, suffix: str) -> Path:
+        chunk, number = int(row.get(f"{key}/chunk_index", 0)), int(row.get(f"{key}/file_index", 0))
+        return root / key / f"chunk-{chunk:03d}" / f"file-{number:03d}{suffix}"
 
-    data, key = root / "data" / file("data", ".parquet"), f"videos/{camera}"
-    if f"{key}/file_index" not in row:
-        return Place(data, data, 0.0, int(row["length"]))
-    return Place(
-        data, root / key / file(key, ".mp4"), float(row[f"{key}/from_timestamp"]), int(row["length"])
-    )
+    key = f"videos/{camera}"
+    begin = float(row.get(f"{key}/from_timestamp", 0.0))
+    return file("data", ".parquet"), file(key, ".mp4"), begin, int(row["length"])

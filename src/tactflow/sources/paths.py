@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import parse_qsl
 
 from tactflow.engine.errors import SourceError
 from tactflow.system.files import expanded, is_device
+
+MOST_LISTED = 20
+"""Names that a message lists at most. Chosen by hand."""
 
 
 def locate(spec: str, directory: Path | None) -> Path | None:
@@ -109,6 +112,12 @@ def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> 
             raise SourceError(f"{spec}: {key}={value}: required {describe_settings(known)}")
         settings[key] = value
     return name, settings
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names, for a message: "a, b and 3 more"; "none" if there are none."""
+    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
+    return (", ".join(names[:MOST_LISTED]) or "none") + more
 
 
 def describe_settings(known: Mapping[str, str]) -> str:
