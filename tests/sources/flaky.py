@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tests.clock import ManualClock
+from tactflow.sources import Arrival, Watched
+from tests.clock import PATIENCE, ManualClock
 
 PERIOD = 0.01
 """Time between the scripted device's frames on its clock, s."""
@@ -93,3 +94,29 @@ class Connection:
 
     def close(self) -> None:
         self.device.closed += 1
+
+
+class Reading:
+    """Reads a source in another thread, until its end or `stop`."""
+
+    def __init__(self, source: Watched) -> None:
+        self.source = source
+        self.arrivals: list[Arrival] = []
+        self.error = ""
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            while (arrival := self.source.read_arrival()) is not None:
+                self.arrivals.append(arrival)
+        except SourceError as error:
+            self.error = str(error)
+
+    def join(self) -> None:
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
+
+    def stop(self) -> None:
+        self.source.stop()
+        self.join()

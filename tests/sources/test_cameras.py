@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactflow.cli import cameras as command
-from tactflow.sources.cameras import Abilities, ask_driver, list_cameras
+from tactflow.sources.cameras import Abilities, list_cameras
 
 GEL = Abilities("GelSight Mini", True, {"MJPG": [(800, 600), (320, 240)], "YUYV": []})
 METADATA = Abilities("GelSight Mini", False, {})
@@ -34,6 +34,7 @@ def ask(device: Path) -> Abilities:
 
 
 def test_cameras_are_listed_by_index_under_their_steadiest_names(dev: Path) -> None:
+    (dev / "v4l" / "by-id" / "usb-Unplugged-video-index0").symlink_to("../../video7")
     cameras = list_cameras(dev, ask)
     assert [camera.index for camera in cameras] == [0, 1, 10]
     by_id = f"{dev}/v4l/by-id/usb-GelSight_R0B1-video-index0"
@@ -44,20 +45,10 @@ def test_cameras_are_listed_by_index_under_their_steadiest_names(dev: Path) -> N
     assert "usermod -aG video" in cameras[2].problem
 
 
-def test_a_link_whose_camera_was_unplugged_is_not_listed(dev: Path) -> None:
-    (dev / "v4l" / "by-id" / "usb-Gone-video-index0").symlink_to("../../video7")
-    assert not any("Gone" in name for camera in list_cameras(dev, ask) for name in camera.names)
-
-
 def test_a_device_that_is_no_camera_is_listed_with_the_drivers_refusal(dev: Path) -> None:
     camera = list_cameras(dev)[0]
     assert camera.abilities is None
     assert camera.problem
-
-
-def test_asking_what_is_no_driver_is_an_os_error(dev: Path) -> None:
-    with pytest.raises(OSError, match="ioctl"):
-        ask_driver(dev / "video0")
 
 
 def test_a_camera_is_described_with_formats_and_all_its_names(dev: Path) -> None:
@@ -77,20 +68,23 @@ def test_the_command_lists_cameras_as_json(dev: Path, capsys: pytest.CaptureFixt
     assert [line["index"] for line in lines] == [0, 1, 10]
 
 
+@pytest.mark.parametrize(
+    ("system", "words"),
+    [
+        ("linux", ["no camera is plugged in", "dmesg"]),
+        ("darwin", ["--source 0"]),
+        ("win32", ["--source 0"]),
+    ],
+)
 def test_without_a_camera_the_command_says_what_to_try(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command.run(argparse.Namespace(dev=tmp_path, json=False)) == 0
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "no camera is plugged in" in err
-    assert "dmesg" in err
-
-
-@pytest.mark.parametrize("system", ["darwin", "win32"])
-def test_elsewhere_than_on_linux_the_command_says_that_cameras_have_numbers_only(
-    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    system: str,
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(command.sys, "platform", system)
     assert command.run(argparse.Namespace(dev=tmp_path, json=False)) == 0
-    assert "--source 0" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert all(word in err for word in words)

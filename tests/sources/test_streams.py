@@ -6,16 +6,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import Frame
-from tactflow.sources import open_source
-from tactflow.stages.capture import Capture
+from tactflow.sources import Watch, Watched, open_source
 from tests.clock import PATIENCE, until
+from tests.sources.flaky import Reading
 
 
 class Server:
@@ -82,33 +82,21 @@ def server() -> Iterator[Server]:
     server.stop()
 
 
-class Reading:
-    """A capture of a stream, read in a thread of its own."""
+@pytest.fixture
+def watched(server: Server) -> Iterator[Callable[..., Reading]]:
+    """Opens the stream, watched, and reads it in another thread."""
+    opened: list[Reading] = []
 
-    def __init__(self, server: Server, **params: object) -> None:
-        self.stage = Capture(Capture.Params.model_validate({"source": server.address, **params}))
-        self.stage.open()
-        self.frames: list[Frame] = []
-        self.error: SourceError | None = None
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+    def read(**settings: Any) -> Reading:
+        source = open_source(server.address, watch=Watch(**settings))
+        assert isinstance(source, Watched)
+        opened.append(Reading(source))
+        return opened[-1]
 
-    def _run(self) -> None:
-        try:
-            self.frames.extend(self.stage.frames())
-        except SourceError as error:
-            self.error = error
-
-    def until(self, condition: Callable[[], object]) -> None:
-        until(condition, lambda: f"{len(self.frames)} frames, {self.stage.state}, {self.error}")
-
-    def ended(self) -> bool:
-        return not self._thread.is_alive()
-
-    def close(self) -> None:
-        self.stage.stop()
-        self._thread.join(PATIENCE)
-        self.stage.close()
+    yield read
+    for reading in opened:
+        reading.stop()
+        reading.source.close()
 
 
 def test_a_stream_gives_its_frames_stamped_on_arrival(server: Server) -> None:
@@ -139,50 +127,46 @@ def test_an_address_without_a_stream_is_an_error_without_the_password(
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize(
-    ("does", "says"),
-    [
-        ("gone", "is gone since"),
-        ("silent", "no frames since"),
-    ],
-)
+@pytest.mark.parametrize(("does", "says"), [("gone", "is gone since"), ("silent", "no frames since")])
 def test_a_stream_that_fails_is_reported_and_comes_back(
-    does: str, says: str, server: Server, caplog: pytest.LogCaptureFixture
+    does: str,
+    says: str,
+    server: Server,
+    watched: Callable[..., Reading],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    reading = Reading(server)
-    try:
-        reading.until(lambda: len(reading.frames) > 10)
-        if does == "gone":
-            server.stop()
-        server.does = does
-        reading.until(lambda: says in caplog.text)
-        reading.until(lambda: reading.stage.state != "running")
-        server.does = "good"
-        if does == "gone":
-            server.start()
-        reading.until(lambda: reading.stage.state == "running")
-        count = len(reading.frames)
-        reading.until(lambda: len(reading.frames) > count + 10)
-    finally:
-        reading.close()
+    reading = watched()
+    arrivals = reading.arrivals
+    until(lambda: len(arrivals) > 10)
+    if does == "gone":
+        server.stop()
+    server.does = does
+    until(lambda: says in caplog.text and reading.source.state != "running", lambda: caplog.text)
+    server.does = "good"
+    if does == "gone":
+        server.start()
+    until(lambda: reading.source.state == "running")
+    count = len(arrivals)
+    until(lambda: len(arrivals) > count + 10)
     assert "is back after" in caplog.text
-    assert [frame.seq for frame in reading.frames] == sorted({frame.seq for frame in reading.frames})
-    assert {frame.epoch for frame in reading.frames} == {0}
+    assert [arrival.seq for arrival in arrivals] == sorted({arrival.seq for arrival in arrivals})
 
 
-def test_a_server_that_stays_away_ends_the_run_with_what_to_try(server: Server) -> None:
-    reading = Reading(server, no_frame_timeout=0.5)
-    reading.until(lambda: reading.frames)
+def test_a_server_that_stays_away_ends_the_run_with_what_to_try(
+    server: Server, watched: Callable[..., Reading]
+) -> None:
+    reading = watched(no_frame_timeout=0.5)
+    until(lambda: reading.arrivals)
     server.stop()
-    reading.until(reading.ended)
-    reading.close()
-    assert "gone, no good frame for" in str(reading.error)
-    assert "no stream can be opened there" in str(reading.error)
+    reading.join()
+    assert "gone, no good frame for" in reading.error
+    assert "no stream can be opened there" in reading.error
 
 
-def test_without_reconnection_a_server_that_goes_away_is_the_end(server: Server) -> None:
-    reading = Reading(server, reconnect=False)
+def test_without_reconnection_a_server_that_goes_away_is_the_end(
+    server: Server, watched: Callable[..., Reading]
+) -> None:
+    reading = watched(reconnect=False)
     server.stop()
-    reading.until(reading.ended)
-    reading.close()
-    assert reading.error is None
+    reading.join()
+    assert reading.error == ""

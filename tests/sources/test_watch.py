@@ -13,8 +13,8 @@ from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.sources import Arrival, Watch, Watched
 from tactflow.stages.capture import Capture
-from tests.clock import PATIENCE, until
-from tests.sources.flaky import Flaky
+from tests.clock import until
+from tests.sources.flaky import Flaky, Reading
 
 QUICK = {
     "no_frame_timeout": None,
@@ -74,25 +74,6 @@ def take(source: Watched, count: int = 5) -> list[Arrival]:
     arrivals = [source.read_arrival() for _ in range(count)]
     assert None not in arrivals
     return [arrival for arrival in arrivals if arrival is not None]
-
-
-class Reading:
-    """Reads a source in another thread."""
-
-    def __init__(self, source: Watched) -> None:
-        self.source = source
-        self.arrivals: list[Arrival] = []
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while (arrival := self.source.read_arrival()) is not None:
-            self.arrivals.append(arrival)
-
-    def stop(self) -> None:
-        self.source.stop()
-        self._thread.join(PATIENCE)
-        assert not self._thread.is_alive()
 
 
 FAULTS = {
