@@ -46,6 +46,8 @@ def test_options_behind_a_pattern_hold_for_all_that_match(data: Path) -> None:
     found = find_recordings(["b/*.npy?fps=30"])
     assert [one.source for one in found] == [f"{data}/b/press-{number}.npy?fps=30" for number in (2, 10)]
     assert names("b/p*-?.npy") == ["press-2.npy"]
+    assert names("b/press-2.npy?topic=/gel") == ["press-2.npy?topic=/gel"]
+    assert names("lerobot:a?episode=1", "b/press-2.npy")[0] == f"lerobot:{data / 'a'}?episode=1"
 
 
 def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:

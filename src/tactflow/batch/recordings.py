@@ -165,7 +165,9 @@ def _inside(folder: Path) -> Iterator[str]:
 
 
 def _short_names(sources: Sequence[str]) -> list[str]:
-    """Paths relative to the folder that all recordings share; simulated sources unchanged."""
-    paths = [source for source in sources if not source.startswith("sim:")]
-    shared = os.path.commonpath([os.path.dirname(path) for path in paths]) if paths else ""
-    return [source if source.startswith("sim:") else os.path.relpath(source, shared) for source in sources]
+    """Sources without the folders that all recordings share; simulated ones unchanged."""
+    # Options, such as `?topic=/gel`, are not part of the path.
+    paths = [source.partition("?")[0] for source in sources if not source.startswith("sim:")]
+    shared = os.path.commonprefix(paths)
+    shared = shared[: shared.rfind(os.sep) + 1]
+    return [source.removeprefix(shared) for source in sources]
