@@ -168,6 +168,6 @@ def _short_names(sources: Sequence[str]) -> list[str]:
     """Sources without the folders that all recordings share; simulated ones unchanged."""
     # Options, such as `?topic=/gel`, are not part of the path.
     paths = [source.partition("?")[0] for source in sources if not source.startswith("sim:")]
-    shared = os.path.commonprefix(paths)
+    shared = os.path.commonprefix(paths)  # noqa: RUF071 - a path may follow a prefix such as lerobot:
     shared = shared[: shared.rfind(os.sep) + 1]
     return [source.removeprefix(shared) for source in sources]
