@@ -77,7 +77,7 @@ def test_pictures_kept_as_files_are_decoded(tmp_path: Path) -> None:
 
 
 WRONG = {
-    "?dataset=/gel/flat": "required uint8 or uint16 of N x H x W x 3 .*; got int32 5",
+    "?dataset=/gel/flat": "required uint8 or uint16 of N x H x W x 3 .*, got int32 of shape 5",
     "?dataset=/gel/frames&times=/gel/frames": r"times are uint8 of shape .*; required 5 numbers",
     "?dataset=/gel/frames&order=gbr": "order=gbr: required bgr or rgb",
     "?set=/gel/frames": "set=/gel/frames: required dataset=name of the frames, times=",

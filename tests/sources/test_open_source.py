@@ -235,7 +235,7 @@ BAD_FILES: dict[str, tuple[str, bytes, str]] = {
     "floats": ("a.npy", npy(np.zeros((2, 4, 5, 3))), "uint8 .*float64 of shape 2 x 4 x 5 x 3"),
     "0 axes": ("a.npy", npy(np.array(7, np.uint8)), r"N x H x W.* of shape \(\)"),
     "2 channels": ("a.npy", npy(np.zeros((2, 4, 5, 2), np.uint8)), "2 x 4 x 5 x 2"),
-    "one image": ("a.npy", npy(np.zeros((4, 5, 3), np.uint8)), r"a single image\? Save it as array\[None\]"),
+    "one image": ("a.npy", npy(np.zeros((4, 5, 3), np.uint8)), r"a single picture\? Give array\[None\]"),
     "no frames": ("a.npy", npy(np.zeros((0, 4, 5, 3), np.uint8)), "0 x 4 x 5 x 3"),
     "cut array": ("a.npy", npy(FRAMES)[:-10], "is cut off"),
     "archive": ("a.npz", npy(FRAMES, np.savez), r"a \.npz archive; save its array with np\.save"),

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
-from tactflow.sources.files import DEFAULT_FPS, decode_image, holds_frames
+from tactflow.sources.base import FrameReader, check_array, damaged, require
+from tactflow.sources.files import DEFAULT_FPS, decode_image
 from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
 SETTINGS = {
@@ -26,8 +26,6 @@ LARGEST_CHUNK = 1 << 30
 """Bytes of an uncompressed chunk at most, so that a damaged file does not take all memory. Chosen by hand."""
 ZARR_METADATA = frozenset(["zarr.json", ".zarray", ".zattrs"])
 """Files that lie beside the chunks of a Zarr array."""
-REQUIRED = "required uint8 or uint16 of N x H x W x 3 (BGR) or N x H x W (gray), or N JPEG or PNG files"
-"""What an array of frames is, for messages."""
 
 
 class ArrayDataset(FrameReader):
@@ -179,23 +177,19 @@ def _open(path: Path) -> _Hdf5 | _Zarr:
 def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:
     if name is not None and f"/{name.strip('/')}" in arrays:
         return arrays[f"/{name.strip('/')}"]
-    found = [f"{key} ({_described(array)})" for key, array in sorted(arrays.items())]
+    found = [
+        f"{key} ({array.dtype} {' x '.join(map(str, array.shape))})" for key, array in sorted(arrays.items())
+    ]
     problem = f"add ?{setting}=" if name is None else f"there is no {name}; required"
     raise SourceError(f"{spec}: {problem} one of: {listed(found)}")
 
 
-def _described(array: Any) -> str:
-    return f"{array.dtype} {' x '.join(map(str, array.shape)) or '()'}"
-
-
 def _count(array: Any, name: str) -> int:
-    """The number of frames of an array. Raises SourceError if it holds none, or too large ones."""
+    """The number of frames. Raises SourceError if there are none, or too large ones."""
     shape, dtype = array.shape, array.dtype
-    encoded = (len(shape) == 1 and dtype.kind == "O") or (len(shape) == 2 and dtype == np.uint8)
-    if 0 in shape or not (encoded or holds_frames(array)):
-        raise SourceError(f"{name}: {REQUIRED}; got {_described(array)}")
-    if not encoded:
-        check_pixel_count(name, shape[2], shape[1])
+    are_files = (array.ndim == 1 and dtype.kind == "O") or (array.ndim == 2 and dtype == np.uint8)
+    if 0 in shape or not are_files:
+        check_array(array, name)
     chunk = math.prod(array.chunks or (1,)) * dtype.itemsize
     if chunk > LARGEST_CHUNK:
         raise SourceError(f"{name}: has chunks of {chunk} bytes; required at most {LARGEST_CHUNK}")

@@ -262,6 +262,29 @@ def _note_16_bits(image: NDArray[np.uint16], name: str) -> None:
         )
 
 
+def check_array(array: Any, name: str) -> None:
+    """Refuse an array, of NumPy, HDF5 or Zarr, that holds no frames.
+
+    Raises
+    ------
+    SourceError
+        If it is not uint8 or uint16 of N x H x W or N x H x W x C with C in 1, 3, 4, or a picture has more
+        than `MOST_PIXELS`.
+    """
+    required = "required uint8 or uint16 of N x H x W x 3 (BGR) or N x H x W (gray)"
+    got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
+    if array.ndim == 3 and array.shape[2] in (3, 4):
+        raise SourceError(f"{name}: {required}, {got}; a single picture? Give array[None]")
+    if (
+        array.dtype.newbyteorder("=") not in (np.uint8, np.uint16)
+        or array.ndim not in (3, 4)
+        or array.shape[3:] not in ((), (1,), (3,), (4,))
+        or 0 in array.shape
+    ):
+        raise SourceError(f"{name}: {required}, {got}")
+    check_pixel_count(name, array.shape[2], array.shape[1])
+
+
 def check_pixel_count(name: str, width: int, height: int) -> None:
     """Refuse pictures of more pixels than a camera has, before memory is allocated for them.
 

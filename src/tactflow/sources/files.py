@@ -19,7 +19,7 @@ from tactflow.sources.base import (
     BgrImage,
     CaptureReader,
     FrameReader,
-    check_pixel_count,
+    check_array,
     damaged,
     log,
     to_bgr,
@@ -238,7 +238,6 @@ class ArrayFile(FrameReader):
         self.fps = fps or DEFAULT_FPS
         self.total, height, width = self._array.shape[:3]
         self.size = (width, height)
-        check_pixel_count(self.name, width, height)
         self.description = f"{path}, {self.total} frames"
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
@@ -252,7 +251,6 @@ class ArrayFile(FrameReader):
 
 
 def _map_array(path: Path) -> np.memmap[Any, Any]:
-    required = "required a uint8 array of N x H x W x 3 (BGR) or N x H x W (gray)"
     try:
         # Not np.load, which would also take archives and pickles.
         array = np.lib.format.open_memmap(path, mode="r")
@@ -261,28 +259,14 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
     except Exception as error:
         # The header is read as Python source is: what is wrong with it raises whatever a parser can.
         if ZIP_MAGIC in str(error):
-            raise SourceError(f"{path}: a .npz archive; save its array with np.save; {required}") from error
+            raise SourceError(f"{path}: a .npz archive; save its array with np.save") from error
         if "mmap length" in str(error) or "file size" in str(error):
             raise SourceError(
                 f"{path}: the file is cut off: it holds fewer bytes than its header promises; copy it again"
             ) from error
-        raise SourceError(f"{path}: not a .npy file, or a damaged one; {required}") from error
-    got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
-    if array.ndim == 3 and array.shape[2] in (3, 4):
-        raise SourceError(f"{path}: {required}, {got}; a single image? Save it as array[None]")
-    if not holds_frames(array):
-        raise SourceError(f"{path}: {required}, {got}")
+        raise SourceError(f"{path}: not a .npy file, or a damaged one") from error
+    check_array(array, str(path))
     return array
-
-
-def holds_frames(array: Any) -> bool:
-    """Whether an array holds frames: uint8 or uint16, N x H x W or N x H x W x C with C in 1, 3, 4."""
-    return (
-        array.dtype.newbyteorder("=") in (np.uint8, np.uint16)
-        and array.ndim in (3, 4)
-        and array.shape[3:] in ((), (1,), (3,), (4,))
-        and 0 not in array.shape
-    )
 
 
 def refuse_playlist(path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader
+from tactflow.sources.base import FrameReader, check_array
 from tactflow.sources.files import DEFAULT_FPS
 
 
@@ -39,11 +39,8 @@ class MemoryFrames(FrameReader):
 
     def __init__(self, frames: Iterable[NDArray[Any]], fps: float | None = None) -> None:
         super().__init__("frames in memory")
-        if isinstance(frames, np.ndarray) and (frames.ndim < 3 or frames.shape[2:] in ((3,), (4,))):
-            raise SourceError(
-                f"an array of shape {frames.shape}: required N x H x W x 3 (BGR) or N x H x W (gray); "
-                "a single picture? Give array[None]"
-            )
+        if isinstance(frames, np.ndarray):
+            check_array(frames, "an array")
         self.fps = fps or DEFAULT_FPS
         self.total = len(frames) if isinstance(frames, Sized) else None
         self.description = f"{'' if self.total is None else f'{self.total} '}frames in memory"
