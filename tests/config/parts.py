@@ -144,23 +144,8 @@ class Viewer(Sink):
         pass
 
 
-class Forgetful(Stage):
-    def process(self, image: Image) -> Contact:
-        raise NotImplementedError
-
-
 class Bare(Stage):
     memory = "pure"
 
     def process(self, image) -> Contact:  # type: ignore[no-untyped-def]
         raise NotImplementedError
-
-
-class Both(Sink):
-    memory = "pure"
-
-    def process(self, image: Image) -> Contact:
-        raise NotImplementedError
-
-    def write(self, image: Image) -> None:
-        pass

@@ -29,11 +29,8 @@ BASES = {"file": "", "top": "", "source": HEAD, "prepare": PREPARE, "compare": C
 
 CASES = [
     ("file", "§", "the file is empty .. required"),
-    ("file", "§# nothing here", "the file is empty"),
     ("file", "§- capture\n- hull", "expected a mapping .. got a list"),
-    ("file", "§hello", "expected a mapping .. got 'hello'"),
     ("file", "stages:\n§\tcapture: {}", "tab character .. blanks"),
-    ("file", "stages: {capture: {\n§", "not valid YAML"),
     ("file", "sensor: 'main\nstages: {}\n§", "not valid YAML .. starts in line 1"),
     ("file", "sensor: a§: b", "not valid YAML .. quotes"),
     ("file", "sinks:\n  out: {use: @Publish}\n§---\nstages:\n  capture: {use: @Source}", "second document"),
@@ -42,14 +39,11 @@ CASES = [
     ("file", "§stages: &all\n  capture: *all", "nested too deeply"),
     ("file", 'sensor: "a§\x01b"', "#x0001 .. not allowed"),
     ("top", "sensor: a\n§sensor: b", "sensor: duplicate key .. line 1, column 1"),
-    ("source", "  prepare: {use: @Prepare, gamma: 1, §gamma: 2}", "gamma: duplicate key"),
     ("source", "  §yes: {}", "a key must be text .. quotes"),
-    ("source", "  prepare:\n    <<: [§1]", "for merging, but found scalar"),
     ("top", "§stagse: {}", "stagse: unknown key .. did you mean stages?"),
     ("file", "§sensor: main", "stages: required, but not given .. id -> stage"),
     ("file", "stages:\n  §- capture\nSINK", "stages: should be a mapping .. got a list"),
     ("file", "§stages: {}\nSINK", "no source of frames .. capture"),
-    ("source", "sinks: §zmq", "sinks: should be a mapping .. got 'zmq'"),
     ("source", "  prepare: §fast", "stages.prepare: should be a mapping .. got 'fast'"),
     ("source", "  §a.b: {}", "stages.a.b: should be a word"),
     (
@@ -57,10 +51,7 @@ CASES = [
         "sinks:\n  §capture: {use: @Publish}",
         "the id capture is taken by stages.capture .. bad.yaml:2:3",
     ),
-    ("top", "sensor: §left hand", "sensor: should be a word .. got 'left hand'"),
     ("top", "skipping: §1", "skipping: should be a valid boolean, got 1"),
-    ("top", "opencv_threads: §-1", "opencv_threads: should be greater than or equal to 0"),
-    ("source", "  prepare: {use: @Prepare, queue: §4}", "stages.prepare.queue: should be a mapping .. got 4"),
     (
         "source",
         "  prepare: {use: @Prepare, queue: {when_full: §lates}}",
@@ -71,11 +62,6 @@ CASES = [
         "  prepare: {use: @Prepare, on_error: §ignore}",
         "on_error: should be 'stop', 'skip_frame' or 'disable', got 'ignore'",
     ),
-    (
-        "source",
-        "  prepare: {use: @Prepare, on_error: {action: skip_frame, budget: §many}}",
-        "on_error.budget: should be a valid integer, got 'many'",
-    ),
     ("source", "  prepare: {use: @Prepare, §max_rate: 5}", "stages.prepare.max_rate: unknown parameter"),
     ("source", "  h: {use: §captur}", "no stage called captur .. did you mean capture?"),
     ("source", "  §teleport:", "stages.teleport: there is no stage called teleport .. ./file.py:Class"),
@@ -83,17 +69,6 @@ CASES = [
     ("source", "sinks:\n  out: {use: §@Prepare}", "is a stage; it belongs under stages:"),
     ("source", "  a: {use: §'./nowhere.py:A'}", "cannot read ./nowhere.py .. No such file"),
     ("source", "  a: {use: §@Prepar}", "no class Prepar .. did you mean Prepare?"),
-    (
-        "source",
-        "  a: {use: §'collections:OrderedDict'}",
-        "OrderedDict must inherit from Source or Stage or Sink of tactflow",
-    ),
-    (
-        "source",
-        "  a: {use: §@Both}",
-        "is a sink; it belongs under sinks:",
-    ),
-    ("prepare", "  a: {use: §@Forgetful}", "must declare memory .. stateful"),
     ("prepare", "  a: {use: §@Bare}", "Bare.process .. parameter image has no annotation"),
     (
         "compare",
@@ -103,21 +78,13 @@ CASES = [
     ("prepare", "  §a: {use: @Needy}", "stages.a.path: required, but not given"),
     ("source", "  p: {use: @Prepare, gamma: §high}", "stages.p.gamma: should be a valid number, got 'high'"),
     ("source", "  p: {use: @Prepare, gamma: §yes}", "should be a valid number, got true"),
-    (
-        "compare",
-        "  o: {use: @Outline, min_area: §2.5}",
-        "stages.o.min_area: should be a valid integer, got 2.5",
-    ),
-    ("source", "  p: {use: @Prepare, gamma: §5.5}", "should be less than or equal to 5, got 5.5"),
     ("source", "  p: {use: @Prepare, gamma: §.nan}", "should be a finite number"),
     ("source", "  p:\n    use: @Prepare\n    gamma:§", "got nothing"),
-    ("source", "  p: {use: @Prepare, rotate: §45}", "stages.p.rotate: should be 0, 90, 180 or 270, got 45"),
     (
         "source",
         "  p: {use: @Prepare, method: §pyramide}",
         "should be 'area' or 'pyramid', got 'pyramide'; did you mean pyramid?",
     ),
-    ("source", "  p: {use: @Prepare, corners: §3}", "should be a list, got 3"),
     (
         "source",
         "  p:\n    use: @Prepare\n    corners:\n      - [1, 2]\n      - [3, §x]",
@@ -130,18 +97,8 @@ CASES = [
     ),
     (
         "source",
-        "  p: {use: @Prepare, corners: §[[1, 2], [1, 2], [1, 2], [1, 2], [1, 2]]}",
-        "stages.p.corners: should have at most 4 items, not 5",
-    ),
-    (
-        "source",
         "  p: {use: @Prepare, lens: {focal: 3, §fishey: true}}",
         "stages.p.lens.fishey: unknown parameter; did you mean fisheye?",
-    ),
-    (
-        "source",
-        "  p: {use: @Prepare, §lens: {fisheye: true}}",
-        "stages.p.lens.focal: required, but not given",
     ),
     (
         "file",
@@ -153,10 +110,8 @@ CASES = [
         "  p: {use: @Prepare, shift: §{angle: steep}}",
         "stages.p.shift: by: required .. or angle: should be a valid number, got a mapping",
     ),
-    ("compare", "  o: {use: @Outline, name: §abcdefghi}", "at most 8 characters"),
     ("source", "  §p: {use: @Prepare, size: [3, 4]}", "stages.p: size needs corners"),
     ("source", "  §second: {use: @Source}", "one source .. capture ( .. bad.yaml:2:3"),
-    ("file", "§stages:\n  prepare: {use: @Prepare}\nSINK", "no source of frames"),
     (
         "prepare",
         "  §outline: {use: @Outline}",
@@ -167,14 +122,12 @@ CASES = [
         "  §outline: {use: @Outline}\n  compare: {use: @Compare}",
         "compare gives it but stands below .. in: {contact_mask: compare.contact_mask}",
     ),
-    ("compare", "sinks:\n  out: {use: @Publish}\nsensors: §{}", "sensors: should have at least 1 item"),
     ("prepare", "sinks:\n  §out: {use: @Require}", "needs contact, but no stage gives it"),
     (
         "compare",
         "  o: {use: @Outline, in: {§contactmask: compare.contact_mask}}",
         "o has no input contactmask; did you mean contact_mask?",
     ),
-    ("compare", "  o: {use: @Outline, in: §[compare]}", "stages.o.in: should be a mapping, got a list"),
     (
         "compare",
         "  o: {use: @Outline, in: {contact_mask: §compar.contact_mask}}",
@@ -204,11 +157,6 @@ CASES = [
     ),
     (
         "compare",
-        "  o: {use: @Refine, in: {contact: §prepare}}",
-        "the input contact takes Contact, but prepare.image .. the types differ",
-    ),
-    (
-        "compare",
         "  a: {use: @Refine, in: {contact: §b}}\n  b: {use: @Refine}",
         "form a cycle, b -> a -> b .. a takes b.contact .. b takes a.contact .. bad.yaml:6:3",
     ),
@@ -229,17 +177,6 @@ CASES = [
         "compare",
         "  o: {use: @Outline, §when: {otherwise: repeat}}",
         "stages.o.when.signal: required, but not given .. bool port",
-    ),
-    ("compare", "  o: {use: @Outline, when: §5}", "when: should be a valid string .. got 5"),
-    (
-        "compare",
-        "  o: {use: @Outline, when: {signal: touching, §otherwize: repeat}}",
-        "when.otherwize: unknown key; did you mean otherwise?",
-    ),
-    (
-        "compare",
-        "  o: {use: @Outline, when: {signal: touching, otherwise: §zero}}",
-        "when.otherwise: should be 'absent' or 'repeat', got 'zero'",
     ),
     (
         "prepare",

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.config.load import load_pipeline
 from tactflow.config.registry import available, catalogue, resolve
 from tactflow.engine.errors import ConfigError
 
@@ -142,42 +141,3 @@ def test_a_class_imported_into_a_loose_file_does_not_count_as_its_own(tmp_path: 
         + STAGE.format(name="Edges").replace("from __future__ import annotations", "")
     )
     assert resolve("./edges.py", "stages", tmp_path).cls.__name__ == "Edges"
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        (
-            "def __init__(self, params: StageParams)",
-            "def __init__(self)",
-            "must be built from its parameters",
-        ),
-        (
-            '    memory = "pure"\n',
-            '    memory = "none"\n',
-            "must declare memory = .* got 'none'",
-        ),
-        ('    memory = "pure"\n', '    memory = "pure"\n    Params = dict\n', "must be a subclass of"),
-        (
-            '    memory = "pure"\n',
-            '    memory = "pure"\n    class Params(StageParams):\n        queue: int = 3\n',
-            "Params.queue: that name is a key of the pipeline file",
-        ),
-    ],
-)
-def test_a_class_that_breaks_the_contract_is_refused_with_its_line(
-    old: str, new: str, words: str, tmp_path: Path
-) -> None:
-    (tmp_path / "edges.py").write_text(STAGE.format(name="Edges").replace(old, new))
-    with pytest.raises(ConfigError, match=rf"edges\.py:\d+: Edges.*{words}"):
-        resolve("./edges.py", "stages", tmp_path)
-
-
-def test_a_stage_in_a_loose_file_replaces_a_built_in_one(tmp_path: Path) -> None:
-    (tmp_path / "edges.py").write_text(STAGE.format(name="Edges"))
-    (tmp_path / "pipeline.yaml").write_text(
-        "stages:\n  capture:\n  preprocess:\n  hull: {use: ./edges.py:Edges}\nsinks:\n  jsonl:\n"
-    )
-    pipeline = load_pipeline(tmp_path / "pipeline.yaml")
-    assert pipeline.nodes["hull"].component.cls.__name__ == "Edges"
-    assert str(pipeline.nodes["jsonl"].inputs["contact"]) == "hull.contact"
