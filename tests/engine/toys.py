@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +102,8 @@ class Counted:
     def __init__(self, params: Params) -> None:
         self.params = params
         self.seen: list[int] = []
+        self.rows: list[Any] = []
+        self.captured: list[float] = []
         self.opened = self.closed = self.resets = 0
         self.release = threading.Event()
 
@@ -224,7 +226,7 @@ class LateTick(Counted, Sink):
     """A sink that asks for the tick behind its inputs."""
 
     def write(self, number: Number | None, total: Number, tick: Tick) -> None:
-        self.rows = [*getattr(self, "rows", []), (tick.frame.seq, number and number.value, total.value)]
+        self.rows.append((tick.frame.seq, number and number.value, total.value))
 
 
 class Quitter(Counted, Stage):
@@ -271,14 +273,11 @@ class Collect(Counted, Sink):
 
     wanted = True
 
-    def __init__(self, params: Counted.Params) -> None:
-        super().__init__(params)
-        self.rows: list[tuple[int, float | None, float | None, float | None, dict[str, str]]] = []
-
     def write(self, tick: Tick, joined: Number | None, total: Number | None, gated: Number | None) -> None:
         self.saw(tick.frame.seq)
         values = (None if n is None else n.value for n in (joined, total, gated))
         self.rows.append((tick.frame.seq, *values, dict(tick.skipped)))
+        self.captured.append(tick.frame.captured)
 
     def wants(self) -> bool:
         return self.wanted
@@ -286,10 +285,6 @@ class Collect(Counted, Sink):
 
 class Frames(Counted, Sink):
     """Keeps number, reference and epoch of each frame, and what was skipped."""
-
-    def __init__(self, params: Counted.Params) -> None:
-        super().__init__(params)
-        self.rows: list[tuple[int, bool, int, dict[str, str]]] = []
 
     def write(self, tick: Tick, doubtful: Number) -> None:  # noqa: ARG002 (the port must be asked for)
         frame = tick.frame
@@ -300,10 +295,6 @@ class References(Counted, Sink):
     """Wants nothing but references."""
 
     takes_references = True
-
-    def __init__(self, params: Counted.Params) -> None:
-        super().__init__(params)
-        self.rows: list[int] = []
 
     def wants(self) -> bool:
         return False
@@ -322,19 +313,6 @@ class Archive(Collect):
 
     threaded = True
     when_live = "block"
-
-
-class FrameArchive(Counted, Sink):
-    threaded = True
-    when_live = "block"
-
-    def __init__(self, params: Counted.Params) -> None:
-        super().__init__(params)
-        self.frames: list[Frame] = []
-
-    def write(self, frame: Frame) -> None:
-        self.saw(frame.seq)
-        self.frames.append(frame)
 
 
 class Onlooker(Collect):
