@@ -11,7 +11,6 @@ from tactflow.bench.gels import GELS, left_out, measure_gels
 from tactflow.bench.labels import (
     Label,
     compare_decisions,
-    compare_first_contact,
     labels_of,
     outlines_by_eye,
     touch_of,
@@ -82,17 +81,14 @@ def test_rest_and_touch_of_a_recording_are_read(tmp_path: Path) -> None:
     assert touch_of(tmp_path / "mini_box", tmp_path) is None
 
 
-def test_decisions_count_only_where_something_is_known_and_an_early_contact_must_be_seen_in_time() -> None:
+def test_decisions_count_only_where_something_is_known() -> None:
     touched = np.array([1, 0, 0, -1, 1, 1, 1, 1, 1, 1], np.int8)
     late = np.array([0, 1, 0, 1, 0, 0, 0, 0, 1, 1], np.bool_)
     tally = Tally()
     compare_decisions(tally, touched, late)
-    compare_first_contact(tally, touched, late)
     errors = tally.errors()
     assert errors.pop("missed_contacts") == pytest.approx(100 * 5 / 7)
-    assert errors == {"false_contacts": 50.0, "early_found": 0.0}
-    compare_first_contact(tally, touched, touched == 1)
-    assert tally.errors()["early_found"] == 50
+    assert errors == {"false_contacts": 50.0}
 
 
 def test_what_is_missing_and_what_is_unknown_is_said(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ Every recording runs through the default pipeline, or through the one for gels w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from tactflow.bench.labels import (
     Label,
     compare_decisions,
-    compare_first_contact,
     labels_of,
     outlines_by_eye,
     touch_of,
 )
-from tactflow.bench.lockstep import TimedResult, on_recording
+from tactflow.bench.lockstep import TimedResult, on_recording, with_params
 from tactflow.bench.pipelines import PIPELINE, Bench, Judge
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import RECORDING
@@ -124,13 +123,6 @@ def left_out(data: Path) -> list[str]:
     ]
 
 
-def prepared(pipeline: Pipeline, downsample: int) -> Pipeline:
-    """The same pipeline with no other preprocessing than making the picture smaller."""
-    node = pipeline.nodes["preprocess"]
-    params = node.component.params.model_validate({"rotate": 0, "downsample": downsample})
-    return replace(pipeline, nodes={**pipeline.nodes, "preprocess": replace(node, params=params)})
-
-
 def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pipeline], data: Path) -> None:
     """Measure every recording of a gel that is known here and in the folder.
 
@@ -141,19 +133,23 @@ def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pi
     drawn = outlines_by_eye(data / FOLDER)
     together = Tally()
     for gel in present(data):
-        name, pipeline = bare if gel.dots == 0 else marked
+        # No other preprocessing than making the picture smaller.
+        dotted, plain = (
+            with_params(pipeline, "preprocess", rotate=0, downsample=gel.downsample)
+            for pipeline in (marked[1], bare[1])
+        )
+        ready = {bare[0]: plain} if gel.dots == 0 else {marked[0]: dotted}
         sources, scene = gel.sources(data / FOLDER), RECORDING + gel.folder
         parts = []
         for source in sources:
             labels = labels_of(source, data / FOLDER, gel.downsample, drawn)
             parts.append((source, partial(GelJudge, gel, labels, touch_of(source, data / FOLDER))))
-        tally = bench.measure({name: prepared(pipeline, gel.downsample)}, scene, parts)[name]
+        (tally,) = bench.measure(ready, scene, parts).values()
         if not {"label_distance_p50", "line_angle_p50"} & set(tally.values):
             for key in ("outline_iou_p50", "outline_iou_min"):
                 together.values[key] += tally.values[key]
         if gel.dots == 0:
-            refusing = on_recording(prepared(marked[1], gel.downsample), sources[0])
-            bench.measure_refusal(marked[0], refusing, scene)
+            bench.measure_refusal(marked[0], on_recording(dotted, sources[0]), scene)
     if errors := together.errors():
         count = len(together.values["outline_iou_p50"])
         bench.result.add(PIPELINE, marked[0], RECORDING + OUTLINES, errors, frames=count)
@@ -190,8 +186,6 @@ class GelJudge(Judge):
         found, counted = np.array(self._found, np.bool_), self._gel.dots
         touched = self._gel.known(len(found)) if self._touch is None else self._touch[: len(found)]
         compare_decisions(self.tally, touched, found)
-        if self._touch is not None:
-            compare_first_contact(self.tally, touched, found)
         if counted and self._dots is not None:
             self.tally.add(
                 dots_found=100.0 * min(self._dots, counted) / counted,

@@ -16,11 +16,6 @@ from tactflow.bench import metrics
 from tactflow.bench.quantities import Tally
 from tactflow.vision.types import Contact
 
-PROMPT = 4
-"""Frames within which a first contact has to be seen. Chosen by hand: 0.16 s at 25 frames a second."""
-EARLY = 25
-"""Frames within which a first contact is an early one: 1 s at 25 frames a second."""
-
 Polygons = Mapping[str, Mapping[int, tuple[int, NDArray[np.float64]]]]
 """Recording -> frame -> (downsample, polygon (N, 2) px of the frame after it)."""
 
@@ -121,11 +116,3 @@ def compare_decisions(tally: Tally, touched: NDArray[np.int8], found: NDArray[np
     touched : (N,): 1 touched, 0 at rest, -1 unknown. found : (N,), whether a contact was found.
     """
     tally.percent(false_contacts=found[touched == 0], missed_contacts=~found[touched == 1])
-
-
-def compare_first_contact(tally: Tally, touched: NDArray[np.int8], found: NDArray[np.bool_]) -> None:
-    """Judge whether the first contact of a recording was seen in time, if it is early; as above."""
-    resting = np.flatnonzero(touched == 0)
-    begun = np.flatnonzero(touched[resting[0] :] == 1) + resting[0] if len(resting) else resting
-    if len(begun) and begun[0] <= EARLY:
-        tally.percent(early_found=found[begun[0] : begun[0] + PROMPT].any())

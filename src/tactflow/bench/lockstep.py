@@ -132,13 +132,18 @@ class LockstepPipeline:
         return replace(collecting, nodes=nodes, opencv_threads=1)
 
 
+def with_params(pipeline: Pipeline, stage: str, **params: Any) -> Pipeline:
+    """The same pipeline with other parameters of a stage; defaults for those that are left out."""
+    node = pipeline.nodes[stage]
+    changed = replace(node, params=node.component.params.model_validate(params))
+    return replace(pipeline, nodes={**pipeline.nodes, stage: changed})
+
+
 def on_recording(pipeline: Pipeline, path: Path, **params: Any) -> Pipeline:
     """The same pipeline reading another recording. params : further parameters of the capture stage."""
     source = pipeline.source
-    changed = source.component.params.model_validate(
-        {**source.params.model_dump(exclude_unset=True), "source": str(path), **params}
-    )
-    return replace(pipeline, nodes={**pipeline.nodes, source.id: replace(source, params=changed)})
+    kept = source.params.model_dump(exclude_unset=True)
+    return with_params(pipeline, source.id, **{**kept, "source": str(path), **params})
 
 
 def take_turns(

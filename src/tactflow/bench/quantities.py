@@ -131,7 +131,6 @@ _ALL = [
     Quantity("label_distance_p50", "centre against labelled circle, median", "px", MEDIAN, slack=0.1),
     Quantity("line_angle_p50", "direction against labelled line, median", "deg", MEDIAN, slack=0.1),
     Quantity("line_angle_max", "direction against labelled line, maximum", "deg", MOST, slack=0.3),
-    _percent_right("early_found", "first contacts within a second that were seen in time"),
     _percent_right("dots_found", "dots found, of those counted by eye", slack=1.0),
     Quantity("dots_beyond", "dots found beyond those counted by eye", "%", slack=1.0),
     _percent_right("force_right", "contact agrees with force >= 0.75 N", slack=0.3),

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import gels, metrics
-from tactflow.bench.lockstep import TimedResult
+from tactflow.bench.lockstep import TimedResult, with_params
 from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import RECORDING
@@ -50,7 +50,9 @@ def measure_recordings(
     marked : for sensors with markers; their preprocessing is replaced by the Wedge's rectification.
     bare : for sensors without. data : folder of recordings.
     """
-    ready = {name: rectified(pipeline) for name, pipeline in marked.items()}
+    ready = {
+        name: with_params(pipeline, "preprocess", homography=RECTIFY) for name, pipeline in marked.items()
+    }
     if (data / "wedge_ball" / "labels.csv").exists():
         files, labels = labelled_presses(data / "wedge_ball")
         ball = [(stack(files, bench.scratch), partial(PressJudge, labels))]
@@ -75,13 +77,6 @@ def check(data: Path) -> None:
     known = ("wedge_ball", "wedge_roll", "wedge_grasp", gels.FOLDER)
     if not any((data / name).is_dir() for name in known):
         raise ConfigError(f"--data {data}: required a folder with one of {', '.join(known)} in it")
-
-
-def rectified(pipeline: Pipeline) -> Pipeline:
-    """The same pipeline with the Wedge's rectification as its only preprocessing."""
-    node = pipeline.nodes["preprocess"]
-    changed = replace(node, params=node.component.params.model_validate({"homography": RECTIFY}))
-    return replace(pipeline, nodes={**pipeline.nodes, "preprocess": changed})
 
 
 def without_markers(pipeline: Pipeline) -> Pipeline:

@@ -62,7 +62,6 @@ GEL_COLUMNS = {
     "dots found, beyond, %": ("dots_found", "dots_beyond"),
     "contact at rest, %": ("false_contacts",),
     "missed, %": ("missed_contacts",),
-    "early ones in time, %": ("early_found",),
     "outline IoU, median, worst": ("outline_iou_p50", "outline_iou_min"),
     "centre, px": ("label_distance_p50",),
     "direction, median, worst, deg": ("line_angle_p50", "line_angle_max"),

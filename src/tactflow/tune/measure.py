@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench.lockstep import TimedResult, on_recording, take_turns
+from tactflow.bench.lockstep import TimedResult, on_recording, take_turns, with_params
 from tactflow.bench.quantities import Tally, rms
 from tactflow.bench.scenes import Rendered
 from tactflow.bench.score import PipelineScore
@@ -130,10 +130,8 @@ def _on_sensor(pipeline: Pipeline) -> Pipeline:
     node = pipeline.nodes.get("preprocess")
     if node is None:
         return pipeline
-    params = node.params.model_dump(exclude_unset=True, by_alias=True)
-    kept = {key: params[key] for key in ("downsample", "method") if key in params}
-    changed = replace(node, params=node.component.params.model_validate(kept))
-    return replace(pipeline, nodes={**pipeline.nodes, node.id: changed})
+    params = node.params.model_dump(include={"downsample", "method"}, exclude_unset=True)
+    return with_params(pipeline, node.id, **params)
 
 
 def _trial(name: str, tally: Tally, scale: float, times: Times, seed: int) -> Trial:
