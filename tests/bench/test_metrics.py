@@ -7,7 +7,6 @@ from tactflow.bench import metrics
 
 GRID = np.array([(x, y) for y in range(0, 100, 20) for x in range(0, 100, 20)], dtype=np.float64)
 SQUARE = np.array([(0, 0), (10, 0), (10, 10), (0, 10)], dtype=np.float64)
-ALL = np.ones(len(GRID), dtype=bool)
 
 
 def test_the_pitch_of_a_square_grid_is_its_spacing_and_one_point_has_none() -> None:
@@ -17,13 +16,6 @@ def test_the_pitch_of_a_square_grid_is_its_spacing_and_one_point_has_none() -> N
 
 def wrong(position: np.ndarray) -> list[int]:
     return np.flatnonzero(metrics.identity_errors(position, GRID, 20)).tolist()
-
-
-def test_two_markers_that_swapped_are_both_wrong() -> None:
-    position = GRID.copy()
-    assert wrong(position) == []
-    position[[3, 4]] = position[[4, 3]]
-    assert wrong(position) == [3, 4]
 
 
 def test_a_marker_over_half_a_pitch_away_is_wrong_even_in_the_open() -> None:
@@ -65,23 +57,6 @@ def test_the_overlap_of_two_squares_counts_their_pixels(other: np.ndarray, iou: 
 )
 def test_directions_are_compared_across_the_seam(angle: float, truth: float, expected: float) -> None:
     assert metrics.angle_error(angle, truth) == pytest.approx(expected, abs=1e-6)
-
-
-def test_two_markers_on_one_dot_are_both_counted() -> None:
-    position = GRID.copy()
-    position[1] = position[0] + 2
-    assert metrics.shared_dots(position, ALL, pitch=20) == 2
-    trusted = ALL.copy()
-    trusted[1] = False
-    assert metrics.shared_dots(position, trusted, pitch=20) == 0
-
-
-def test_a_marker_that_moves_unlike_its_neighbours_is_a_jump() -> None:
-    flow = np.tile((12.0, 0.0), (25, 1))  # all together: over half a pitch, but no jump
-    assert metrics.flow_jumps(GRID, flow, ALL) == 0
-    flow[12] = (23.0, 0.0)
-    assert metrics.flow_jumps(GRID, flow, ALL) == 1
-    assert metrics.flow_jumps(GRID, flow, np.arange(25) != 12) == 0
 
 
 def test_the_ratio_of_axes_is_that_of_a_rectangle() -> None:

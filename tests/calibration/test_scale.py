@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
+from tactflow.calibration.scale import scale_from_area, scale_from_pitch
 
 SIZE = (300, 400)
 
@@ -66,7 +66,7 @@ def test_a_grid_at_45_degrees_gives_one_scale_for_both_axes() -> None:
 
 
 def test_too_few_dots_are_refused_with_the_way_out() -> None:
-    with pytest.raises(ValueError, match="corners of a known rectangle"):
+    with pytest.raises(ValueError, match="with --area instead"):
         scale_from_pitch([[0, 0], [10, 0], [0, 10]], 2.0, SIZE)
 
 
@@ -76,13 +76,6 @@ def test_a_pitch_that_is_none_is_refused(pitch: float) -> None:
         scale_from_pitch(grid(0.1, 0.1, 2.0, 0, 0, 1), pitch, SIZE)
 
 
-@pytest.mark.parametrize(
-    ("millimetres", "wrong"),
-    [
-        ([[0, 0], [24, 0], [0, 32]], "as many points"),
-        ([[24, 0], [0, 0], [24, 32], [0, 32]], "falls"),
-    ],
-)
-def test_corners_that_make_no_sense_are_refused(millimetres: list[list[float]], wrong: str) -> None:
-    with pytest.raises(ValueError, match=wrong):
-        scale_from_corners([[0, 0], [240, 0], [0, 320], [240, 320]], millimetres, (240, 320))
+def test_an_area_gives_the_scale() -> None:
+    scale = scale_from_area((24.0, 32.0), (240, 160))
+    assert (scale.x, scale.y, scale.origin) == (0.1, 0.2, (119.5, 79.5))

@@ -16,16 +16,12 @@ Capture = pytest.CaptureFixture[str]
 
 def test_it_writes_frames_and_truth(tmp_path: Path, capsys: Capture) -> None:
     out, truth = tmp_path / "new" / "a.npy", tmp_path / "a.jsonl"
-    assert main(["sim", "press?frames=5", "--out", str(out), "--truth", str(truth)]) == 0
+    assert main(["sim", "sim:press?frames=5", "--out", str(out), "--truth", str(truth)]) == 0
     assert np.load(out, mmap_mode="r").shape == (5, 600, 800, 3)
     assert len(truth.read_text().splitlines()) == 5
     printed = capsys.readouterr()
     assert printed.out == ""
     assert "5 frames of press" in printed.err
-
-
-def test_the_prefix_of_a_source_is_understood(tmp_path: Path) -> None:
-    assert main(["sim", "sim:idle?frames=2", "--out", str(tmp_path / "a.npy"), "--quiet"]) == 0
 
 
 def test_the_list_names_every_scene_and_every_setting(capsys: Capture) -> None:

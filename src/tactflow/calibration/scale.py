@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from tactflow.vision.types import Scale
 FEWEST_LINKS: Final = 8
 """Distances between neighbouring dots in each direction at least, for a pitch and its error. By hand."""
 POINTED: Final = 0.5
-"""Standard error of a point that somebody has pointed at in a picture, px. Chosen by hand."""
+"""Standard error of an edge of the picture, px. Chosen by hand."""
 LONGER: Final = 1.35
 """How much longer than the typical one a distance between neighbours may be: less than the diagonal of a
 square, 1.41."""
@@ -67,7 +68,7 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
     if fewest < FEWEST_LINKS:
         raise ValueError(
             f"scale by pitch: required a grid with {FEWEST_LINKS} pairs of neighbours along each direction, "
-            f"found {fewest}; give the corners of a known rectangle instead"
+            f"found {fewest}; give the size of what the picture shows with --area instead"
         )
     means = np.array([np.median(group, axis=0) for group in groups])
     x, y = _square(means, pitch)
@@ -92,52 +93,24 @@ def _square(means: NDArray[np.float64], pitch: float) -> tuple[float, float]:
         return both, both
     x, y = np.sqrt(np.maximum(np.linalg.solve(squares, [pitch**2, pitch**2]), 0)).tolist()
     if not (x > 0 and y > 0):
-        raise ValueError("scale by pitch: the dots stand in no square grid; give corners instead")
+        raise ValueError(
+            "scale by pitch: the dots are in no square grid; give the size of what the picture shows with --area instead"
+        )
     return x, y
 
 
-def scale_from_corners(pixels: ArrayLike, millimetres: ArrayLike, size: tuple[int, int]) -> Scale:
-    """From points of the processed picture whose places are known in mm.
+def scale_from_area(area: tuple[float, float], size: tuple[int, int]) -> Scale:
+    """From the width and height in mm of what a picture of size (width, height), px, shows.
 
-    Parameters
-    ----------
-    pixels, millimetres : (N, 2) each, N >= 2, not all on one line along an axis. size : of the picture, px.
+    The standard errors are those of edges that are known to half a pixel.
 
-    Returns
-    -------
-    The scale by least squares, mm = offset + scale px along each axis, with standard errors from what is
-    left, but at least those of points that are known to half a pixel.
-
-    Raises
-    ------
-    ValueError : too few points, or all at one x or y.
-
-    Examples
-    --------
-    >>> scale = scale_from_corners([[0, 0], [240, 0], [0, 320], [240, 320]],
-    ...     [[0, 0], [24, 0], [0, 32], [24, 32]], (240, 320))
-    >>> round(scale.x, 6), round(scale.y, 6)
-    (0.1, 0.1)
+    >>> scale = scale_from_area((24, 32), (240, 320))
+    >>> scale.x, scale.y, round(scale.stderr[0], 6)
+    (0.1, 0.1, 0.000295)
     """
-    known, real = np.asarray(pixels, np.float64), np.asarray(millimetres, np.float64)
-    if known.ndim != 2 or known.shape[1] != 2 or known.shape != real.shape or len(known) < 2:
-        raise ValueError(f"corners: required as many points in px as in mm, got {known.shape}, {real.shape}")
-    values, errors = [], []
-    for axis in (0, 1):
-        away = known[:, axis] - known[:, axis].mean()
-        if (away**2).sum() < 1:
-            raise ValueError(f"corners: all have the same {'xy'[axis]}, which gives no scale along it")
-        slope = float((away * real[:, axis]).sum() / (away**2).sum())
-        if slope <= 0:
-            raise ValueError(
-                f"corners: {'xy'[axis]} in mm falls where it grows in px; both go right and down"
-            )
-        rest = real[:, axis] - real[:, axis].mean() - slope * away
-        left = len(known) - 2
-        variance = max(float((rest**2).sum()) / left if left else 0.0, (POINTED * slope) ** 2)
-        values.append(slope)
-        errors.append(float(np.sqrt(variance / (away**2).sum())))
-    return Scale(values[0], values[1], (errors[0], errors[1]), centre(size))
+    x, y = area[0] / size[0], area[1] / size[1]
+    stderr = math.sqrt(2) * POINTED * x / size[0], math.sqrt(2) * POINTED * y / size[1]
+    return Scale(x, y, stderr, centre(size))
 
 
 def _links(dots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

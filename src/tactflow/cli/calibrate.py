@@ -30,7 +30,7 @@ from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry, try_photometry
 from tactflow.calibration.presses import PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
-from tactflow.calibration.scale import scale_from_corners, scale_from_pitch
+from tactflow.calibration.scale import scale_from_area, scale_from_pitch
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.options import add_overwrite, positive
 from tactflow.cli.terminal import notes, printable, say, typed
@@ -388,9 +388,7 @@ def _scale(args: argparse.Namespace, loaded: Pipeline, session: Session) -> tupl
         if args.pitch is not None:
             scale = scale_from_pitch(session.dots, args.pitch, (width, height))
             return scale, f"pitch of {args.pitch:g} mm"
-        # The picture reaches half a pixel beyond the centres of its outermost pixels.
-        corners = [[-0.5, -0.5], [width - 0.5, height - 0.5]]
-        scale = scale_from_corners(corners, [[0, 0], args.area], (width, height))
+        scale = scale_from_area(args.area, (width, height))
         return scale, f"area of {args.area[0]:g} x {args.area[1]:g} mm"
     except ValueError as problem:
         raise ConfigError(f"calibrate: {problem}") from None
