@@ -68,7 +68,7 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
     if fewest < FEWEST_LINKS:
         raise ValueError(
             f"scale by pitch: required a grid with {FEWEST_LINKS} pairs of neighbours along each direction, "
-            f"found {fewest}; give the size of what the picture shows with --area instead"
+            f"found {fewest}; give the size of the picture with --area instead"
         )
     means = np.array([np.median(group, axis=0) for group in groups])
     x, y = _square(means, pitch)
@@ -94,7 +94,7 @@ def _square(means: NDArray[np.float64], pitch: float) -> tuple[float, float]:
     x, y = np.sqrt(np.maximum(np.linalg.solve(squares, [pitch**2, pitch**2]), 0)).tolist()
     if not (x > 0 and y > 0):
         raise ValueError(
-            "scale by pitch: the dots are in no square grid; give the size of what the picture shows with --area instead"
+            "scale by pitch: the dots are in no square grid; give the size of the picture with --area instead"
         )
     return x, y
 
