@@ -123,17 +123,6 @@ def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
         film(tmp_path / "film.avi", [*pictures(2), *pictures(1, 48, 62)])
 
 
-def test_a_folder_that_cannot_be_written_is_an_error() -> None:
-    with pytest.raises(StageError, match="cannot be written"):
-        film(Path("/proc/nowhere/film.avi"), pictures(1))
-
-
-def test_a_disk_that_is_nearly_full_stops_the_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(film_module, "MIN_FREE_BYTES", 1 << 62)
-    with pytest.raises(StageError, match="the disk is full"):
-        film(tmp_path / "film.avi", pictures(20))
-
-
 @pytest.mark.parametrize(
     ("params", "expected"),
     [

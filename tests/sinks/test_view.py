@@ -26,11 +26,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from tactflow.config.load import load_pipeline
 from tactflow.engine.contract import Recorder, Source, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.frame import Frame
-from tactflow.engine.run import Runner
 from tactflow.message.result import Result
 from tactflow.sinks.view import View
 from tactflow.view import server
@@ -518,19 +516,6 @@ def test_a_websocket_of_another_page_or_under_a_foreign_name_is_refused(view: Vi
     assert not sink.wants()
 
 
-def test_a_request_whose_body_is_none_is_refused_without_a_traceback(
-    view: Views, caplog: pytest.LogCaptureFixture
-) -> None:
-    where = urlsplit(str(view().description))
-    with socket.create_connection((str(where.hostname), where.port or 0), PATIENCE) as connection:
-        connection.sendall(
-            b"HEAD / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello, you\r\n"
-        )
-        while connection.recv(65536):
-            pass
-    assert "Traceback" not in caplog.text
-
-
 def test_another_address_needs_a_token() -> None:
     with pytest.raises(ValidationError, match="a token is required"):
         View.Params(host="0.0.0.0")
@@ -634,25 +619,3 @@ def test_too_many_pages_are_turned_away(view: Views, page: Pages) -> None:
     for _ in range(16):
         page(sink).next("hello")
     assert page(sink).close_code() == 4429
-
-
-PIPELINE = """
-sensor: main
-stages:
-  capture: {source: "sim:press?frames=100000"}
-  preprocess: {downsample: 2}
-  difference: {in: {unmarked: preprocess.image}}
-  hull: {when: touching}
-sinks:
-  view: {port: 0, max_fps: 240}
-"""
-
-
-def test_a_run_that_nobody_watches_encodes_nothing_and_computes_nothing_for_the_view(tmp_path: Path) -> None:
-    file = tmp_path / "pipeline.yaml"
-    file.write_text(PIPELINE.replace("100000", "30"))
-    result = Runner(load_pipeline(file)).run()
-    assert result.exit_code == 0
-    assert result.stats["sinks"]["view"]["counters"]["encoded"] == 0
-    assert result.stats["sinks"]["view"]["runs"] == 0
-    assert result.stats["stages"]["hull"]["runs"] == 0

@@ -123,17 +123,6 @@ def test_only_a_subscription_to_this_sensor_counts(
     until(lambda: not sink.wants() and sink.counters()["subscriptions"] == 0)
 
 
-def test_a_subscriber_that_never_reads_holds_up_nobody(opened: Open, subscribe: Subscribe) -> None:
-    sink = opened()
-    # It accepts little itself, so that everything piles up at the publisher.
-    subscribe(sink, RCVHWM=1, RCVBUF=4096)
-    reader = subscribe(sink, b"tactflow.")
-    for seq in range(500):
-        write(sink, range(seq, seq + 1))
-        assert receive(reader)[1]["seq"] == seq
-    sink.close()
-
-
 def test_a_conflating_subscriber_that_pauses_gets_the_newest(opened: Open, subscribe: Subscribe) -> None:
     sink = opened()
     socket = subscribe(sink, CONFLATE=1)
