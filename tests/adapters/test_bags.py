@@ -134,27 +134,3 @@ def test_a_video_in_messages_is_decoded(tmp_path: Path) -> None:
     assert [round(float(image.mean()) / 40) for image, _ in found] == [3, 4]
     with pytest.raises(SourceError, match="there is no picture in it"):
         open_source(f"{write_foxglove(tmp_path / 'none.mcap', messages[1:3], 'protobuf')}?topic={TOPIC}")
-
-
-def test_a_bag_of_real_frames_gives_the_results_of_the_folder_to_the_bit(
-    tmp_path: Path, shared_data: Path
-) -> None:
-    from tactflow.api import run
-
-    files = sorted((shared_data / "wedge_roll").glob("*.jpg"))[60:80]
-    images = [cv2.imread(str(file)) for file in files]
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    for file, image in zip(files, images, strict=True):
-        cv2.imwrite(str(folder / f"{file.stem}.png"), image)
-    bags = [write_bag(tmp_path / name, images, kind) for kind, name in KINDS.items()]
-    specs = [str(folder), *(f"{bag}?topic={TOPIC}" for bag in bags)]
-    lines = []
-    for index, spec in enumerate(specs):
-        out = tmp_path / f"{index}.jsonl"
-        sinks = {"jsonl": {"path": str(out), "detail": True}}
-        run("wedge", source=spec, settings={"sinks": sinks, "stages.capture.fps": 25})
-        lines.append(out.read_bytes())
-    assert lines[0].count(b"\n") == 20
-    assert b'"area"' in lines[0]
-    assert lines[1:] == lines[:1] * 3

@@ -152,72 +152,52 @@ def test_nobody_reads_a_device_among_the_pieces_of_an_array(tmp_path: Path) -> N
 KEY = "observation.images.gel"
 
 
+def write_film(path: Path, images: NDArray[np.uint8]) -> None:
+    """A video at 25 Hz, as LeRobot encodes it."""
+    av = pytest.importorskip("av", reason="the extra lerobot is not installed")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libsvtav1", rate=25, options={"crf": "10", "preset": "8"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for image in images:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        file.mux(stream.encode(None))
+    if sys.platform == "linux":
+        # Where the user is root, this encoder makes the calling thread a real-time one.
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def write_lerobot(root: Path, images: NDArray[np.uint8], version: str, dtype: str) -> Path:
     """Two episodes of two and three frames at 25 Hz, by the documents of the layouts."""
     pa = pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
-    av = pytest.importorskip("av", reason="the extra lerobot is not installed")
     import pyarrow.parquet as pq
 
-    lengths = [2, 3]
     features = {KEY: {"dtype": dtype, "shape": [48, 64, 3]}, "action": {"dtype": "float32", "shape": [1]}}
     info = {"codebase_version": version, "fps": 25, "total_episodes": 2, "features": features}
-    v3 = version.startswith("v3")
-    rows = [
-        {"frame_index": index, "episode_index": episode}
-        | (
-            {KEY: {"bytes": cv2.imencode(".png", images[2 * episode + index])[1].tobytes()}}
-            if dtype == "image"
-            else {}
-        )
-        for episode, length in enumerate(lengths)
-        for index in range(length)
-    ]
-    data, film = (
-        root / "data" / "chunk-000",
-        root / "videos" / (f"{KEY}/chunk-000" if v3 else f"chunk-000/{KEY}"),
-    )
-    for folder in (root / "meta" / "episodes" / "chunk-000", data, film):
-        folder.mkdir(parents=True)
+    rows: list[dict[str, Any]] = [{"episode_index": int(index >= 2)} for index in range(5)]
+    episodes = [{"episode_index": 0, "length": 2}, {"episode_index": 1, "length": 3}]
+    if dtype == "image":
+        for row, image in zip(rows, images, strict=True):
+            row[KEY] = {"bytes": cv2.imencode(".png", image)[1].tobytes()}
+    for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
+        (root / folder).mkdir(parents=True)
     (root / "meta" / "info.json").write_text(json.dumps(info))
-    parts = (
-        [("file-000", rows, images)]
-        if v3
-        else [
-            (
-                f"episode_00000{one}",
-                [row for row in rows if row["episode_index"] == one],
-                images[2 * one : 2 + 3 * one],
-            )
-            for one in (0, 1)
-        ]
-    )
-    for name, some, shown in parts:
-        pq.write_table(pa.Table.from_pylist(some), data / f"{name}.parquet")
+    if version.startswith("v3"):
+        pq.write_table(pa.Table.from_pylist(rows), root / "data/chunk-000/file-000.parquet")
+        for index, episode in enumerate(episodes):
+            episode |= {"data/chunk_index": 0, "data/file_index": 0}
+            if dtype == "video":
+                place = {"chunk_index": 0, "file_index": 0, "from_timestamp": 0.08 * index}
+                episode |= {f"videos/{KEY}/{key}": value for key, value in place.items()}
         if dtype == "video":
-            with av.open(str(film / f"{name}.mp4"), "w") as file:
-                stream = file.add_stream("libsvtav1", rate=25, options={"crf": "10", "preset": "8"})
-                stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-                for image in shown:
-                    file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-                file.mux(stream.encode(None))
-            if sys.platform == "linux":
-                # Where the user is root, this encoder makes the calling thread a real-time one.
-                os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    if v3:
-        key = f"videos/{KEY}"
-        episodes = [
-            {"episode_index": one, "length": lengths[one], "data/chunk_index": 0, "data/file_index": 0}
-            | (
-                {f"{key}/chunk_index": 0, f"{key}/file_index": 0, f"{key}/from_timestamp": 0.08 * one}
-                if dtype == "video"
-                else {}
-            )
-            for one in (0, 1)
-        ]
+            write_film(root / "videos" / KEY / "chunk-000/file-000.mp4", images)
         pq.write_table(pa.Table.from_pylist(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
-    else:
-        lines = [json.dumps({"episode_index": one, "length": lengths[one]}) for one in (0, 1)]
-        (root / "meta" / "episodes.jsonl").write_text("\n".join(lines))
+        return root
+    for index, part in enumerate((slice(2), slice(2, 5))):
+        name = f"episode_00000{index}"
+        pq.write_table(pa.Table.from_pylist(rows[part]), root / f"data/chunk-000/{name}.parquet")
+        write_film(root / "videos/chunk-000" / KEY / f"{name}.mp4", images[part])
+    (root / "meta" / "episodes.jsonl").write_text("\n".join(map(json.dumps, episodes)))
     return root
 
 
