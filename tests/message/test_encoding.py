@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.encoding import STATUS_NAMES
 from tactflow.message.result import encode_message
 from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
@@ -95,7 +94,7 @@ def test_whatever_is_unknown_is_null_and_the_message_stays_valid(
     assert (message["markers"] is None) == (markers is None)
 
 
-def test_the_field_is_told_where_it_is_asked_for() -> None:
+def test_the_field_is_part_of_the_message_on_request() -> None:
     origin = np.array([[20.0, 20], [40, 20], [20, 40], [40, 40]])
     markers = Markers(origin, origin + np.array([1.0, 0.5]), np.zeros(4, np.uint8), np.full(4, 0.02))
     field = FieldModel(origin, (60, 60))(markers)
@@ -107,15 +106,15 @@ def test_the_field_is_told_where_it_is_asked_for() -> None:
     rows, columns = field.grid.shape
     assert np.array(message["field"]["displacement"]).shape == (rows, columns, 2)
     assert np.array(message["field"]["stderr"]).shape == (rows, columns)
-    told = message["field"]
-    last = np.array(told["first"]) + told["spacing"] * np.array([columns - 1, rows - 1])
+    grid = message["field"]
+    last = np.array(grid["first"]) + grid["spacing"] * np.array([columns - 1, rows - 1])
     assert last == pytest.approx(field.grid.points[-1, -1])
     empty = json.loads(encode_message(result_of(TICK, Results(PROCESSED)), field=True))
     VALIDATOR.validate(empty)
     assert empty["field"] is None
 
 
-def test_a_force_is_told_with_its_errors_and_null_where_a_component_is_unknown() -> None:
+def test_a_force_has_its_errors_and_null_where_a_component_is_unknown() -> None:
     force = Force((None, None, 2.5), (None, None, 0.2), True)
     message = build_message(TICK, Results(PROCESSED, CONTACT, force=force))
     VALIDATOR.validate(message)
@@ -146,12 +145,6 @@ def test_reasons_for_skipping_are_passed_on() -> None:
     VALIDATOR.validate(message)
 
 
-def test_the_message_is_one_line() -> None:
-    assert b"\n" not in encode_message(
-        result_of(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS)), detail=True
-    )
-
-
 def test_views_that_are_not_contiguous_and_other_number_types_are_written_correctly() -> None:
     wide = np.arange(12, dtype=np.float64).reshape(3, 4)
     markers = Markers(wide[:, ::2], wide[:, 1::2], np.array([0, 9, 0, 9, 0], np.uint8)[::2], wide[:, 0])
@@ -176,6 +169,7 @@ def test_numbers_arrive_as_they_were(rows: list[tuple[float, float, float, float
     body = encode_message(result_of(TICK, Results(None, None, None, markers)))
     # Read with the standard library: another parser than the encoder's own.
     message = json.loads(body)
+    assert b"\n" not in body
     assert message["markers"]["origin"] == table[:, :2].tolist()
     assert message["markers"]["position"] == table[:, 2:].tolist()
     assert message["markers"]["status"] == [MarkerStatus(s).name.lower() for s in status.tolist()]
@@ -213,10 +207,6 @@ def test_an_infinite_standard_error_is_refused() -> None:
             result_of(TICK, Results(None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0])))),
             detail=True,
         )
-
-
-def test_status_names_follow_the_enum() -> None:
-    assert [STATUS_NAMES[status] for status in MarkerStatus] == ["tracked", "inferred", "lost"]
 
 
 def _changed(path: str, value: Any) -> dict[str, Any]:

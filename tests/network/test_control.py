@@ -44,7 +44,7 @@ def bare() -> Iterator[ControlSocket]:
     socket.close()
 
 
-def test_a_run_does_what_it_is_told_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_carries_out_commands_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "pipeline.yaml").write_text(PIPELINE)
     monkeypatch.chdir(tmp_path)
     runner = Runner(load_pipeline(tmp_path / "pipeline.yaml"))
@@ -143,7 +143,7 @@ def test_an_address_that_is_taken_is_named_with_what_to_do(bare: ControlSocket) 
     sink.close()
 
 
-def test_a_late_answer_to_an_earlier_command_is_none_to_the_next() -> None:
+def test_a_late_answer_to_an_earlier_command_is_not_taken_for_the_next() -> None:
     with zmq.Context() as context, context.socket(zmq.ROUTER) as run:
         run.linger = 0
         port = run.bind_to_random_port("tcp://127.0.0.1")

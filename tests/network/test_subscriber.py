@@ -133,14 +133,14 @@ def test_what_is_no_result_is_passed_over_and_counted_where_it_pretends_to_be_on
 def test_a_sensor_can_be_chosen_and_its_name_is_matched_whole() -> None:
     publisher = Publisher("main2")
     with (
-        Subscriber(publisher.endpoint, sensor="main", timeout=0.05) as other,
+        Subscriber(publisher.endpoint, sensor="main", timeout=0.05) as shorter,
         Subscriber(publisher.endpoint, sensor="main2", timeout=LONG) as same,
     ):
         publisher.wait()
         publisher.send(0)
         assert same.receive().sensor == "main2"
         with pytest.raises(TimeoutError):
-            other.receive()
+            shorter.receive()
     publisher.sink.close()
 
 
@@ -244,7 +244,7 @@ def test_listen_reports_that_nothing_came(publisher: Publisher, capsys: pytest.C
     assert "is tactflow running" in capsys.readouterr().err
 
 
-def test_whoever_sends_messages_as_long_as_no_result_is_heard_no_more() -> None:
+def test_a_publisher_of_messages_longer_than_any_result_is_disconnected() -> None:
     with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
         port = publisher.bind_to_random_port("tcp://127.0.0.1")
         publisher.linger = 0

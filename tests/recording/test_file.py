@@ -77,7 +77,7 @@ def test_annotations_of_foxglove_lie_on_contact_and_dots_counted_from_the_corner
     encoded = encode_annotations(Result(frame, {"contact": two, "markers": tracked}), 1_500_000_000)
     read = ImageAnnotations.FromString(encoded)
     assert (read.timestamp.seconds, read.timestamp.nanos) == (1, 500_000_000)
-    places = [(one.type, np.array([(point.x, point.y) for point in one.points])) for one in read.points]
+    places = [(part.type, np.array([(point.x, point.y) for point in part.points])) for part in read.points]
     outlines = [points for kind, points in places if kind == PointsAnnotation.LINE_LOOP]
     assert np.array_equal(outlines, [CONTACT.hull + 0.5, CONTACT.hull + 100.5])
     dots = np.concatenate([points for kind, points in places if kind == PointsAnnotation.POINTS])

@@ -53,7 +53,7 @@ def test_a_pipeline_is_handed_on_without_its_secrets(text: str) -> None:
         ["batch", f"rtsp://me:{SECRET}@camera/1", "--out", "unused"],
     ],
 )
-def test_no_error_message_tells_a_secret_of_the_command_line(
+def test_no_error_message_repeats_a_secret_of_the_command_line(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words) in (2, 4)
