@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import logging
+import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
 
+from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Output, Recorder, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.message.result import Result
+from tactflow.engine.rate import SLACK, RateLimit
+from tactflow.message.result import Result, encode_message
 from tactflow.recording import missing_packages
 from tactflow.system.files import expanded, next_name
 
 if TYPE_CHECKING:
-    from tactflow.recording.recorder import FrameRecorder
+    from tactflow.recording.writer import Entry, RecordingWriter
+
+log = logging.getLogger("tactflow")
+
+BACKLOG_SHARE = 4
+"""Frames from memory that are written per new frame, so that saving them never holds up the run."""
 
 
 class Record(Recorder):
@@ -88,16 +100,24 @@ class Record(Recorder):
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is written yet.
 
-        Parameters
-        ----------
-        sensor : names the channels of the file.
-        control : handle on the run, for the settings that are written beside the frames.
+        sensor : names the channels of the file. control : the run, whose settings are written beside the
+        frames; or None.
         """
         super().__init__(params)
         self.description = params.path
         self._sensor = sensor
         self._control = control
-        self._recorder: FrameRecorder | None = None
+        self._counts = {"frames": 0, "files": 0, "bytes": 0}
+        self._previews = RateLimit(params.preview) if params.preview else None
+        self._lock = threading.RLock()
+        self._file: RecordingWriter | None = None
+        self._ends: int | None = None
+        self._backlog: deque[Entry] = deque()
+        self._references: list[Entry] = []
+        self._ring: deque[Entry] = deque()
+        self._ring_bytes = 0
+        self._warned = False
+        self._touching = False
 
     @classmethod
     def outputs(cls, params: Record.Params) -> Sequence[Output]:
@@ -121,44 +141,52 @@ class Record(Recorder):
         problem = missing_packages()
         if problem is not None:
             raise StageError(problem)
-        from tactflow.recording.recorder import FrameRecorder
-
-        p = self.params
-        options = p.model_dump(exclude={"path", "overwrite", "trigger"})
-        path = expanded(p.path)
-        self._recorder = FrameRecorder(path, self._sensor, self._control, trigger=p.begins, **options)
-        if p.begins == "start":
-            self._recorder.start(numbered=False, overwrite=p.overwrite)
+        if self.params.begins == "start":
+            self._open_file(expanded(self.params.path), self.params.overwrite)
 
     @property
     def recording(self) -> bool:
         """Whether a file is being written. In ring mode it ends by itself."""
-        return self._recorder is not None and self._recorder.recording
+        return self._file is not None
 
     def start_recording(self) -> None:
-        """Begin a new file with a number of its own; with a ring, save what it holds. Nothing if recording.
+        """Begin a new, numbered file with what the ring holds, which then is all of it. Nothing if recording.
 
         Raises
         ------
         StageError
             If it cannot be written.
         """
-        if self._recorder is not None:
-            self._recorder.start()
-            self.description = str(self._recorder.path)
+        with self._lock:
+            if self.recording:
+                return
+            self._open_next()
+            self._backlog = deque(self._ring)
+            self._ends = self._backlog[-1].time if self._backlog else None
+            # While the run is paused, no frame comes that would take the ring along.
+            if self._backlog and self._control is not None and self._control.paused:
+                self.stop_recording()
 
     def stop_recording(self) -> None:
-        """Finish the file. Nothing if not recording. Raises StageError if it cannot be written."""
-        if self._recorder is not None:
-            self._recorder.stop()
+        """Finish the file, with all that belongs to it. Nothing if not recording.
+
+        Raises
+        ------
+        StageError
+            If it cannot be written.
+        """
+        with self._lock:
+            while self._is_due():
+                self._write_entry(self._backlog.popleft())
+            self._finish()
 
     def wants(self) -> bool:
         """Whether frames are written or kept."""
-        return self._recorder is not None and self._recorder.wants
+        return self.recording or self.params.ring is not None or self.params.trigger == "contact"
 
     def counters(self) -> dict[str, int]:
         """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
-        return {} if self._recorder is None else self._recorder.counters()
+        return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
     def write(self, result: Result) -> None:
         """Record one frame, or keep it for later.
@@ -168,10 +196,129 @@ class Record(Recorder):
         StageError
             If it cannot be written. The file then ends with the frame before and can be played.
         """
-        if self._recorder is not None:
-            self._recorder.add(result)
-            self.description = str(self._recorder.path)
+        with self._lock:
+            if not self.wants() and not result.frame.reference:
+                return
+            entry = self._entry(result)
+            if self.params.trigger == "contact":
+                self._follow(result.contact is not None, entry.time)
+            if self.recording:
+                self._backlog.append(entry)
+            for _ in range(BACKLOG_SHARE):
+                if self._is_due():
+                    self._write_entry(self._backlog.popleft())
+            if self._backlog and not self._is_due():
+                self._finish()
+            self._keep(entry)
 
     def close(self) -> None:
         """Write what is left, and finish the file."""
         self.stop_recording()
+
+    def _entry(self, result: Result) -> Entry:
+        from tactflow.recording.frames import encode_frame, nanoseconds
+        from tactflow.recording.schemas import encode_annotations, encode_picture
+        from tactflow.recording.writer import Entry
+
+        frame = result.frame
+        time = nanoseconds(frame.t)
+        data = {"frames": encode_frame(frame)}
+        # A reference image that is not part of the source has no results.
+        if frame.seq >= 0:
+            data["results"] = encode_message(result, detail=True)
+            if self._previews is not None and self._previews.due(frame.t):
+                image = frame.image if result.image is None else result.image
+                jpeg = encode_jpeg(image, self.params.quality)
+                data["image"] = encode_picture(jpeg, self._sensor, time)
+                data["annotations"] = encode_annotations(result, time)
+        return Entry(time, frame.seq, frame.reference, frame.epoch, data)
+
+    def _follow(self, touching: bool, time: int) -> None:
+        """Begin a file when a contact begins; it ends some time after the contact."""
+        if touching and not self._touching:
+            self.start_recording()
+        if touching:
+            self._ends = time + round((self.params.after + SLACK) * 1e9)
+        self._touching = touching
+
+    def _is_due(self) -> bool:
+        """Whether the next entry of the backlog belongs to the file."""
+        return bool(self._backlog) and (self._ends is None or self._backlog[0].time <= self._ends)
+
+    def _keep(self, entry: Entry) -> None:
+        """Remember the entry in the ring, and references for as long as frames of their epoch may follow."""
+        ring = self._ring
+        if self.params.ring is not None:
+            ring.append(entry)
+            self._ring_bytes += _size(entry)
+            while ring[0].time < entry.time - round(self.params.ring * 1e9):
+                self._ring_bytes -= _size(ring.popleft())
+            while self._ring_bytes > self.params.memory * 1_000_000:
+                self._ring_bytes -= _size(ring.popleft())
+                if not self._warned:
+                    self._warned = True
+                    log.warning(
+                        "record: the ring holds only %.1f s, as memory is limited to %d MB; raise memory",
+                        (entry.time - ring[0].time) / 1e9 if ring else 0,
+                        self.params.memory,
+                    )
+        if entry.reference:
+            self._references.append(entry)
+        oldest = min(waiting[0].epoch for waiting in (ring, self._backlog, [entry]) if waiting)
+        self._references = [reference for reference in self._references if reference.epoch >= oldest]
+
+    def _open_file(self, path: Path, overwrite: bool = False) -> RecordingWriter:
+        from tactflow.recording.writer import RecordingWriter
+
+        self._file = RecordingWriter(path, self._sensor, self._control, overwrite=overwrite)
+        self.description = str(path)
+        return self._file
+
+    def _open_next(self) -> RecordingWriter:
+        file = self._open_file(next_name(expanded(self.params.path)))
+        log.info("record: %s", file.path)
+        return file
+
+    def _write_entry(self, entry: Entry) -> None:
+        """Write one entry, where the file is large or long enough to a further one."""
+        file = self._file
+        assert file is not None
+        try:
+            if file.frames and self._is_full(file, entry):
+                # `recording` stays True meanwhile, or the run would leave out the next frame.
+                self._finish_file(file)
+                file = self._open_next()
+            if file.frames == 0:
+                for reference in self._references:
+                    if reference.epoch == entry.epoch and reference.seq < entry.seq:
+                        # At the beginning of the file's time line, without results of that time.
+                        file.write(replace(reference, data={"frames": reference.data["frames"]}), entry.time)
+            file.write(entry)
+        except BaseException:
+            self._file = None
+            self._backlog.clear()
+            raise
+        self._counts["frames"] += 1
+
+    def _is_full(self, file: RecordingWriter, entry: Entry) -> bool:
+        size, after = self.params.rotate_size, self.params.rotate_after
+        return (size is not None and file.bytes >= size * 1_000_000) or (
+            after is not None and entry.time - file.begins >= after * 1e9
+        )
+
+    def _finish(self) -> None:
+        file, self._file = self._file, None
+        self._backlog.clear()
+        self._ends = None
+        if file is not None:
+            self._finish_file(file)
+
+    def _finish_file(self, file: RecordingWriter) -> None:
+        file.finish()
+        self._counts["files"] += 1
+        self._counts["bytes"] += file.bytes
+
+
+def _size(entry: Entry) -> int:
+    """Approximate memory, bytes, with 200 for the object and its fields."""
+    return sum(map(len, entry.data.values())) + 200
