@@ -175,11 +175,8 @@ class StampedReader(FrameReader):
 class CaptureReader(FrameReader):
     """A source that OpenCV opens: a video, a camera, a stream.
 
-    Parameters
-    ----------
-    name : what messages call it.
-    failure : the error message if it cannot be opened.
-    arguments : of `cv2.VideoCapture`.
+    name : what messages call it. failure : the error message if it cannot be opened. arguments : of
+    `cv2.VideoCapture`.
     """
 
     def __init__(self, name: str, failure: str, *arguments: Any) -> None:
@@ -221,16 +218,8 @@ def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> BgrImage:
     >>> bgr.shape, bgr.dtype, int(bgr.max())
     ((2, 2, 3), dtype('uint8'), 255)
 
-    Parameters
-    ----------
-    image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16.
-    name : what messages call the picture.
-    note : whether the log tells what is converted.
-
-    Raises
-    ------
-    SourceError
-        If the pixels are of another kind.
+    image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16; others raise SourceError.
+    name : what messages call the picture. note : whether the log tells what is converted.
     """
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4):
@@ -263,13 +252,9 @@ def _note_16_bits(image: NDArray[np.uint16], name: str) -> None:
 
 
 def check_array(array: Any, name: str) -> None:
-    """Refuse an array, of NumPy, HDF5 or Zarr, that holds no frames.
+    """Raise SourceError unless an array, of NumPy, HDF5 or Zarr, holds frames.
 
-    Raises
-    ------
-    SourceError
-        If it is not uint8 or uint16 of N x H x W or N x H x W x C with C in 1, 3, 4, or a picture has more
-        than `MOST_PIXELS`.
+    They are uint8 or uint16, N x H x W or N x H x W x C with C in 1, 3, 4, of `MOST_PIXELS` at most.
     """
     required = "required uint8 or uint16 of N x H x W x 3 (BGR) or N x H x W (gray)"
     got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
@@ -286,15 +271,7 @@ def check_array(array: Any, name: str) -> None:
 
 
 def check_pixel_count(name: str, width: int, height: int) -> None:
-    """Refuse pictures of more pixels than a camera has, before memory is allocated for them.
-
-    name : the file or address. width, height : as it states them, px.
-
-    Raises
-    ------
-    SourceError
-        If they have more than `MOST_PIXELS`.
-    """
+    """Raise SourceError for pictures of more than `MOST_PIXELS`, before memory is allocated for them."""
     if width * height > MOST_PIXELS:
         raise SourceError(
             f"{name}: its pictures are {width} x {height}, more than {MOST_PIXELS} pixels; if that is right, "

@@ -62,16 +62,9 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def read_image(path: Path) -> NDArray[Any]:
-    """Decode an image file as it is stored, without changing depth or channels.
+    """Decode an image file as it is stored: (H, W) or (H, W, C), any depth.
 
-    Returns
-    -------
-    image : (H, W) or (H, W, C), any depth.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read, is not an image, or is cut off.
+    Raises SourceError if the file cannot be read, is not an image, or is cut off.
     """
     if path.exists() and not path.is_file():
         raise SourceError(f"{path}: required a file, not a folder or a device")
@@ -128,17 +121,10 @@ def _has_whole_chunks(png: bytes) -> bool:
 
 
 class ImageFiles(FrameReader):
-    """A recording of one image file per frame.
+    """A recording of one image file per frame; frame i is taken at i / fps.
 
-    Parameters
-    ----------
-    files : in the order they are played.
-    name : of the folder or pattern, for people.
-    fps : frames per second; the time of frame i is i / fps.
-
-    Attributes
-    ----------
-    first : name of the first file, without its folder.
+    files : in the order they are played. name : of the folder or pattern, for people. first : name of the
+    first file, without its folder.
     """
 
     def __init__(self, files: Sequence[Path], name: str, fps: float | None = None) -> None:
@@ -225,10 +211,7 @@ class ArrayFile(FrameReader):
     >>> second[0].shape, second[1]
     ((48, 64, 3), 0.1)
 
-    Parameters
-    ----------
-    path : the file.
-    fps : frames per second; the time of frame i is i / fps.
+    Frame i is taken at i / fps.
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
@@ -286,12 +269,7 @@ class VideoFile(CaptureReader):
     """A video file, read by OpenCV's FFmpeg.
 
     A frame's time is the file's own time stamp, from 0 at the first frame; where stamps are missing or do not
-    grow, one frame's duration is added instead.
-
-    Parameters
-    ----------
-    path : the file.
-    fps : frames per second if the file does not say.
+    grow, one frame's duration is added instead. fps : frames per second if the file does not say.
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
@@ -325,13 +303,7 @@ class VideoFile(CaptureReader):
 
 
 def open_file(spec: str, directory: Path | None = None, fps: float | None = None) -> FrameReader:
-    """Open images, an array or a video: a file, a folder or a pattern.
-
-    Raises
-    ------
-    SourceError
-        If it is not there, or not a recording.
-    """
+    """Open images, an array or a video: a file, a folder or a pattern. Raises SourceError."""
     if glob.has_magic(spec) and locate(spec, directory) is None:
         return open_glob(spec, directory, fps)
     path = find_path(spec, directory)

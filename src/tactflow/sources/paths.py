@@ -36,18 +36,10 @@ def split_prefix(spec: str, directory: Path | None) -> tuple[str, str]:
 
 
 def find_path(spec: str, directory: Path | None) -> Path:
-    """Where a path of a command line or a pipeline file points to.
+    """Where a path of a command line or a pipeline file points to; `~` is expanded.
 
-    Parameters
-    ----------
-    spec : absolute, or relative to the current directory or else to `directory`; `~` is expanded.
-    directory : the pipeline file's folder, or None.
-
-    Raises
-    ------
-    SourceError
-        If nothing is there; suggests files with similar names. If it is a pipe or a device: opening one may
-        block for ever, and no signal ends that.
+    Raises SourceError if nothing is there (it suggests similar names), and for a pipe or a device: opening
+    one may block for ever, and no signal ends that.
     """
     path = locate(spec, directory)
     if path is None:
@@ -72,13 +64,7 @@ def _suggestion(candidates: list[Path]) -> str:
 
 
 def refuse_devices(path: Path) -> None:
-    """Refuse a pipe or a device, also through a link, and a folder with one inside: reading it may never end.
-
-    Raises
-    ------
-    SourceError
-        If there is one.
-    """
+    """Raise SourceError for a pipe or a device, also through a link or inside a folder: it may never end."""
     inside = [Path(place, name) for place, _, names in os.walk(path) for name in names]
     for file in inside or [path]:
         if is_device(str(file)):
@@ -86,19 +72,10 @@ def refuse_devices(path: Path) -> None:
 
 
 def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The path and the settings of a source.
+    """The path and the settings of a source, `path?name=value&name=value`; `%26` stands for &.
 
-    Parameters
-    ----------
-    spec : `path`, or `path?name=value&name=value`; `%26` stands for &. A file that has a ? in its name takes
-        precedence.
-    directory : where a relative path is looked for if it is not in the current directory.
-    known : name -> what it is, for messages.
-
-    Raises
-    ------
-    SourceError
-        If a setting is unknown, empty or given twice.
+    A file that has a ? in its name takes precedence. known : name -> what it is, for messages. Raises
+    SourceError if a setting is unknown, empty or given twice.
 
     >>> split_query("bag.mcap?topic=/gel/image", None, {"topic": "name of a topic"})
     ('bag.mcap', {'topic': '/gel/image'})
