@@ -52,6 +52,11 @@ _SHRUNK = {2: "halved", 4: "quartered", 8: "shrunk 8 times", 16: "shrunk 16 time
 """Factor of `downsample` -> what it does, in words."""
 
 
+FEWEST_PIXELS = 160
+"""Shorter side of a processed picture, px, below which shrinking it deserves a hint. Chosen by hand: the
+smallest pictures of the sensors that the shipped pipelines are for."""
+
+
 class Preprocessed(NamedTuple):
     """image : the processed frame. mapping : between its pixels and those of the raw frame."""
 
@@ -105,7 +110,12 @@ class Preprocess(Stage):
         ]
         if steps:
             done = " and ".join(filter(None, (", ".join(steps[:-1]), steps[-1])))
-            logger.info("%d x %d %s to %d x %d: stages.preprocess", *before, done, *after)
+            hint = (
+                "; dots may be lost: try downsample: 1"
+                if params.downsample > 1 and min(after) < FEWEST_PIXELS
+                else ""
+            )
+            logger.info("%d x %d %s to %d x %d: stages.preprocess%s", *before, done, *after, hint)
 
     def _build(self, width: int, height: int) -> Preprocessor:
         params = self.params

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -28,14 +29,14 @@ def test_what_was_found_is_told_and_drawn(tmp_path: Path, capsys: pytest.Capture
     assert ((picture == (0, 255, 255)).all(axis=2)).any()
 
 
-def test_a_gel_without_marks_is_no_error_and_the_best_spots_are_drawn(
+def test_a_gel_without_marks_is_exit_code_3_and_the_best_spots_are_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     speckle = np.random.default_rng(1).normal(0, 1, (240, 320))
     speckle = cv2.GaussianBlur(speckle, (0, 0), 2.0)
     image, file = tmp_path / "speckle.png", tmp_path / "found.jpg"
     cv2.imwrite(str(image), np.where(speckle > 0.1, 40, 170).astype(np.uint8))
-    assert main(["detect", str(image), "--picture", str(file)]) == 0
+    assert main(["detect", "--source", str(image), "--picture", str(file)]) == 3
     out = capsys.readouterr().out
     assert "0 markers found" in out
     assert "form no lattice" in out
@@ -43,9 +44,18 @@ def test_a_gel_without_marks_is_no_error_and_the_best_spots_are_drawn(
     assert cv2.imread(str(file)) is not None
 
 
+def test_what_was_found_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["detect", "--source", GEL, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert len(found["centers"]) == 80
+    assert found["polarity"] == "dark"
+
+
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
+        ([], 2, "required one source"),
+        ([GEL, "--source", GEL], 2, "required one source"),
         (["nowhere.mp4"], 4, "no such file"),
         ([GEL, "--frame", "5"], 4, "--frame 5 is beyond its 2 frames, counted from 0"),
         ([GEL, "--frame", "-1"], 2, "--frame: required 0 or more, got -1"),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 
 from tactflow import __version__
@@ -212,3 +214,35 @@ def test_no_name_of_a_file_forges_a_line_of_the_messages(capsys: pytest.CaptureF
         lines = capsys.readouterr().err.splitlines()
         assert [line for line in lines if line.startswith("tactflow: ")] == lines[:1]
         assert not any(letter in "".join(lines) for letter in "\x1b\u202e")
+
+
+def test_a_shipped_pipeline_is_printed_to_be_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["pipelines", "mini"]) == 0
+    Path("pipeline.yaml").write_text(capsys.readouterr().out)
+    assert main(["check", "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["mistakes"] == []
+    assert checked["sensors"]["mini"]["stages"][0] == "capture"
+    assert main(["explain", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["nodes"]["hull"]["runs because"].endswith("need it")
+    assert main(["check", "--json", "--set", "stages.hull.min_aera=3"]) == 2
+    assert "did you mean min_area?" in json.loads(capsys.readouterr().out)["mistakes"][0]
+    assert main(["pipelines", "--json"]) == 0
+    assert "mini" in json.loads(capsys.readouterr().out)
+    assert main(["pipelines", "minni"]) == 2
+    assert "did you mean mini?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pipeline", ["mini", "digit", "sts", "default"])
+def test_a_video_with_what_was_found_takes_one_option(
+    pipeline: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = ["run", pipeline, "--source", "sim:press?frames=30", "--video", "out.mp4", "--quiet"]
+    assert main([*command, "--set", "sinks.view=null", "--set", "sinks.zmq=null"]) == 0
+    film = cv2.VideoCapture("out.mp4")
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 30
+    film.release()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -24,6 +25,16 @@ def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFix
     hull = next(row for row in rows if row.startswith("hull "))
     ports = ["contact_mask,", "evidence?", "contact"]
     assert hull.split()[:6] == ["hull", "stage", *ports, "built-in"]
+
+
+def test_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stages", "--json"]) == 0
+    every = {part["name"]: part for part in json.loads(capsys.readouterr().out)}
+    assert sorted(every) == sorted(c.name for c in available())
+    assert main(["stages", "hull", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == [every["hull"]]
+    assert every["hull"]["outputs"] == {"contact": "Contact (may be absent)"}
+    assert "rotate" in every["preprocess"]["parameters"]["properties"]
 
 
 def test_one_stage_is_explained_with_ports_and_parameters(

@@ -79,12 +79,14 @@ def test_a_real_wedge_is_rectified_to_the_full_picture(shared_data: Path) -> Non
     [
         (
             {"rotate": 90, "downsample": 2},
-            "80 x 60 turned by 90 degrees and halved to 30 x 40: stages.preprocess",
+            "80 x 60 turned by 90 degrees and halved to 30 x 40: stages.preprocess; "
+            "dots may be lost: try downsample: 1",
         ),
         ({"crop": [0, 0, 40, 20]}, "80 x 60 cut to 40 x 20: stages.preprocess"),
         (
             {"crop": [0, 0, 40, 20], "rotate": 180, "downsample": 4},
-            "80 x 60 cut, turned by 180 degrees and quartered to 10 x 5: stages.preprocess",
+            "80 x 60 cut, turned by 180 degrees and quartered to 10 x 5: stages.preprocess; "
+            "dots may be lost: try downsample: 1",
         ),
         ({}, None),
     ],

@@ -72,5 +72,5 @@ def test_reset_takes_a_new_reference() -> None:
 
 
 def test_no_markers_is_an_error_that_names_the_markerless_pipeline() -> None:
-    with pytest.raises(ValueError, match=r"0 markers found: .* pipelines/markerless\.yaml"):
+    with pytest.raises(ValueError, match=r"0 markers found: .* use the pipeline markerless"):
         feed(Tracker(Tracker.Params()), np.full((200, 200, 3), 90, np.uint8), 0)

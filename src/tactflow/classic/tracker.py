@@ -166,7 +166,7 @@ def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
     """
     if len(centers) < 4:
         raise NoMarkersError(
-            f"{len(centers)} markers found: is the sensor marker-less? then use pipelines/markerless.yaml"
+            f"{len(centers)} markers found: is the sensor marker-less? then use the pipeline markerless"
         )
     squared = ((centers[:, None] - centers[None]) ** 2).sum(axis=2)
     np.fill_diagonal(squared, np.inf)
@@ -185,7 +185,7 @@ def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
         links.setdefault(second, []).append((first, -down, -right))
     if not links:
         raise NoMarkersError(
-            "0 markers found in a grid: is the sensor marker-less? then use pipelines/markerless.yaml"
+            "0 markers found in a grid: is the sensor marker-less? then use the pipeline markerless"
         )
     largest: dict[tuple[int, int], int] = {}
     for start in sorted(links, key=lambda center: -len(links[center])):

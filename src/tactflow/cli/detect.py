@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
-from tactflow.cli.options import add_overwrite, refuse_output
+from tactflow.cli.options import add_json, add_overwrite, refuse_output
 from tactflow.cli.terminal import printable
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
@@ -28,7 +29,9 @@ SHOWN: Final = 0.25
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `detect`."""
-    parser.add_argument("source", metavar="SRC", help="as in 'tactflow run --source': of the untouched gel")
+    parser.add_argument("first", nargs="?", metavar="SRC", help="the same as --source SRC")
+    parser.add_argument("--source", metavar="SRC", help="as in 'tactflow run': of the untouched gel")
+    add_json(parser)
     parser.add_argument(
         "--picture", type=Path, metavar="FILE", help="write what was found and why, to look at or to send"
     )
@@ -44,20 +47,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what was found, and draw it; returns 0 also where there are no marks.
+    """Print what was found, and draw it; returns 3 where there are no marks.
 
     Raises
     ------
     ConfigError, SourceError, StageError
         If the options are wrong, the frame cannot be read, or the picture cannot be written.
     """
+    if (args.first is None) == (args.source is None):
+        raise ConfigError("required one source: tactflow detect --source SRC")
+    source = args.source or args.first
     if args.frame < 0:
         raise ConfigError(f"--frame: required 0 or more, got {args.frame}")
     if args.picture is not None:
         if args.picture.suffix.lower() not in PICTURES:
             raise ConfigError(f"--picture: required a name that ends in .png or .jpg, got {args.picture}")
         refuse_output("--picture", args.picture, overwrite=args.overwrite)
-    image = _frame(args.source, args.frame)
+    image = _frame(source, args.frame)
     image = Preprocessor(image.shape[1::-1], rotate=args.rotate, downsample=args.downsample)(image)
     valid = None if args.all else valid_area(image)
     marks: Detection | None = None
@@ -69,15 +75,22 @@ def run(args: argparse.Namespace) -> int:
         rival, lines = error.best, [str(error), *_best(error.best)]
     except ValueError as error:
         raise ConfigError(f"--dot: {error}") from None
-    title = f"{args.source}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
+    title = f"{source}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
     without = 0.0 if valid is None else float(np.mean(valid == 0))
     if without > 0:
         lines.append(f"dim: {100 * without:.0f} % of the picture show no gel; --all looks there, too")
     text = "\n".join(map(printable, [title, *lines]))
-    print(text)
+    print(orjson.dumps(_as_json(marks, lines)).decode() if args.json else text)
     if args.picture is not None:
         _write(args.picture, draw_detection(image, marks, text, rival=rival, valid=valid))
-    return 0
+    return 0 if marks is not None else StageError.exit_code
+
+
+def _as_json(marks: Detection | None, lines: Sequence[str]) -> dict[str, Any]:
+    """The marks in px of the picture that was looked at, and what is said about them."""
+    found = {} if marks is None else {"dot_radius": marks.dot_radius, "pitch": marks.pitch}
+    centers = [] if marks is None else marks.centers.tolist()
+    return {"centers": centers, "polarity": marks and marks.polarity, **found, "notes": lines}
 
 
 def _near_rival(marks: Detection) -> Candidate | None:

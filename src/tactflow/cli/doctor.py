@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import orjson
 
-from tactflow.cli.options import seconds
+from tactflow.cli.options import add_json, seconds
 from tactflow.cli.terminal import printable
 from tactflow.engine.errors import StageError
 from tactflow.sources import KINDS
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"how much of it to look at; default {LIVE_SECONDS:g}. Leave the gel untouched at first and at "
         "last, and press it in between",
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
+    add_json(parser)
     parser.add_argument("--html", type=Path, metavar="FILE", help="also write the table as a page")
 
 

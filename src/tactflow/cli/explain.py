@@ -4,10 +4,11 @@ pipeline as a Mermaid flowchart."""
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from tactflow.cli.options import add_pipeline, load_plan
+from tactflow.cli.options import add_json, add_pipeline, load_plan
 from tactflow.cli.statistics import NodeStatistics, Statistics, milliseconds, saving, share
 from tactflow.cli.terminal import printable
 from tactflow.engine.contract import Sink
@@ -20,6 +21,12 @@ _COSTLY = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `explain`."""
+    add_arguments_graph(parser)
+    add_json(parser)
+
+
+def add_arguments_graph(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `graph`."""
     add_pipeline(parser)
     parser.add_argument(
         "--stats",
@@ -29,12 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a paragraph for each stage and sink."""
+    """Print a paragraph for each stage and sink, or the same as JSON."""
+    if args.json:
+        pipeline, plan, statistics = _load(args)
+        about = {"file": pipeline.file, "sensor": pipeline.sensor, "segments": list(plan.segments)}
+        print(json.dumps(about | {"nodes": dict(_facts(pipeline, plan, statistics))}, indent=2))
+        return 0
     print("\n".join(map(printable, explanation(*_load(args)))))
     return 0
-
-
-add_arguments_graph = add_arguments
 
 
 def run_graph(args: argparse.Namespace) -> int:
@@ -54,15 +63,26 @@ def explanation(pipeline: Pipeline, plan: Plan, statistics: Statistics | None) -
     yield f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"
     if statistics is not None:
         yield from _run_lines(pipeline, statistics)
+    for id_, facts in _facts(pipeline, plan, statistics):
+        yield ""
+        yield f"{id_} ({facts.pop('at')})"
+        width = max(map(len, facts))
+        yield from (f"  {name.ljust(width)}  {text}" for name, text in facts.items())
+
+
+def _facts(
+    pipeline: Pipeline, plan: Plan, statistics: Statistics | None
+) -> Iterator[tuple[str, dict[str, str]]]:
+    """Each stage and sink with what there is to say about it: heading -> text."""
     sinks = _sinks_behind(pipeline)
     uncertain = _may_be_absent(pipeline)
     for node in pipeline.nodes.values():
-        yield ""
-        yield f"{node.id} ({node.mark})"
         is_pruned = node in plan.pruned
-        facts = {"pruned because": "no sink needs what it makes"}
-        if not is_pruned:
-            facts = {"runs because": _reason(node, sinks[node.id])}
+        facts = {"at": str(node.mark)}
+        if is_pruned:
+            facts["pruned because"] = "no sink needs what it makes"
+        else:
+            facts["runs because"] = _reason(node, sinks[node.id])
             if skips := _skips(node, pipeline, uncertain):
                 facts["skipped when"] = "; ".join(skips)
         if node.component.kind == "stage":
@@ -75,8 +95,7 @@ def explanation(pipeline: Pipeline, plan: Plan, statistics: Statistics | None) -
         facts["is"] = name if ":" in name or name == origin else f"{name} ({origin})"
         if statistics is not None and not is_pruned:
             facts["statistics"] = _cost(node, statistics)
-        width = max(map(len, facts))
-        yield from (f"  {name.ljust(width)}  {text}" for name, text in facts.items())
+        yield node.id, facts
 
 
 def _reason(node: Node, sinks: list[str]) -> str:

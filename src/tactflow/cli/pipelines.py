@@ -8,7 +8,7 @@ import subprocess
 import time
 from importlib.resources import files
 
-from tactflow.cli.options import add_pipeline, add_quiet, load_plan
+from tactflow.cli.options import add_json, add_pipeline, add_quiet, load_plan
 from tactflow.cli.terminal import printable, say, table
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import described_pipelines, find_pipeline
@@ -20,23 +20,33 @@ from tactflow.system.extras import opencv_conflict
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what follows the options of `pipelines`, which has none."""
+    """Declare the options of `pipelines`."""
+    parser.add_argument(
+        "name", nargs="?", metavar="NAME", help="print this one, to change a copy: NAME > pipeline.yaml"
+    )
+    add_json(parser, "a JSON object: name -> what it is for")
     parser.epilog = "for your sensor: tactflow run mini --source 0"
 
 
-def run(_: argparse.Namespace) -> int:
-    """Print the name of each shipped pipeline, and what it is for."""
-    print("\n".join(table(list(described_pipelines().items()))))
+def run(args: argparse.Namespace) -> int:
+    """Print the name of each shipped pipeline and what it is for, or one of them as it is."""
+    if args.name is not None:
+        print(find_pipeline(args.name).read_text(encoding="utf-8"), end="")
+    elif args.json:
+        print(json.dumps(described_pipelines(), indent=2))
+    else:
+        print("\n".join(table(list(described_pipelines().items()))))
     return 0
 
 
 def add_arguments_check(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `check`."""
     add_pipeline(parser)
+    add_json(parser, "a JSON object: the mistakes, and what each sensor's pipeline consists of")
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Print one line for each sensor; raises ConfigError with every mistake."""
+    """Print one line for each sensor, or JSON; raises ConfigError with every mistake."""
     from tactflow.fleet.sinks import clash_problems
 
     warn_of_opencv()
@@ -49,9 +59,17 @@ def run_check(args: argparse.Namespace) -> int:
         except ConfigError as error:
             mistakes += error.mistakes
     mistakes += clash_problems({name: pipeline for name, (pipeline, _) in valid.items() if name is not None})
+    # A mistake that several sensors share is reported once.
+    mistakes = list(dict.fromkeys(mistakes))
+    if args.json:
+        parts = {
+            pipeline.sensor: {"stages": [*pipeline.nodes], "warnings": [*pipeline.warnings, *plan.warnings]}
+            for pipeline, plan in valid.values()
+        }
+        print(json.dumps({"mistakes": mistakes, "sensors": parts}, indent=2))
+        return ConfigError.exit_code if mistakes else 0
     if mistakes:
-        # A mistake that several sensors share is reported once.
-        raise ConfigError(*dict.fromkeys(mistakes))
+        raise ConfigError(*mistakes)
     for name, (pipeline, plan) in valid.items():
         sinks = len(pipeline.sinks)
         counts = {"stage": len(pipeline.nodes) - sinks, "sink": sinks, "segment": len(plan.segments)}

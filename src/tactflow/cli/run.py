@@ -46,6 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jsonl", metavar="PATH", help="also write one result message a frame ('-': standard output)"
     )
+    parser.add_argument(
+        "--video",
+        metavar="PATH",
+        help="also write the pictures with what was found drawn on them (.mp4, .avi, ...)",
+    )
     parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
     parser.add_argument(
         "--realtime",
@@ -121,7 +126,7 @@ def _run_all(
             f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
         )
     reports = _reports(args)
-    files = {"--jsonl": args.jsonl, "--out": getattr(args, "out", None)}
+    files = {"--jsonl": args.jsonl, "--video": args.video, "--out": getattr(args, "out", None)}
     named = {option: str(path) for option, path in files.items() if path is not None}
     problems += name_problems(named | reports, sensors)
     if problems:
@@ -156,11 +161,13 @@ def _reports(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
-    """The sink of `--jsonl`."""
-    if args.jsonl is None:
-        return {}
-    path = args.jsonl if sensor is None else with_name(args.jsonl, sensor)
-    return {"--jsonl": {"use": "jsonl", "path": path}}
+    """The sinks of `--jsonl` and `--video`."""
+    paths = {"jsonl": args.jsonl, "video": args.video}
+    return {
+        f"--{use}": {"use": use, "path": path if sensor is None else with_name(path, sensor)}
+        for use, path in paths.items()
+        if path is not None
+    }
 
 
 def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
+from tactflow.cli.options import add_json
 from tactflow.cli.terminal import say, table
 from tactflow.config.document import shown
 from tactflow.config.models import is_word
@@ -35,19 +37,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="explain one: a built-in, a plug-in, module:Class or ./file.py:Class, which is run",
     )
+    add_json(parser, "a JSON array with ports, and the parameters as JSON Schema")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the table, or one component in full."""
-    if args.name is not None:
-        print("\n".join(details(_find(args.name))))
-        return 0
-    components, problems = catalogue()
+    components, problems = ([_find(args.name)], []) if args.name is not None else catalogue()
     for problem in problems:
         say(f"tactflow: warning: {problem}")
+    if args.json:
+        print(json.dumps([*map(_as_json, components)], indent=2))
+        return 0
+    if args.name is not None:
+        print("\n".join(details(components[0])))
+        return 0
     heading = ("NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT IT DOES")
     print("\n".join(table([heading, *map(_row, components)])))
     return 0
+
+
+def _as_json(component: Component) -> dict[str, Any]:
+    ports = component.ports
+    return {
+        "name": component.name,
+        "kind": component.kind,
+        "origin": component.origin,
+        "inputs": {port.name: _port_type(port) for port in ports.inputs},
+        "outputs": {port.name: _port_type(port) for port in ports.outputs},
+        "parameters": component.params.model_json_schema(schema_generator=_AnySchema),
+    }
 
 
 def details(component: Component) -> Iterator[str]:

@@ -11,7 +11,7 @@ from typing import Final
 
 import orjson
 
-from tactflow.cli.options import refuse_output, seconds
+from tactflow.cli.options import add_json, refuse_output, seconds
 from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--html", type=Path, metavar="FILE", help="default: beside --out, ending in .html")
     parser.add_argument("--overwrite", action="store_true", help="replace these files if they are there")
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

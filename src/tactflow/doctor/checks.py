@@ -281,7 +281,7 @@ def _compression(observed: Observation) -> Measured:
 def _dots(observed: Observation) -> Measured | str:
     dots = observed.dots
     if dots is None:
-        return "none detected; for a gel without dots use pipelines/markerless.yaml"
+        return "none detected; for a gel without dots use the pipeline markerless"
     grid = measures.lattice(dots, observed.typical)
     return Measured(
         100.0 * grid.missing,

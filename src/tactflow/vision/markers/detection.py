@@ -77,7 +77,7 @@ CENTROID_CONVERGED: Final = 1e-3
 marker's error."""
 
 _NO_MARKERS: Final = (
-    "0 markers found: is the sensor marker-less? then use pipelines/markerless.yaml, or one that is made for "
+    "0 markers found: is the sensor marker-less? then use the pipeline markerless, or one that is made for "
     "your sensor without dots (tactflow pipelines)"
 )
 _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels)"
