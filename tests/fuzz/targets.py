@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import zmq
 from mcap.writer import CompressionType, Writer
-from starlette.websockets import WebSocket, WebSocketState
+from websockets.asyncio.server import ServerConnection
 
 from tactflow.calibration.file import Calibration, ScaleEntry
 from tactflow.cli import listen
@@ -272,18 +272,14 @@ def subscriptions(_: Path) -> Iterator[Parser]:
 class OneMessage:
     """A connection to the page over which one message comes."""
 
-    application_state = WebSocketState.CONNECTED
-
     def __init__(self, text: str) -> None:
         self._texts = [text]
 
-    async def send_text(self, data: str) -> None: ...
-
-    async def send_bytes(self, data: bytes) -> None: ...
+    async def send(self, data: str | bytes) -> None: ...
 
     async def close(self, code: int, reason: str) -> None: ...
 
-    async def receive_text(self) -> str:
+    async def recv(self) -> str:
         if not self._texts:
             raise EOFError
         return self._texts.pop()
@@ -302,7 +298,7 @@ def commands(_: Path) -> Iterator[Parser]:
     def feed(data: bytes) -> None:
         hub = Hub(None, "main")
         hub.run_id = secrets.token_hex(1)
-        asyncio.run(hub.serve(cast(WebSocket, OneMessage(data.decode("utf-8", "replace")))))
+        asyncio.run(hub.serve(cast(ServerConnection, OneMessage(data.decode("utf-8", "replace")))))
 
     yield Parser(samples, feed)
 

@@ -14,12 +14,11 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import orjson
-from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from websockets.asyncio.server import ServerConnection
 
 from tactflow.engine.control import Control
 from tactflow.engine.stats import Durations
@@ -68,7 +67,7 @@ class Page:
     send. ended : the run is over.
     """
 
-    socket: WebSocket
+    socket: ServerConnection
     credit: bool = True
     shows: frozenset[str] = frozenset()
     sent: int = 0
@@ -177,7 +176,7 @@ class Hub:
 
     # -- the life of a page -------------------------------------------------------------------------------
 
-    async def serve(self, socket: WebSocket) -> None:
+    async def serve(self, socket: ServerConnection) -> None:
         """Serve a page until it disconnects or the run ends."""
         page = Page(socket)
         page.post("hello", _text(type="hello", run=self.run_id, sensors=[self.sensor]))
@@ -281,9 +280,9 @@ class Hub:
             page.wake.clear()
             while page.texts:
                 kind = next(iter(page.texts))
-                await page.socket.send_text(page.texts.pop(kind))
+                await page.socket.send(page.texts.pop(kind))
             if page.ended:
-                await close(page.socket, 1001, "the run has ended")
+                await page.socket.close(1001, "the run has ended")
                 return
             packet = self._latest
             if page.credit and packet is not None and packet.number > page.sent:
@@ -293,16 +292,16 @@ class Hub:
                 page.sent_at = time.perf_counter()
                 self._sent += 1
                 self._recount()
-                await page.socket.send_bytes(packet.data)
+                await page.socket.send(packet.data)
 
     async def _read(self, page: Page) -> None:
         while True:
             try:
-                message = orjson.loads(await page.socket.receive_text())
+                message = orjson.loads(await page.socket.recv())
             except orjson.JSONDecodeError:
                 message = None
             if not isinstance(message, dict):
-                await close(page.socket, 1008, "required a JSON object")
+                await page.socket.close(1008, "required a JSON object")
                 return
             if "ack" in message:
                 self._acknowledged(page, message)
@@ -359,13 +358,6 @@ class Hub:
     def _refusal(self, name: str) -> str | None:
         """Why a command is unavailable, or None."""
         return "the run has ended" if self._end is not None else self._commands.refusal(name)
-
-
-async def close(socket: WebSocket, code: int, reason: str) -> None:
-    """Close a WebSocket that either side may have closed already."""
-    if socket.application_state is WebSocketState.CONNECTED:
-        with suppress(RuntimeError, WebSocketDisconnect):
-            await socket.close(code, reason)
 
 
 def _text(**fields: Any) -> str:
