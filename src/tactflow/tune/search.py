@@ -128,14 +128,16 @@ class Search:
         dots = recording.observation.dots
         known = [Candidate(DEFAULT), *candidates(base, recording.size, None if dots is None else dots.pitch)]
         tuned = Tuned(recording, look, self.goal, [], [], None)
-        tuned.trials = self._first_round(known, tuned)
+        # The original and the most expensive candidate, the baseline of comparisons, come first.
+        order = [0, 1, *(2 + np.random.default_rng(self.seed).permutation(len(known) - 2))]
+        tuned.trials = self._round([known[index] for index in order], FIRST, tuned, self.seed, GROUP)
         finalists = self._finalists(known, tuned.trials)
         if self._is_over(0.5):
             tuned.notes.append("out of time after the first round")
             names = {candidate.name for candidate in finalists}
             tuned.trials = [trial for trial in tuned.trials if trial.name in names]
         else:
-            tuned.trials = self._last_round(finalists, tuned)
+            tuned.trials = self._round(finalists, LAST, tuned, self.seed + 100, len(finalists))
         if not any(math.isfinite(trial.of(self.goal.kind)) for trial in tuned.trials if trial.usable):
             raise SourceError(_no_success(tuned.trials, self.goal))
         self._show_recording(finalists, tuned)
@@ -149,22 +151,6 @@ class Search:
         """Whether a fraction of the time budget has passed."""
         return time.monotonic() - self._began > share * self.seconds
 
-    def _first_round(self, known: Sequence[Candidate], tuned: Tuned) -> list[Trial]:
-        """Evaluate all candidates in random groups, until half of the budget has passed."""
-        self.say(f"round 1: {len(known)} candidates, {_frames(FIRST)} frames")
-        # The original and the most expensive candidate, the baseline of comparisons, come first.
-        order = [0, 1, *(2 + np.random.default_rng(self.seed).permutation(len(known) - 2))]
-        trials: list[Trial] = []
-        for start in range(0, len(order), GROUP):
-            if trials and self._is_over(0.5):
-                tuned.notes.append(f"out of time after {len(trials)} of {len(known)} candidates")
-                break
-            group = [known[index] for index in order[start : start + GROUP]]
-            trials += self._judge(group, FIRST, tuned.look, self.seed)
-        mark_unsound(trials)
-        tuned.rounds.append((len(trials), _frames(FIRST)))
-        return trials
-
     def _finalists(self, known: Sequence[Candidate], trials: Sequence[Trial]) -> list[Candidate]:
         """Select the original, the most expensive, the best and the front."""
         runs = {trial.name for trial in trials if trial.failure is None}
@@ -172,27 +158,31 @@ class Search:
         chosen = {*(candidate.name for candidate in known[:2]), *best, *front(trials, self.goal.kind)}
         return [candidate for candidate in known if candidate.name in chosen & runs]
 
-    def _last_round(self, finalists: Sequence[Candidate], tuned: Tuned) -> list[Trial]:
-        self.say(f"round 2: {len(finalists)} candidates, {_frames(LAST)} frames")
-        trials = self._judge(finalists, LAST, tuned.look, self.seed + 100)
+    def _round(
+        self, known: Sequence[Candidate], cases: Sequence[Case], tuned: Tuned, seed: int, size: int
+    ) -> list[Trial]:
+        """Evaluate candidates on simulated recordings, `size` of them in turns, until half of the budget has
+        passed."""
+        frames = sum(case.frames for case in cases)
+        self.say(f"{len(known)} candidates on {frames} simulated frames")
+        rendered = [Fitted(tuned.look, case, self._folder, seed + index) for index, case in enumerate(cases)]
+        trials: list[Trial] = []
+        for start in range(0, len(known), size):
+            if trials and self._is_over(0.5):
+                tuned.notes.append(f"out of time after {len(trials)} of {len(known)} candidates")
+                break
+            pipelines: dict[str, Pipeline] = {}
+            for candidate in known[start : start + size]:
+                try:
+                    pipelines[candidate.name] = candidate.load(self.file, self.sensor)
+                except ConfigError as error:
+                    trials.append(Trial(candidate.name, failure=str(error)))
+            trials += judge(pipelines, rendered, self.seed, self._is_over)
+        for recording in rendered:
+            recording.path.unlink(missing_ok=True)
         mark_unsound(trials)
-        tuned.rounds.append((len(trials), _frames(LAST)))
+        tuned.rounds.append((len(trials), frames))
         return trials
-
-    def _judge(self, group: Sequence[Candidate], cases: Sequence[Case], look: Look, seed: int) -> list[Trial]:
-        pipelines: dict[str, Pipeline] = {}
-        failed: list[Trial] = []
-        for candidate in group:
-            try:
-                pipelines[candidate.name] = candidate.load(self.file, self.sensor)
-            except ConfigError as error:
-                failed.append(Trial(candidate.name, failure=str(error)))
-        rendered = [Fitted(look, case, self._folder, seed + index) for index, case in enumerate(cases)]
-        try:
-            return [*judge(pipelines, rendered, self.seed, self._is_over), *failed]
-        finally:
-            for recording in rendered:
-                recording.path.unlink(missing_ok=True)
 
     def _show_recording(self, finalists: Sequence[Candidate], tuned: Tuned) -> None:
         """Measure times on the recording instead of simulated frames, and compare candidates without
@@ -228,10 +218,6 @@ class Search:
         # Keep the original unless the best is significantly faster.
         same = [trial for trial in picked if trial.name == DEFAULT and trial.ms.value <= picked[0].ms.high]
         return [*same, *picked][0].name if picked else None
-
-
-def _frames(cases: Sequence[Case]) -> int:
-    return sum(case.frames for case in cases)
 
 
 def _upper_error(trial: Trial, kind: str) -> float:
