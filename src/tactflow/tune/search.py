@@ -132,6 +132,8 @@ class Search:
         order = [0, 1, *(2 + np.random.default_rng(self.seed).permutation(len(known) - 2))]
         tuned.trials = self._round([known[index] for index in order], FIRST, tuned, self.seed, GROUP)
         finalists = self._finalists(known, tuned.trials)
+        if not finalists:
+            raise SourceError(_no_success(tuned.trials, self.goal))
         if self._is_over(0.5):
             tuned.notes.append("out of time after the first round")
             names = {candidate.name for candidate in finalists}

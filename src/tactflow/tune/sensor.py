@@ -127,7 +127,10 @@ def _contrast_ratio(observation: Observation, simulated: Image, levels: tuple[fl
 
 def _light_of(recording: Recording) -> str:
     """The simulator's light that responds to contacts like the recording."""
-    untouched, touched = _extremes(recording)
+    pairs = recording.observation.pairs
+    pictures = pairs[0].image, max(pairs, key=lambda pair: recording.changes[pair.number]).image
+    side = max(8, min(pictures[0].shape[:2]) // 60)
+    untouched, touched = (cv2.blur(picture, (side, side))[::4, ::4].astype(float) for picture in pictures)
     ratio = (touched / np.maximum(untouched, 25.0)).reshape(-1, 3)
     ratio = ratio / np.maximum(np.median(ratio, axis=0), 0.1) - 1.0
     strong = ratio[np.abs(ratio).max(axis=1) > FAINT]
@@ -138,16 +141,6 @@ def _light_of(recording: Recording) -> str:
     if common < -0.6:
         return "darkening"
     return min(LIGHTS, key=lambda name: abs(LIGHTS[name] - max(common, 0.0)))
-
-
-def _extremes(recording: Recording) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The untouched picture and the one with the largest change, (h, w, 3), smoothed and subsampled."""
-    pairs = recording.observation.pairs
-    first = pairs[0].image
-    most = max(pairs, key=lambda pair: recording.changes[pair.number])
-    side = max(8, min(first.shape[:2]) // 60)
-    small = [cv2.blur(image, (side, side))[::4, ::4].astype(np.float32) for image in (first, most.image)]
-    return small[0], small[1]
 
 
 def _depth(recording: Recording, plain: Look, untouched: Image) -> float:
