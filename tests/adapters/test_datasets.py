@@ -92,23 +92,30 @@ def test_what_is_no_frames_is_refused(query: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_an_array_whose_chunks_are_not_stored_is_refused(name: str, tmp_path: Path) -> None:
-    path, shape, chunks = KINDS[name](tmp_path / name, frames=IMAGES), (10**12, 12, 16, 3), (2, 12, 16, 3)
-    if name.endswith(".zarr"):
-        array = pytest.importorskip("zarr").create_array(
-            path, name="long", shape=shape, chunks=chunks, dtype="u1"
-        )
-        array[:4] = 7
+def test_an_array_ends_where_nothing_more_is_stored(
+    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = KINDS[name](tmp_path / name, frames=IMAGES)
+    options = {"shape": (10**12, 12, 16, 3), "chunks": (2, 12, 16, 3), "dtype": "u1"}
+    is_zarr = name.endswith(".zarr")
+    if is_zarr:
+        file = pytest.importorskip("zarr").open_group(path)
     else:
-        with pytest.importorskip("h5py").File(path, "a") as file:
-            file.create_dataset("long", shape, np.uint8, chunks=chunks)[:4] = 7
-            file.create_dataset("nothing", IMAGES.shape, np.uint8)
-        with pytest.raises(SourceError, match="/nothing: 0 of 1 chunks are stored"):
-            open_source(f"{path}?dataset=/nothing")
-    with pytest.raises(
-        SourceError, match="/long: 2 of 500000000000 chunks are stored; was it written to its"
-    ):
-        open_source(f"{path}?dataset=/long")
+        file = pytest.importorskip("h5py").File(path, "a")
+        file.create_dataset("whole", IMAGES.shape, "u1")
+    create = file.create_array if is_zarr else file.create_dataset
+    long, late, _ = (create(key, **options) for key in ("long", "late", "never"))
+    # Zarr does not store the chunk of two black pictures.
+    long[:5] = np.concatenate([IMAGES[:2], 0 * IMAGES[:2], IMAGES[4:]])
+    late[10**6] = IMAGES[0]
+    if not is_zarr:
+        file.close()
+    found = played(f"{path}?dataset=long")
+    assert [int(image.max()) > 0 for image, _ in found] == [True, True, False, False, True, False]
+    assert "ended after 6 of 1000000000000 frames, the others were never written" in caplog.text
+    for array in ("late", "never", *([] if is_zarr else ["whole"])):
+        with pytest.raises(SourceError, match=f"{array}: only [01] of its chunks are stored; was it written"):
+            open_source(f"{path}?dataset={array}")
 
 
 def test_pixels_in_another_file_are_not_read(tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_array, damaged, require
+from tactflow.sources.base import FrameReader, check_array, damaged, log, require
 from tactflow.sources.files import DEFAULT_FPS, decode_image
 from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
@@ -24,8 +25,8 @@ BLOCK = 64 << 20
 """Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
 LARGEST_CHUNK = 1 << 30
 """Bytes of an uncompressed chunk at most, so that a damaged file does not take all memory. Chosen by hand."""
-ZARR_METADATA = frozenset(["zarr.json", ".zarray", ".zattrs"])
-"""Files that lie beside the chunks of a Zarr array."""
+ZARR_CHUNK = re.compile(r"(?:c[./])?(\d+)(?:[./]\d+)*")
+"""Path of a chunk or shard in the folder of a Zarr array: its index along each axis."""
 
 
 class ArrayDataset(FrameReader):
@@ -58,13 +59,8 @@ class ArrayDataset(FrameReader):
         self._file = file = _open(path)
         try:
             self._array = _choose(spec, settings.get("dataset"), file.arrays, "dataset")
-            self.total = _count(self._array, self.name)
-            # A chunk that nobody wrote reads as the fill value, so that a few bytes can claim any length.
-            stored, needed = file.chunks(self._array)
-            if stored < needed:
-                raise SourceError(
-                    f"{self.name}: {stored} of {needed} chunks are stored; was it written to its end?"
-                )
+            _check(self._array, self.name)
+            self.total = self._count_stored(*file.stored(self._array))
             if "times" in settings:
                 self._times = self._seconds(_choose(spec, settings["times"], file.arrays, "times"))
             else:
@@ -82,20 +78,39 @@ class ArrayDataset(FrameReader):
         self._file.close()
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        for index, (frame, t) in enumerate(zip(_read_chunks(self._array), self._times, strict=True)):
+        for index, (frame, t) in enumerate(
+            zip(_read_chunks(self._array, len(self._times)), self._times, strict=True)
+        ):
             if frame.ndim == 1:
                 frame = decode_image(frame.tobytes(), f"{self.name}, frame {index}")
             if self._swapped and frame.ndim == 3:
                 frame = frame[..., [2, 1, 0, 3][: frame.shape[2]]] if frame.shape[2] > 1 else frame
             yield frame, float(t)
 
+    def _count_stored(self, stored: Collection[int], length: int) -> int:
+        """Frames up to the last chunk that is stored: others read as the fill value, for any length.
+
+        stored : indices of chunks along the first axis. length : frames in each.
+        """
+        chunks, claimed = max(stored, default=-1) + 1, int(self._array.shape[0])
+        # Zarr leaves out chunks of black pictures. Where most are missing, it is no recording.
+        if 2 * len(stored) < max(chunks, 1):
+            raise SourceError(f"{self.name}: only {len(stored)} of its chunks are stored; was it written?")
+        if chunks * length < claimed:
+            log.warning(
+                "%s: ended after %d of %d frames, the others were never written",
+                *(self.name, chunks * length, claimed),
+            )
+        return min(chunks * length, claimed)
+
     def _seconds(self, array: Any) -> NDArray[np.float64]:
         """Times from 0 at the first frame, s; where they would go back, they stay."""
-        if array.shape != (self.total,) or array.dtype.kind not in "fiu":
+        length = self._array.shape[0]
+        if array.shape != (length,) or array.dtype.kind not in "fiu":
             raise SourceError(
-                f"{self.name}: times are {array.dtype} of shape {array.shape}; required {self.total} numbers"
+                f"{self.name}: times are {array.dtype} of shape {array.shape}; required {length} numbers"
             )
-        times = np.asarray(array[:])
+        times = np.asarray(array[: self.total])
         # Whole numbers are subtracted before they are rounded: Unix time in ns has 19 digits.
         seconds = (times - times[:1]) / (1e9 if array.dtype.kind in "iu" else 1.0)
         if not np.isfinite(seconds).all():
@@ -123,11 +138,13 @@ class _Hdf5:
         file.visititems(visit)
 
     @staticmethod
-    def chunks(array: Any) -> tuple[int, int]:
-        """Stored chunks, and how many there are along the first axis."""
+    def stored(array: Any) -> tuple[Collection[int], int]:
+        """Indices of the stored chunks along the first axis, and the frames in each."""
         if array.chunks is None:
-            return array.id.get_storage_size(), 1
-        return array.id.get_num_chunks(), math.ceil(array.shape[0] / array.chunks[0])
+            return range(array.id.get_storage_size() > 0), array.shape[0]
+        found: set[int] = set()
+        array.id.chunk_iter(lambda chunk: found.add(chunk.chunk_offset[0] // array.chunks[0]))
+        return found, array.chunks[0]
 
 
 class _Zarr:
@@ -153,12 +170,13 @@ class _Zarr:
         return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
 
     @staticmethod
-    def chunks(array: Any) -> tuple[int, int]:
-        """Stored chunks, and how many there are along the first axis."""
-        # Each chunk or shard is a file; the zarr package itself would look for every chunk that may be.
-        files = Path(array.store.root, array.path).rglob("*")
-        stored = sum(file.is_file() and file.name not in ZARR_METADATA for file in files)
-        return stored, math.ceil(array.shape[0] / (array.shards or array.chunks)[0])
+    def stored(array: Any) -> tuple[Collection[int], int]:
+        """Indices of the stored chunks along the first axis, and the frames in each."""
+        # The zarr package itself would look for every chunk that may be.
+        folder = Path(array.store.root, array.path)
+        paths = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+        found = {int(match[1]) for path in paths if (match := ZARR_CHUNK.fullmatch(path))}
+        return found, (array.shards or array.chunks)[0]
 
     def close(self) -> None:
         """Nothing stays open."""
@@ -184,8 +202,8 @@ def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str
     raise SourceError(f"{spec}: {problem} one of: {listed(found)}")
 
 
-def _count(array: Any, name: str) -> int:
-    """The number of frames. Raises SourceError if there are none, or too large ones."""
+def _check(array: Any, name: str) -> None:
+    """Raise SourceError if an array holds no frames, or too large ones."""
     shape, dtype = array.shape, array.dtype
     are_files = (array.ndim == 1 and dtype.kind == "O") or (array.ndim == 2 and dtype == np.uint8)
     if 0 in shape or not are_files:
@@ -193,13 +211,12 @@ def _count(array: Any, name: str) -> int:
     chunk = math.prod(array.chunks or (1,)) * dtype.itemsize
     if chunk > LARGEST_CHUNK:
         raise SourceError(f"{name}: has chunks of {chunk} bytes; required at most {LARGEST_CHUNK}")
-    return int(shape[0])
 
 
-def _read_chunks(array: Any) -> Iterator[NDArray[Any]]:
+def _read_chunks(array: Any, length: int) -> Iterator[NDArray[Any]]:
     """One frame after the other; the file is read by whole chunks, as they are compressed."""
     frame_bytes = max(math.prod(array.shape[1:]) * array.dtype.itemsize, 1)
     together = max(1, min(array.chunks[0] if array.chunks else 1, BLOCK // frame_bytes))
-    for begin in range(0, array.shape[0], together):
-        for frame in array[begin : begin + together]:
+    for begin in range(0, length, together):
+        for frame in array[begin : min(begin + together, length)]:
             yield np.frombuffer(frame, np.uint8) if isinstance(frame, bytes) else np.asarray(frame)
