@@ -60,15 +60,6 @@ def distance(a: ArrayLike, b: ArrayLike) -> Any:
     return np.hypot(error[..., 0], error[..., 1])
 
 
-def distances_without_offset(points: FloatArray, labels: FloatArray) -> NDArray[np.float64]:
-    """(N,) float64, distances of points (N, 2) to labels (N, 2) after the median offset is taken out, px.
-
-    The offset depends on what the labeller took for the middle of a contact.
-    """
-    offset = np.asarray(points, dtype=np.float64) - np.asarray(labels, dtype=np.float64)
-    return np.asarray(distance(offset, np.median(offset, axis=0)))
-
-
 def angle_error(angle: float, truth: float) -> float:
     """Difference of two undirected axes, degrees in [0, 90]: 89 and -89 differ by 2, not by 178."""
     difference = abs(angle - truth) % 180.0
@@ -162,48 +153,6 @@ def identity_errors(position: FloatArray, truth: FloatArray, pitch: float) -> Bo
     # Ties go to the marker itself: two dots that truly coincide cannot be told apart by anybody.
     nearest = apart.min(axis=1, initial=np.inf)
     return np.asarray((nearest < own) | (own > pitch / 2))
-
-
-def shared_dots(position: FloatArray, trusted: BoolArray, pitch: float) -> int:
-    """How many trusted markers stand on a dot that another trusted marker also claims.
-
-    Two markers closer than a quarter of the pitch share a dot: real dots are larger than that, so they
-    cannot come so near without being one blob.
-
-    Parameters
-    ----------
-    position : (N, 2) floating, px. trusted : (N,) bool, not declared lost. pitch : px.
-    """
-    known = np.asarray(position)[np.asarray(trusted)]
-    if len(known) < 2:
-        return 0
-    apart = pairwise_distances(known, known)
-    np.fill_diagonal(apart, np.inf)
-    return int(np.count_nonzero(apart.min(axis=1) < pitch / 4))
-
-
-def flow_jumps(origin: FloatArray, displacement: FloatArray, trusted: BoolArray) -> int:
-    """How many trusted markers move unlike their neighbours: over half a pitch from the neighbours' median.
-
-    A gel is continuous, so neighbouring dots move alike; a jump of more than half a pitch means that one of
-    the two carries a wrong name. Neighbours are at most 1.25 pitches apart: the four of a square grid, not
-    the diagonal ones, with which a steep but smooth edge of a moving region looks torn.
-
-    Parameters
-    ----------
-    origin : (N, 2) floating, positions in the reference frame, px. displacement : (N, 2) floating, px.
-    trusted : (N,) bool, not declared lost.
-    """
-    pitch = dot_pitch(origin)
-    near = pairwise_distances(origin, origin) <= 1.25 * pitch
-    np.fill_diagonal(near, False)
-    near &= np.asarray(trusted, dtype=np.bool_)[None]
-    jumps = 0
-    for index in np.flatnonzero(trusted):
-        if np.count_nonzero(near[index]) >= 2:
-            typical = np.median(displacement[near[index]], axis=0)
-            jumps += bool(distance(displacement[index], typical) > pitch / 2)
-    return jumps
 
 
 def masked_mae(image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]) -> float:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactflow.bench.metrics import distances_without_offset
+from tactflow.bench.metrics import distance
 
 Summary = Callable[[NDArray[np.float64]], Any]
 
@@ -25,7 +25,7 @@ def rms(values: NDArray[np.float64]) -> float:
 def beyond_offset(values: NDArray[np.float64], q: float) -> float:
     """The q-th percentile of distances, px, after the median offset is taken out. values : x, y, x, y, ..."""
     offsets = values.reshape(-1, 2)
-    return float(np.percentile(distances_without_offset(offsets, np.zeros_like(offsets)), q))
+    return float(np.percentile(distance(offsets, np.median(offsets, axis=0)), q))
 
 
 P99 = partial(np.percentile, q=99)
@@ -133,12 +133,6 @@ _ALL = [
     Quantity("line_angle_max", "direction against labelled line, maximum", "deg", MOST, slack=0.3),
     _percent_right("dots_found", "dots found, of those counted by eye", slack=1.0),
     Quantity("dots_beyond", "dots found beyond those counted by eye", "%", slack=1.0),
-    _percent_right("force_right", "contact agrees with force >= 0.75 N", slack=0.3),
-    Quantity("shared_dots", "markers that share a dot with another", "per frame"),
-    Quantity("flow_jumps", "flow jumps over half a pitch against neighbours", "per frame"),
-    Quantity("frames_with_jumps", "frames with at least one flow jump", "%"),
-    Quantity("lost_share", "markers declared lost", "%", slack=0.2),
-    Quantity("markers_short", "markers missing from the known grid", ""),
 ]
 
 QUANTITIES: Mapping[str, Quantity] = {quantity.key: quantity for quantity in _ALL}

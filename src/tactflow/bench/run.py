@@ -92,7 +92,8 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
         if not plan.quick and plan.scenes is None:
             steps.append(("heights", partial(depth.measure_simulated, run.bench)))
         if plan.data is not None:
-            steps.append(("recordings", partial(run.recordings, plan.data)))
+            if (plan.data / "wedge_ball" / "labels.csv").exists():
+                steps.append(("presses of a ball", partial(run.presses, plan.data / "wedge_ball")))
             steps.append(("real gels", partial(run.gels, plan.data)))
         for number, (what, measure) in enumerate(steps):
             progress(what, number, len(steps))
@@ -133,12 +134,12 @@ class _Run:
         with rendered(case, self.bench.scratch) as scene:
             measure_methods(self.bench, self.marked, scene)
 
-    def recordings(self, data: Path) -> None:
-        """Measure whole pipelines on recordings of the Wedge."""
+    def presses(self, folder: Path) -> None:
+        """Measure whole pipelines on presses of a real ball, and heights."""
         wedge = {WEDGE: self.loaded[WEDGE]} if WEDGE in self.loaded else {}
-        recordings.measure_recordings(self.bench, wedge | self.marked, self.bare, data)
-        if wedge and (data / "wedge_ball" / "labels.csv").exists():
-            depth.measure_ball(self.bench, self.loaded[WEDGE], data / "wedge_ball")
+        recordings.measure_presses(self.bench, wedge | self.marked, folder)
+        if wedge:
+            depth.measure_ball(self.bench, self.loaded[WEDGE], folder)
 
     def gels(self, data: Path) -> None:
         """Measure the default and the markerless pipeline on recordings of many labs."""

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data",
         type=Path,
         metavar="DIR",
-        help="also measure on the real recordings in DIR (wedge_ball, wedge_roll, wedge_grasp, gels)",
+        help="also measure on the real recordings in DIR (wedge_ball, gels)",
     )
     add(
         "--json",
