@@ -122,24 +122,3 @@ def test_results_belong_to_the_caller() -> None:
         kept = first.copy()
         process(np.zeros_like(PLAIN.touched))
         assert np.array_equal(first, kept)
-
-
-@pytest.mark.parametrize("kind", [np.float32, np.uint16, np.bool_])
-def test_other_types_than_uint8_are_refused(kind: type) -> None:
-    picture = PLAIN.reference.astype(kind)
-    for compute in PICTURES.values():
-        with pytest.raises(ValueError, match="required"):
-            compute(picture, picture)
-    for of_mask in MASKS.values():
-        with pytest.raises(ValueError, match="required"):
-            of_mask(PLAIN.mask.astype(kind))
-
-
-@pytest.mark.parametrize("shape", [(), (5,), (5, 6, 1), (5, 6, 4), (2, 5, 6, 3), (0, 6, 3)])
-def test_other_shapes_than_a_picture_are_refused(shape: tuple[int, ...]) -> None:
-    picture = np.zeros(shape, np.uint8)
-    # The probe takes any number of channels, and an empty picture may be drawn on.
-    allowed = "draw" if 0 in shape else "probe" if len(shape) == 3 else ""
-    for compute in (compute for name, compute in PICTURES.items() if name != allowed):
-        with pytest.raises(ValueError, match="required"):
-            compute(picture, picture)

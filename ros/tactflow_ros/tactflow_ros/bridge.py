@@ -10,6 +10,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from statistics import median
 from typing import Any
 
 import rclpy
@@ -80,19 +81,19 @@ ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
 
 
 class Counts:
-    """Statistics for /diagnostics between two reports.
+    """Statistics for /diagnostics between two reports; thread-safe.
 
-    `note` and `report` are thread-safe.
+    last : `time.monotonic` of the last message, or of the start. any : whether there was a message.
+    lost_markers : share of all.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._since = time.monotonic()
-        self._received = 0
+        self._since = self.last = time.monotonic()
         self._missing = 0
         self._last_seq: int | None = None
+        # NaN for a recording, whose capture times are no Unix times.
         self._latency_s: list[float] = []
-        self.last = self._since
         self.any = False
         self.lost_markers = math.nan
 
@@ -100,27 +101,24 @@ class Counts:
         """Count a message."""
         status = (message["markers"] or {}).get("status") or []
         with self._lock:
-            self._received += 1
             self.last, self.any = time.monotonic(), True
-            if self._last_seq is not None and message["seq"] > self._last_seq + 1:
-                self._missing += message["seq"] - self._last_seq - 1
+            if self._last_seq is not None:
+                self._missing += max(0, message["seq"] - self._last_seq - 1)
             self._last_seq = message["seq"]
-            if message["t"] > LIVE:
-                self._latency_s.append(time.time() - message["t"])
+            self._latency_s.append(time.time() - message["t"] if message["t"] > LIVE else math.nan)
             self.lost_markers = status.count("lost") / len(status) if status else math.nan
 
     def report(self) -> dict[str, float]:
         """Statistics since the last report."""
         with self._lock:
             now = time.monotonic()
-            latency = sorted(self._latency_s) or [math.nan]
             numbers = {
-                "rate, Hz": self._received / max(now - self._since, 1e-9),
+                "rate, Hz": len(self._latency_s) / max(now - self._since, 1e-9),
                 "frames missing": self._missing,
-                "latency since capture, median, ms": latency[len(latency) // 2] * 1e3,
+                "latency since capture, median, ms": median(self._latency_s or [math.nan]) * 1e3,
                 "lost markers, share": self.lost_markers,
             }
-            self._since, self._received, self._missing, self._latency_s = now, 0, 0, []
+            self._since, self._missing, self._latency_s = now, 0, []
         return numbers
 
 
@@ -132,11 +130,9 @@ class Bridge(LifecycleNode):
         for name, (default, meaning) in PARAMETERS.items():
             self.declare_parameter(name, default, ParameterDescriptor(description=meaning))
         self._topics: dict[str, Any] = {}
-        self._others: list[Any] = []
         self._link: Link | None = None
         self._counts = Counts()
         self._run: dict[str, Any] = {}
-        self._static: Any = None
         self._warned_replay = False
         self.create_service(Trigger, "~/take_reference", self._take_reference)
         # Steady, because simulated time may stand still.
@@ -199,9 +195,9 @@ class Bridge(LifecycleNode):
             link.close()
 
     def _forget(self) -> None:
-        for publisher in (*self._topics.values(), *self._others):
+        for publisher in self._topics.values():
             self.destroy_publisher(publisher)
-        self._topics, self._others, self._static = {}, [], None
+        self._topics = {}
 
     def _make_topics(self) -> None:
         word = self.value("reliability")
@@ -218,8 +214,7 @@ class Bridge(LifecycleNode):
             self._topics["/tactile"] = self._publisher(Point, "/tactile", qos)
         if self.value("publish_clock"):
             self._topics["/clock"] = self._publisher(Clock, "/clock", qos)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DEPTH)
-        self._others.append(self._diagnostics)
+        self._topics["/diagnostics"] = self.create_publisher(DiagnosticArray, "/diagnostics", DEPTH)
 
     def _publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
         events = PublisherEventCallbacks(incompatible_qos=lambda _: self._warn_mismatch(topic))
@@ -245,9 +240,8 @@ class Bridge(LifecycleNode):
         except ImportError:
             raise ImportError("parent_frame needs tf2_msgs: apt install ros-$ROS_DISTRO-tf2-msgs") from None
         qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-        self._static = self.create_publisher(TFMessage, "/tf_static", qos)
-        self._static.publish(TFMessage(transforms=[place]))
-        self._others.append(self._static)
+        self._topics["/tf_static"] = self.create_publisher(TFMessage, "/tf_static", qos)
+        self._topics["/tf_static"].publish(TFMessage(transforms=[place]))
 
     # -- messages -----------------------------------------------------------------------------------------
 
@@ -298,11 +292,9 @@ class Bridge(LifecycleNode):
 
     def _take_reference(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         del request
-        control = self.value("control")
-        if control:
-            response.success, response.message = send_command(
-                control, "take_reference", self.value("keys"), ANSWER_SECONDS
-            )
+        if control := self.value("control"):
+            answer = send_command(control, "take_reference", self.value("keys"), ANSWER_SECONDS)
+            response.success, response.message = answer
         else:
             response.message = (
                 "the parameter control is not set; run tactflow with --set "
@@ -334,7 +326,7 @@ class Bridge(LifecycleNode):
         )
         report = DiagnosticArray(status=[status])
         report.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(report)
+        self._topics["/diagnostics"].publish(report)
 
     def _condition(self, link: Link) -> tuple[bytes, str]:
         if link.refused is not None:
