@@ -32,18 +32,10 @@ ZARR_CHUNK = re.compile(r"(?:c[./])?(\d+)(?:[./]\d+)*")
 class ArrayDataset(FrameReader):
     """Frames of one array of an HDF5 file or a Zarr folder.
 
-    Parameters
-    ----------
     spec : `file.h5?dataset=/frames`; `times=/t` names their times, else frame i is taken at i / fps;
-        `order=rgb` if the colors are in that order.
-    directory : where a relative path is looked for if it is not in the current directory.
-    fps : frames per second if there are no times; 30 if not given.
-
-    Raises
-    ------
-    SourceError
-        If there is no such file or array (it lists those that are there), the array holds no frames, or a
-        package is missing.
+    `order=rgb` if the colors are in that order. directory, fps : as for `open_source`. Raises SourceError if
+    there is no such file or array (it lists those that are there), it holds no frames, or a package is
+    missing.
     """
 
     # HDF5 and the codecs of both formats raise all kinds of errors.

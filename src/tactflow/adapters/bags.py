@@ -56,15 +56,9 @@ class Bag(FrameReader):
     A frame's time is the stamp in its message, or, where that is 0, when it was recorded; from 0 at the first
     frame. Where it would go back, it stays.
 
-    Parameters
-    ----------
-    spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder.
-    directory : where a relative path is looked for if it is not in the current directory.
-
-    Raises
-    ------
-    SourceError
-        If there is no such file or topic (it lists those that are there), or a package is missing.
+    spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder. directory : as for
+    `open_source`. Raises SourceError if there is no such file or topic (it lists those that are there), or a
+    package is missing.
     """
 
     parser_errors = (Exception,)

@@ -24,16 +24,9 @@ CHUNK = 1000
 class LeRobotEpisode(FrameReader):
     """The pictures of one camera in one episode; frame i is taken at i / fps.
 
-    Parameters
-    ----------
-    spec : `lerobot:PATH?camera=observation.images.left_tactile&episode=3`.
-    directory : where a relative path is looked for if it is not in the current directory.
-
-    Raises
-    ------
-    SourceError
-        If there is no such dataset, camera or episode (it lists those that are there), or a package is
-        missing.
+    spec : `lerobot:PATH?camera=observation.images.left_tactile&episode=3`. directory : as for `open_source`.
+    Raises SourceError if there is no such dataset, camera or episode (it lists those that are there), or a
+    package is missing.
     """
 
     # What is wrong with JSON, Parquet and video files raises whatever their parsers do.

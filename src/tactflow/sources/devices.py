@@ -48,15 +48,9 @@ class CameraRequest:
 class Camera(CaptureReader):
     """A camera of this machine. Frames are stamped on arrival.
 
-    Parameters
-    ----------
-    device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/...").
-    request : size, rate and format to ask for. A camera may ignore it; that is reported.
-
-    Raises
-    ------
-    SourceError
-        If the camera cannot be opened; says what to try. From `read` if it stops delivering.
+    device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/..."). request : size, rate and format
+    to ask for; a camera may ignore it, which is reported. Raises SourceError if it cannot be opened, and from
+    `read` if it stops delivering.
     """
 
     live = True
@@ -145,27 +139,18 @@ def _camera_hint(device: str) -> str:
 class Stream(CaptureReader):
     """A network stream: http, https, rtsp or udp. Frames are stamped on arrival.
 
-    The stream's own times and rate are not used: for HTTP they are invented.
-
-    Parameters
-    ----------
-    url : what OpenCV's FFmpeg is to open.
-
-    Raises
-    ------
-    SourceError
-        If nothing can be opened there.
+    The stream's own times and rate are not used: for HTTP they are invented. Raises SourceError if nothing
+    can be opened there.
     """
 
     live = True
 
     def __init__(self, url: str) -> None:
         name = public_address(url)
-        timeouts = {
-            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: OPEN_TIMEOUT,
-            cv2.CAP_PROP_READ_TIMEOUT_MSEC: READ_TIMEOUT,
-        }
-        options = [number for key, seconds in timeouts.items() for number in (key, int(seconds * 1000))]
+        options = [
+            *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(OPEN_TIMEOUT * 1000)),
+            *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, int(READ_TIMEOUT * 1000)),
+        ]
         failure = f"{name}: no stream can be opened there; {_stream_hint(url)}"
         super().__init__(name, failure, url, cv2.CAP_FFMPEG, options)
         self.description = f"{name}, {self._size_text}"

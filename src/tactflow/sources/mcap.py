@@ -25,15 +25,8 @@ class Recording(StampedReader):
     A recording brings its own references: capture's parameters `reference` and `skip` do not apply. With
     `start`, the references that were in force at that time come first.
 
-    Parameters
-    ----------
-    spec : `file.mcap`, or `file.mcap?start=2.5`.
-    directory : where a relative path is looked for if it is not in the current directory.
-
-    Raises
-    ------
-    SourceError
-        If it is not there, is not a recording of tactflow, or an option is wrong.
+    spec : `file.mcap`, or `file.mcap?start=2.5`. directory : as for `open_source`. Raises SourceError if it
+    is not there, is not a recording of tactflow, or an option is wrong.
     """
 
     def __init__(self, spec: str, directory: Path | None = None) -> None:

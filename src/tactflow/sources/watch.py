@@ -97,22 +97,11 @@ class Watched(FrameReader):
 
     The first opening happens here and must succeed: a wrong address is an error at once, not after a wait.
 
-    Parameters
-    ----------
-    opener : opens the source; called again for each reconnection, in another thread.
-    watch : what counts as a fault.
-    name : what the source is called in messages.
-    clock : tells the time, and lets it pass between two attempts.
+    opener : opens the source; called again for each reconnection, in another thread. name : what messages
+    call it. clock : tells the time, and lets it pass between two attempts.
 
-    Raises
-    ------
-    SourceError
-        If the source cannot be opened. From `read` if there was no good frame for `no_frame_timeout`, or the
-        source failed and `reconnect` is False.
-
-    Examples
-    --------
-    Any reader can stand for a camera:
+    Raises SourceError if the source cannot be opened, and from `read` if there was no good frame for
+    `no_frame_timeout`, or the source failed and `reconnect` is False. Any reader can stand for a camera:
 
     >>> from tactflow.sources import open_source
     >>> source = Watched(lambda: open_source("sim:idle?frames=100"), Watch(), "example")
