@@ -16,6 +16,8 @@ from tactflow.stages.capture import Capture
 from tests.clock import until
 from tests.sources.flaky import Flaky, Reading
 
+Opens = Callable[..., Watched]
+Captures = Callable[..., Capture]
 QUICK = {
     "no_frame_timeout": None,
     "frozen_after": 0.1,
@@ -36,7 +38,7 @@ def device() -> Iterator[Flaky]:
 
 
 @pytest.fixture
-def watched(device: Flaky) -> Iterator[Callable[..., Watched]]:
+def watched(device: Flaky) -> Iterator[Opens]:
     """Opens the device, watched with short times."""
     opened: list[Watched] = []
 
@@ -51,23 +53,19 @@ def watched(device: Flaky) -> Iterator[Callable[..., Watched]]:
 
 
 @pytest.fixture
-def capture(device: Flaky) -> Iterator[Callable[..., Capture]]:
+def capture(watched: Opens) -> Iterator[Captures]:
     """Opens a capture of the device, watched with short times."""
     opened: list[Capture] = []
 
-    def opener(*_: object, **__: object) -> Watched:
-        return Watched(device.open, Watch(**QUICK), "flaky", device.clock)
-
     def start(**params: Any) -> Capture:
-        opened.append(Capture(Capture.Params.model_validate({"source": "0", **params}), opener=opener))
+        parameters = Capture.Params.model_validate({"source": "0", **params})
+        opened.append(Capture(parameters, opener=lambda *_, **__: watched()))
         opened[-1].open()
         return opened[-1]
 
     yield start
-    device.free.set()
     for stage in opened:
         stage.stop()
-        stage.close()
 
 
 def take(source: Watched, count: int = 5) -> list[Arrival]:
@@ -87,7 +85,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("does", FAULTS)
 def test_each_fault_is_reported_once_and_so_is_its_end(
-    does: str, device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
+    does: str, device: Flaky, watched: Opens, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = watched()
     take(source)
@@ -109,7 +107,7 @@ def test_each_fault_is_reported_once_and_so_is_its_end(
 
 
 def test_attempts_back_off_and_start_quickly_again_once_the_source_was_back(
-    device: Flaky, watched: Callable[..., Watched]
+    device: Flaky, watched: Opens
 ) -> None:
     source = watched(first_retry=0.25, last_retry=2.0)
     reading = Reading(source)
@@ -127,7 +125,7 @@ def test_attempts_back_off_and_start_quickly_again_once_the_source_was_back(
 
 
 def test_seq_and_time_grow_across_reconnections_even_if_the_devices_clock_does_not(
-    device: Flaky, watched: Callable[..., Watched]
+    device: Flaky, watched: Opens
 ) -> None:
     source = watched()
     arrivals = take(source)
@@ -140,9 +138,7 @@ def test_seq_and_time_grow_across_reconnections_even_if_the_devices_clock_does_n
     assert [a.t for a in arrivals] == sorted({a.t for a in arrivals})
 
 
-def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(
-    watched: Callable[..., Watched],
-) -> None:
+def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(watched: Opens) -> None:
     source = watched()
     first = take(source, 1)[0]
     before = source.missed
@@ -151,7 +147,7 @@ def test_a_reader_that_is_slow_gets_the_newest_frame_and_a_gap_in_seq(
 
 
 def test_black_pictures_at_the_start_are_not_handed_over(
-    device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
+    device: Flaky, watched: Opens, caplog: pytest.LogCaptureFixture
 ) -> None:
     device.does = "black"
     source = watched()
@@ -165,7 +161,7 @@ def test_black_pictures_at_the_start_are_not_handed_over(
 
 
 def test_a_short_dark_moment_after_light_is_passed_on(
-    device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
+    device: Flaky, watched: Opens, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = watched(black_after=1e6, frozen_after=None)
     take(source)
@@ -176,7 +172,7 @@ def test_a_short_dark_moment_after_light_is_passed_on(
 
 @pytest.mark.parametrize(("does", "off"), [("black", "black_after"), ("frozen", "frozen_after")])
 def test_a_check_of_pictures_can_be_switched_off(
-    does: str, off: str, device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
+    does: str, off: str, device: Flaky, watched: Opens, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Switching off one must not leave the other: black pictures here differ, frozen ones are bright.
     source = watched(**{off: None})
@@ -186,7 +182,7 @@ def test_a_check_of_pictures_can_be_switched_off(
 
 
 def test_without_reconnection_a_camera_that_stops_is_an_error_and_a_stream_that_ends_is_the_end(
-    device: Flaky, watched: Callable[..., Watched], caplog: pytest.LogCaptureFixture
+    device: Flaky, watched: Opens, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = watched(reconnect=False)
     take(source)
@@ -208,7 +204,7 @@ def test_a_device_that_is_not_there_at_the_start_is_an_error_at_once() -> None:
 
 
 @pytest.mark.parametrize("does", ["good", "gone", "hangs"])
-def test_stopping_ends_a_read_that_waits(does: str, device: Flaky, watched: Callable[..., Watched]) -> None:
+def test_stopping_ends_a_read_that_waits(does: str, device: Flaky, watched: Opens) -> None:
     source = watched()
     take(source)
     device.does = does
@@ -218,9 +214,7 @@ def test_stopping_ends_a_read_that_waits(does: str, device: Flaky, watched: Call
     reading.stop()
 
 
-def test_every_connection_is_closed_again_even_those_that_hung(
-    device: Flaky, watched: Callable[..., Watched]
-) -> None:
+def test_every_connection_is_closed_again_even_those_that_hung(device: Flaky, watched: Opens) -> None:
     source = watched()
     device.does = "hangs"
     reading = Reading(source)
@@ -233,9 +227,7 @@ def test_every_connection_is_closed_again_even_those_that_hung(
     until(lambda: device.closed == device.opened)
 
 
-def test_capture_counts_frames_that_nobody_took_or_that_were_only_looked_at(
-    capture: Callable[..., Capture],
-) -> None:
+def test_capture_counts_frames_that_nobody_took_or_that_were_only_looked_at(capture: Captures) -> None:
     stage = capture(settle=0)
     frames = stage.frames()
     seqs = [next(frames).seq]
@@ -253,9 +245,7 @@ def test_capture_counts_frames_that_nobody_took_or_that_were_only_looked_at(
     assert stage.missed >= 9
 
 
-def test_capture_names_the_thread_that_frames_arrive_in_now(
-    device: Flaky, capture: Callable[..., Capture]
-) -> None:
+def test_capture_names_the_thread_that_frames_arrive_in_now(device: Flaky, capture: Captures) -> None:
     stage = capture()
     frames = stage.frames()
     next(frames)
@@ -269,7 +259,7 @@ def test_capture_names_the_thread_that_frames_arrive_in_now(
 
 @pytest.mark.parametrize("on_reconnect", ["keep", "retake"])
 def test_capture_keeps_or_retakes_the_reference_after_a_reconnection(
-    on_reconnect: str, device: Flaky, capture: Callable[..., Capture]
+    on_reconnect: str, device: Flaky, capture: Captures
 ) -> None:
     stage = capture(on_reconnect=on_reconnect, reference=2, skip=3)
     frames: list[Frame] = []
