@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -177,16 +176,6 @@ def test_of_several_references_none_shows_an_early_contact(tmp_path: Path) -> No
     np.save(tmp_path / "r.npy", np.stack(images))
     frames = list(capture("r.npy", tmp_path, reference=12).frames())
     assert [frame.seq for frame in frames if frame.reference] == list(range(6))
-
-
-def test_a_frame_that_cannot_be_read_is_an_error_when_its_turn_comes(tmp_path: Path) -> None:
-    for index in range(5):
-        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((48, 64, 3), 100, np.uint8))
-    (tmp_path / "3.png").write_bytes(b"no picture")
-    frames = capture(str(tmp_path)).frames()
-    assert [frame.seq for frame in islice(frames, 3)] == [0, 1, 2]
-    with pytest.raises(SourceError, match=r"3\.png"):
-        next(frames)
 
 
 def test_skipped_frames_leave_their_numbers_unused(recording: str) -> None:

@@ -28,14 +28,6 @@ def test_an_empty_mask_is_no_contact() -> None:
     assert run(np.zeros((60, 90), np.uint8)) == Absent("no_contact")
 
 
-def test_a_bar_is_described() -> None:
-    contact = run(bar())
-    assert isinstance(contact, Contact)
-    assert contact.angle == 0.0
-    assert contact.center == (34.5, 24.5)
-    assert contact.area == 500
-
-
 def test_the_contact_tells_what_showed_it() -> None:
     stage = Hull(Hull.Params())
     told = [stage.process(bar(), evidence) for evidence in (None, "dots", "both")]
@@ -45,14 +37,6 @@ def test_the_contact_tells_what_showed_it() -> None:
 def test_what_is_smaller_than_min_area_is_no_contact() -> None:
     assert run(bar(), min_area=501) == Absent("no_contact")
     assert isinstance(run(bar(), min_area=500), Contact)
-
-
-def test_max_gap_reaches_the_geometry() -> None:
-    near, far = run(two(), max_gap=5), run(two())
-    assert isinstance(near, Contact)
-    assert isinstance(far, Contact)
-    assert near.hull[:, 0].max() == 59
-    assert far.hull[:, 0].max() == 84
 
 
 def two() -> NDArray[np.uint8]:
