@@ -96,13 +96,12 @@ def messages(
     Raises ValueError where the file is damaged and not only cut off, OSError if it cannot be read.
     """
     with path.open("rb") as file:
-        summary = read_summary(file)
-        channels = [] if summary is None else summary.channels.values()
-        wanted = {channel.id for channel in channels if channel.topic in topics}
+        has_index = read_summary(file) is not None
+        wanted: set[int] = set()
         size = path.stat().st_size
         for record in intact_records(file):
             if isinstance(record, Damage):
-                if summary is not None or record.end < size:
+                if has_index or record.end < size:
                     raise ValueError(f"bytes {record.start} to {record.end} are not as they were written")
             elif isinstance(record, Channel) and record.topic in topics:
                 wanted.add(record.id)
