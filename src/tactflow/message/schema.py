@@ -54,20 +54,20 @@ class _ContactModel(_Strict):
     center_mm_stderr: _Point | None = Field(
         None, description="what the scale's error does to center_mm, mm (calibrated, detail)"
     )
-    area_mm2: Annotated[float, Field(ge=0)] | None = Field(None, description="area, mm^2 (calibrated)")
-    area_mm2_stderr: Annotated[float, Field(ge=0)] | None = Field(
+    area_mm2: _NotNegative | None = Field(None, description="area, mm^2 (calibrated)")
+    area_mm2_stderr: _NotNegative | None = Field(
         None, description="what the scale's error does to area_mm2, mm^2 (calibrated, detail)"
     )
-    depth_mm: Annotated[float, Field(ge=0)] | None = Field(
+    depth_mm: _NotNegative | None = Field(
         None, description="how far the surface has been pushed in where it is deepest, mm (calibrated)"
     )
-    depth_mm_stderr: Annotated[float, Field(ge=0)] | None = Field(
+    depth_mm_stderr: _NotNegative | None = Field(
         None, description="standard error of depth_mm, mm; null when unknown (calibrated, detail)"
     )
-    volume_mm3: Annotated[float, Field(ge=0)] | None = Field(
+    volume_mm3: _NotNegative | None = Field(
         None, description="between the untouched surface and the pressed one, mm^3 (calibrated)"
     )
-    volume_mm3_stderr: Annotated[float, Field(ge=0)] | None = Field(
+    volume_mm3_stderr: _NotNegative | None = Field(
         None, description="standard error of volume_mm3, mm^3; null when unknown (calibrated, detail)"
     )
 
@@ -107,7 +107,7 @@ class _MarkersModel(_Strict):
     origin: list[_Point] = Field(description="positions in the reference frame, px")
     position: list[_Point] = Field(description="positions now, px")
     status: list[Literal["tracked", "inferred", "lost"]] = Field(description="how each position is known")
-    stderr: list[Annotated[float, Field(ge=0)] | None] = Field(
+    stderr: list[_NotNegative | None] = Field(
         default_factory=list, description="standard error of each position, px; null when unknown (detail)"
     )
 
@@ -149,9 +149,7 @@ class _FieldModel(_Strict):
     first: _Point = Field(description="(x, y) of row 0, column 0, in the reference frame, px")
     spacing: _Positive = Field(description="from one point to the next along both axes, px")
     displacement: list[list[_Point]] = Field(description="rows of (dx, dy), px")
-    stderr: list[list[Annotated[float, Field(ge=0)]]] = Field(
-        description="standard error of each component, rows, px"
-    )
+    stderr: list[list[_NotNegative]] = Field(description="standard error of each component, rows, px")
 
 
 class _Message(_Strict):
