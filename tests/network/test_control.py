@@ -110,6 +110,9 @@ def test_a_command_that_fails_is_answered_and_ends_nothing(caplog: pytest.LogCap
         def pause(self, paused: bool) -> None:
             raise OSError(f"no space left, {paused}")
 
+        def snapshot(self) -> dict[str, object]:
+            return {"counters": object()}
+
     socket = ControlSocket(ANY_PORT, None, "main", Commands(cast(Control, Broken())))
     try:
         with RemoteControl(socket.endpoint, PATIENCE) as run:
@@ -117,6 +120,8 @@ def test_a_command_that_fails_is_answered_and_ends_nothing(caplog: pytest.LogCap
                 run.pause()
             with pytest.raises(RuntimeError, match=r"no record sink .* adds one"):
                 run.record_start()
+            with pytest.raises(RuntimeError, match="not JSON serializable: object"):
+                run.stats()
             assert run.ping()["message"] == "here"
     finally:
         socket.close()

@@ -80,13 +80,16 @@ class ControlSocket:
 
     def _answer(self, request: list[bytes]) -> bytes:
         try:
-            answer = {"ok": True, **self._carry_out(request)}
+            return self._encoded({"ok": True, **self._carry_out(request)})
         except (RefusedError, StageError) as error:
-            answer = {"ok": False, "message": str(error)}
+            message = str(error)
         except Exception as error:
-            answer = {"ok": False, "message": f"{type(error).__name__}: {error}"}
-            log.warning("zmq: a command failed: %s", answer["message"])
-        answer["state"] = {"sensor": self._sensor, **self._commands.state()}
+            message = f"{type(error).__name__}: {error}"
+            log.warning("zmq: a command failed: %s", message)
+        return self._encoded({"ok": False, "message": message})
+
+    def _encoded(self, answer: Answer) -> bytes:
+        answer = answer | {"state": {"sensor": self._sensor, **self._commands.state()}}
         return orjson.dumps(answer, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
 
     def _carry_out(self, request: list[bytes]) -> Answer:
