@@ -270,7 +270,9 @@ class Zmq(Sink):
         """Body of the thread that publishes the statistics while somebody has asked for them."""
         while not self._closing.wait(self.params.stats_every):
             if publisher.is_subscribed(STATS_TOPIC, by_name=True):
-                publisher.send(STATS_TOPIC + orjson.dumps({"sensor": self._sensor, **control.snapshot()}))
+                statistics = {"sensor": self._sensor, **control.snapshot()}
+                # A sink of the user's own may count with numbers of NumPy.
+                publisher.send(STATS_TOPIC + orjson.dumps(statistics, option=orjson.OPT_SERIALIZE_NUMPY))
 
     def close(self) -> None:
         """Deliver what is under way, for at most `linger` seconds, and free the addresses."""

@@ -234,7 +234,7 @@ class Run:
     def snapshot(self) -> dict[str, Any]:
         self.asked += 1
         self.ready.set()
-        return {"frames": self.asked, "stages": {}}
+        return {"frames": np.int64(self.asked), "stages": {}}
 
 
 def test_statistics_come_without_any_frame_to_whoever_asks_for_them_by_name(
