@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -398,7 +399,10 @@ tactflow.to_frame(tactflow.stream()).describe()
 
 def test_mypy_is_content_with_a_users_program(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
-    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "script.py"]
+    readme = re.search(r"```python\n(# bright.py.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+    assert readme is not None
+    (tmp_path / "bright.py").write_text(readme[1])
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "script.py", "bright.py"]
     env = os.environ | {"MYPYPATH": str(REPOSITORY / "src")}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
@@ -411,6 +415,17 @@ def test_settings_may_be_paths_and_any_text(folder: Path) -> None:
     settings = {"stages.capture.source": folder / "\N{HERB}.npy", "sensor": "left"}
     pipeline = tactflow.load(settings=settings)
     assert pipeline.source.params.source.endswith("\N{HERB}.npy")  # type: ignore[attr-defined]
+
+
+def test_nested_settings_of_stages_are_merged_with_those_of_the_file() -> None:
+    settings = {"stages": {"hull": {"min_area": 7}, "force": None, "preprocess": {}}, "sinks": {}}
+    nested = tactflow.load("default", settings=settings)
+    dotted = tactflow.load(
+        "default",
+        settings={"stages.hull.min_area": 7, "stages.force": None, "stages.preprocess": {}, "sinks": {}},
+    )
+    assert nested.settings == dotted.settings
+    assert nested.nodes["hull"].params.min_area == 7  # type: ignore[attr-defined]
 
 
 @pytest.mark.usefixtures("folder")

@@ -246,3 +246,18 @@ def test_a_video_with_what_was_found_takes_one_option(
     film = cv2.VideoCapture("out.mp4")
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 30
     film.release()
+
+
+def test_the_summary_counts_what_the_results_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # Worn dots: the light alone finds more contact than light and dots together.
+    assert (
+        main(["run", "default", "--source", "sim:worn?frames=60", "--set", "sinks={}", "--jsonl", "a.jsonl"])
+        == 0
+    )
+    touched = sum(
+        json.loads(line)["contact"] is not None for line in Path("a.jsonl").read_text().splitlines()
+    )
+    assert f"({touched} frames with contact)" in capsys.readouterr().err

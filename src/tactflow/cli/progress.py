@@ -70,8 +70,10 @@ def summary(result: RunResult, runner: Runner) -> str:
     # The error itself has been printed already.
     end = "error" if result.error is not None else stats["end"]
     lines = [f"{_frames(stats['frames'])} in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({end})"]
-    touching = next((s for name, s in stats["signals"].items() if name.endswith(".touching")), None)
-    if touching is not None:
+    # The last stage that decides is the one whose decision the results carry.
+    decisions = [s for name, s in stats["signals"].items() if name.endswith(".touching")]
+    if decisions:
+        touching = decisions[-1]
         lines.append(f"contacts: {touching['rises']} ({_frames(touching['true'])} with contact)")
     latency = stats["latency_ms"]
     if latency["p50"] is not None:

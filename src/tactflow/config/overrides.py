@@ -30,12 +30,26 @@ class Override:
 
 
 def from_settings(settings: Mapping[str, Any]) -> list[Override]:
-    """Overrides from a program's `{"stages.hull.min_area": 50}`.
+    """Overrides from a program's `{"stages.hull.min_area": 50}`, or `{"stages": {"hull": {"min_area": 50}}}`.
+
+    Settings of stages are merged with those of the file; anything else replaces what is there.
 
     >>> from_settings({"sinks.zmq": None})
     [Override(key='sinks.zmq', value=None, origin='settings')]
+    >>> [override.key for override in from_settings({"stages": {"hull": {"min_area": 50}}})]
+    ['stages.hull.min_area']
     """
-    return [Override(key, value, "settings") for key, value in settings.items()]
+    found = dict(settings)
+    for key in ("stages", *(f"stages.{id_}" for id_ in _part(settings, "stages"))):
+        if part := _part(found, key):
+            del found[key]
+            found |= {f"{key}.{name}": value for name, value in part.items()}
+    return [Override(key, value, "settings") for key, value in found.items()]
+
+
+def _part(settings: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = settings.get(key)
+    return value if isinstance(value, Mapping) else {}
 
 
 def as_yaml(value: Any) -> str:
