@@ -274,6 +274,7 @@ def test_two_pipelines_are_compared_frame_by_frame(call: Call, format_: str) -> 
         pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'tactflow[parquet]'")
     (call.folder / "other.yaml").write_text(PIPELINE.replace("rotate: 0", "rotate: 180"))
     assert call("--compare", "other.yaml", format_=format_) == 0
+    assert "prepare their pictures differently (rotate)" in call.told
     page = (call.folder / "out" / "compare.html").read_text()
     row = page[page.index("<td>a/press.npy") :].partition("</tr>")[0]
     cells = re.findall(r"<td[^>]*>([^<]*)", row)

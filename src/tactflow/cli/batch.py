@@ -15,7 +15,7 @@ from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.report import Runs, require_pyarrow, write_page, write_runs
 from tactflow.batch.run import Batch, Plan, Result, make_plan
 from tactflow.batch.store import Outcome, Store
-from tactflow.batch.work import Request, resolved
+from tactflow.batch.work import Request, prepared_differently, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
 from tactflow.cli.options import add_overrides, positive
 from tactflow.cli.terminal import progress_bar, say
@@ -188,6 +188,10 @@ class _Call:
         names = " and ".join(request.file for request in requests)
         text = f"{names}, in pixels of the processed frame. Overrides of the first: "
         text += ", ".join(requests[0].overrides) or "none"
+        if differing := prepared_differently(*requests):
+            warning = f"the two prepare their pictures differently ({', '.join(differing)}), so positions differ"
+            say(f"tactflow: WARNING: --compare: {warning}")
+            text += f". Mind that {warning}"
         page = self.stores[0].path / "compare.html"
         write_report(page, "Two pipelines", [Section("Differences", text, tables=[compare(found)])])
         self._say(f"look at {page}")
