@@ -189,7 +189,7 @@ class _Call:
         text = f"{names}, in pixels of the processed frame. Overrides of the first: "
         text += ", ".join(requests[0].overrides) or "none"
         if differing := prepared_differently(*requests):
-            warning = f"the two prepare their pictures differently ({', '.join(differing)}), so positions differ"
+            warning = f"the two prepare their pictures differently ({', '.join(differing)}): positions differ"
             say(f"tactflow: WARNING: --compare: {warning}")
             text += f". Mind that {warning}"
         page = self.stores[0].path / "compare.html"
