@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tactflow.fleet.heartbeat import HANG_AFTER, LONGEST_LOOK, Headway, SignOfLife
+from tactflow.fleet.heartbeat import HANG_AFTER, MAX_INTERVAL, Progress, Watchdog
 from tactflow.fleet.supervisor import FIRST_PAUSE, GIVE_UP_AFTER, GOOD_RUN, LONGEST_PAUSE, Member, Supervisor
 from tactflow.system.signals import ending_handled
 
@@ -84,7 +84,7 @@ class Machine:
         return Process(self.clock, lasts, code, self.folder / sensor, *silent_after)
 
     def run(self) -> int:
-        members = [Member(sensor, [sensor], SignOfLife(self.folder / sensor)) for sensor in self._plans]
+        members = [Member(sensor, [sensor], Watchdog(self.folder / sensor)) for sensor in self._plans]
         supervisor = Supervisor(self.start, self.clock, self.clock.pause)
         with ending_handled(supervisor.count_signal):
             return supervisor.run(members)
@@ -134,7 +134,7 @@ def test_a_process_that_does_not_end_is_killed_at_the_third_signal(
     assert machine.run() == 130
 
 
-def test_a_process_that_gives_no_sign_of_life_is_killed_and_started_again(
+def test_a_process_that_has_no_heartbeat_is_killed_and_started_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     machine = Machine(tmp_path, {"left": [(1e9, 0, 10.0), (1e9, 0, 10.0), (1.0, 0)], "right": [(1000.0, 0)]})
@@ -148,30 +148,30 @@ def test_a_process_that_gives_no_sign_of_life_is_killed_and_started_again(
 
 
 def test_what_the_supervisor_has_slept_through_is_no_silence(tmp_path: Path) -> None:
-    sign = SignOfLife(tmp_path / "alive")
-    sign.start(0.0)
-    sign.look(1000.0)
-    assert sign.silent == LONGEST_LOOK
+    watchdog = Watchdog(tmp_path / "alive")
+    watchdog.start(0.0)
+    watchdog.expired(1000.0)
+    assert watchdog.silent == MAX_INTERVAL
 
 
 def test_to_start_a_sensor_has_time_whatever_it_may_take_for_a_frame(tmp_path: Path) -> None:
-    sign = SignOfLife(tmp_path / "alive", limit=2.0)
-    sign.start(0.0)
-    assert sum(not sign.look(float(second)) for second in range(100)) == HANG_AFTER + 1
-    sign.start(100.0)
-    sign.path.touch()
-    assert not sign.look(101.0)
-    assert [sign.look(101.0 + second) for second in (1.0, 2.0, 3.0)] == [False, False, True]
+    watchdog = Watchdog(tmp_path / "alive", timeout=2.0)
+    watchdog.start(0.0)
+    assert sum(not watchdog.expired(float(second)) for second in range(100)) == HANG_AFTER + 1
+    watchdog.start(100.0)
+    watchdog.path.touch()
+    assert not watchdog.expired(101.0)
+    assert [watchdog.expired(101.0 + second) for second in (1.0, 2.0, 3.0)] == [False, False, True]
 
 
-def test_there_is_headway_when_every_thread_is_in_another_call_or_waits() -> None:
+def test_there_is_progress_when_every_thread_is_in_another_call_or_waits() -> None:
     calls = {"compute": 1, "heavy": 1}
-    headway = Headway(lambda: dict(calls))
-    assert headway()
+    progress = Progress(lambda: dict(calls))
+    assert progress()
     calls["compute"] += 1
-    assert not headway(), "the other one is in the same call"
+    assert not progress(), "the other one is in the same call"
     calls["heavy"] += 1
-    assert headway()
-    assert not headway()
+    assert progress()
+    assert not progress()
     calls.clear()
-    assert headway()
+    assert progress()

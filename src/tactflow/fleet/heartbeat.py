@@ -18,21 +18,21 @@ BEAT_EVERY = 1.0
 HANG_AFTER = 60.0
 """Time without a heartbeat, s, after which a process hangs. To start takes a few seconds, ten on a busy
 machine; a frame in a slow stage takes a second."""
-LONGEST_LOOK = 1.0
-"""Longest time counted between two polls, s: a supervisor that was stopped itself has missed heartbeats."""
+MAX_INTERVAL = 1.0
+"""Longest time counted between two checks, s: a supervisor that was stopped itself has missed heartbeats."""
 
 
-class Headway:
+class Progress:
     """Tells whether every thread has made progress since the last time that all had.
 
     calls : returns thread -> number of its current call; waiting threads are left out.
 
     >>> numbers = {"compute": 1}
-    >>> headway = Headway(lambda: dict(numbers))
-    >>> headway(), headway()
+    >>> progress = Progress(lambda: dict(numbers))
+    >>> progress(), progress()
     (True, False)
     >>> numbers["compute"] += 1
-    >>> headway()
+    >>> progress()
     True
     """
 
@@ -42,62 +42,60 @@ class Headway:
 
     def __call__(self) -> bool:
         """Whether no current call was already running when the answer was last yes."""
-        now = self._calls()
-        gets_on = self._before.items().isdisjoint(now.items())
-        if gets_on:
-            self._before = now
-        return gets_on
+        calls = self._calls()
+        advanced = self._before.items().isdisjoint(calls.items())
+        if advanced:
+            self._before = calls
+        return advanced
 
 
-def start_beating(path: Path, headway: Callable[[], bool]) -> None:
+def start_heartbeat(path: Path, progress: Callable[[], bool]) -> None:
     """Touch a file every second from now on while there is progress."""
-    threading.Thread(target=_beat, args=(path, headway), name="tactflow-heartbeat", daemon=True).start()
+
+    def beat() -> None:
+        pause = threading.Event()
+        while not pause.wait(BEAT_EVERY):
+            if progress():
+                with suppress(OSError):
+                    path.touch()
+
+    threading.Thread(target=beat, name="tactflow-heartbeat", daemon=True).start()
 
 
-def _beat(path: Path, headway: Callable[[], bool]) -> None:
-    pause = threading.Event()
-    while not pause.wait(BEAT_EVERY):
-        if headway():
-            with suppress(OSError):
-                path.touch()
+class Watchdog:
+    """Watches the heartbeat of a process.
 
-
-class SignOfLife:
-    """How long a process has been silent, from its supervisor's view.
-
-    path : the file that the process touches. limit : longest silence, s; at least `HANG_AFTER` while it
-    starts. silent : time since the last heartbeat, s.
+    path : the file that the process touches. timeout : longest silence, s; at least `HANG_AFTER` until the
+    first heartbeat. silent : time since the last heartbeat, s.
     """
 
-    def __init__(self, path: Path, limit: float = HANG_AFTER) -> None:
+    def __init__(self, path: Path, timeout: float = HANG_AFTER) -> None:
         self.path = path
         self.silent = 0.0
-        self._limit = limit
-        self._heard = False
-        self._looked = 0.0
+        self._timeout = timeout
+        self._started = False
+        self._checked = 0.0
         self._touched: int | None = None
 
     def start(self, now: float) -> None:
         """Begin to watch a process started at time `now`, s."""
-        self.silent = 0.0
-        self._looked = now
-        self._heard = False
+        self.silent, self._checked, self._started = 0.0, now, False
 
     @property
-    def limit(self) -> float:
+    def timeout(self) -> float:
         """Longest silence that is accepted now, s."""
-        return self._limit if self._heard else max(self._limit, HANG_AFTER)
+        return self._timeout if self._started else max(self._timeout, HANG_AFTER)
 
-    def look(self, now: float) -> bool:
+    def expired(self, now: float) -> bool:
         """Check for a heartbeat; returns whether the silence is too long."""
-        there = status(str(self.path))
-        touched = None if there is None else there.st_mtime_ns
-        self.silent += min(now - self._looked, LONGEST_LOOK)
-        self._looked = now
+        file = status(str(self.path))
+        touched = None if file is None else file.st_mtime_ns
+        self.silent += min(now - self._checked, MAX_INTERVAL)
+        self._checked = now
         if touched != self._touched:
-            self._touched, self.silent, self._heard = touched, 0.0, True
-        return self.silent > self.limit
+            self._touched, self.silent, self._started = touched, 0.0, True
+        return self.silent > self.timeout
 
-    def excuse(self, now: float) -> None:
+    def skip(self, now: float) -> None:
         """Do not count the time since the last check."""
-        self._looked = now
+        self._checked = now

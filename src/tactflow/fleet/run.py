@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.fleet.heartbeat import SignOfLife
+from tactflow.fleet.heartbeat import Watchdog
 from tactflow.fleet.names import with_name
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import (
@@ -68,15 +68,15 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
         # The path of a local socket has 107 bytes at most (Linux), and TMPDIR may be longer.
         short = "/tmp" if os.path.isdir("/tmp") else None
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-", dir=short)))
-        for one in shared:
-            upstream = [_private(scratch, sensor, node) for sensor, node in one.sinks]
-            stack.enter_context(relay(one.address, upstream, one.backlog, one.linger, one.keys))
+        for group in shared:
+            upstream = [_private(scratch, sensor, node) for sensor, node in group.sinks]
+            stack.enter_context(relay(group.address, upstream, group.backlog, group.linger, group.keys))
         members = []
         for sensor, pipeline in pipelines.items():
-            sign = SignOfLife(scratch / f"{sensor}.alive", request.hang_after)
+            watchdog = Watchdog(scratch / f"{sensor}.alive", request.hang_after)
             command = _command(request, sensor, pipeline, _side_by_side(sensor, pipeline, shared, scratch))
-            command += ["--sign-of-life", str(sign.path)]
-            members.append(Member(sensor, command, sign, [WatchedSink(node) for node in pipeline.sinks]))
+            command += ["--sign-of-life", str(watchdog.path)]
+            members.append(Member(sensor, command, watchdog, [WatchedSink(node) for node in pipeline.sinks]))
         return supervisor.run(members)
 
 
@@ -95,7 +95,7 @@ def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequenc
 
 def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scratch: Path) -> list[str]:
     """Settings of one sensor's sinks that depend on the other sensors."""
-    relayed = {node.id for one in shared for name, node in one.sinks if name == sensor}
+    relayed = {node.id for group in shared for name, node in group.sinks if name == sensor}
     settings = []
     for node in pipeline.sinks:
         params = sink_class(node).among(node.params, scratch)

@@ -69,8 +69,8 @@ def changes(node: Node, params: StageParams) -> list[str]:
 
 def added(node: Node) -> str:
     """The override that adds the same sink as an option of the command line did."""
-    given = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    return f"sinks.{node.id}={as_yaml({'use': node.component.name} | given)}"
+    settings = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
+    return f"sinks.{node.id}={as_yaml({'use': node.component.name} | settings)}"
 
 
 def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
@@ -79,20 +79,20 @@ def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
     pipelines : sensor -> its pipeline. Results may be published at one address with the same keys.
     """
     problems = [
-        f"{node.mark}  sinks.{node.id}.keys: required the same for all sensors that publish at {one.address}"
-        for one in shared_addresses(pipelines)
-        for _, node in one.sinks
-        if (publication := sink_class(node).publishes(node.params)) and publication.keys != one.keys
+        f"{node.mark}  sinks.{node.id}.keys: required the same for all that publish at {group.address}"
+        for group in shared_addresses(pipelines)
+        for _, node in group.sinks
+        if (publication := sink_class(node).publishes(node.params)) and publication.keys != group.keys
     ]
-    seen: dict[str, str] = {}
+    owners: dict[str, str] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
-            for parameter, does, advice in _taken(node, sensor):
-                other = seen.setdefault(does, sensor)
-                if other != sensor:
+            for parameter, use, advice in _taken(node, sensor):
+                owner = owners.setdefault(use, sensor)
+                if owner != sensor:
                     place = f"{node.mark}  " if node.mark.line else f"{node.mark}: "
                     where = f"{place}sinks.{node.id}.{parameter}"
-                    problems.append(f"{where}: {other} and {sensor} would both {does}; {advice}")
+                    problems.append(f"{where}: {owner} and {sensor} would both {use}; {advice}")
     return problems
 
 
@@ -142,9 +142,9 @@ def _plain(params: StageParams) -> dict[str, object]:
 
 def _state(output: Output) -> tuple[int, ...] | None:
     """Size (of a folder: number of entries), identity and modification time; None if it does not exist."""
-    there = status(str(output.path))
+    file = status(str(output.path))
     is_kind = stat.S_ISDIR if output.kind == "folder" else stat.S_ISREG
-    if there is None or not is_kind(there.st_mode):
+    if file is None or not is_kind(file.st_mode):
         return None
-    size = len(os.listdir(output.path)) if output.kind == "folder" else there.st_size
-    return size, there.st_dev, there.st_ino, there.st_mtime_ns
+    size = len(os.listdir(output.path)) if output.kind == "folder" else file.st_size
+    return size, file.st_dev, file.st_ino, file.st_mtime_ns

@@ -13,7 +13,7 @@ from types import FrameType
 from typing import IO, TextIO
 
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.fleet.heartbeat import SignOfLife
+from tactflow.fleet.heartbeat import Watchdog
 from tactflow.fleet.sinks import WatchedSink
 from tactflow.system.files import discard_output
 from tactflow.system.signals import INTERRUPTED
@@ -51,7 +51,7 @@ def start_process(command: Sequence[str]) -> Process:
 class Member:
     """One sensor's process and its history.
 
-    command : runs the sensor. sign : its heartbeat. sinks : what they have written decides with which
+    command : runs the sensor. watchdog : of its heartbeat. sinks : what they have written decides with which
     parameters the sensor is restarted.
     process : the running one; None between two. started, start_at : when it was started, and when it may be
     restarted, s. signals_sent : signals forwarded to the process; KILL_AT if it was killed. failures : in a
@@ -60,7 +60,7 @@ class Member:
 
     sensor: str
     command: Sequence[str]
-    sign: SignOfLife
+    watchdog: Watchdog
     sinks: Sequence[WatchedSink] = ()
     process: Process | None = None
     started: float = 0.0
@@ -152,9 +152,9 @@ class Supervisor:
             return
         if self._results.locked() or self._messages.locked():
             # It may be blocked by our own reader.
-            member.sign.excuse(self._clock())
-        elif member.sign.look(self._clock()):
-            self._say(member, f"has hung for {member.sign.limit:g} s and is killed")
+            member.watchdog.skip(self._clock())
+        elif member.watchdog.expired(self._clock()):
+            self._say(member, f"has hung for {member.watchdog.timeout:g} s and is killed")
             member.signals_sent = KILL_AT
             process.kill()
 
@@ -175,7 +175,7 @@ class Supervisor:
             self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
             member.code = code
             return
-        lasted = self._clock() - member.started - member.sign.silent
+        lasted = self._clock() - member.started - member.watchdog.silent
         member.failures = 1 if lasted > GOOD_RUN else member.failures + 1
         if member.failures > GIVE_UP_AFTER:
             self._say(member, f"failed {member.failures} times in a row (exit code {code}); given up")
@@ -191,7 +191,7 @@ class Supervisor:
             [*member.command, *(word for t in kept for word in ("--set", t))]
         )
         member.started, member.signals_sent = self._clock(), 0
-        member.sign.start(member.started)
+        member.watchdog.start(member.started)
         assert member.process.stdout is not None
         assert member.process.stderr is not None
         for stream, target, prefix in (
