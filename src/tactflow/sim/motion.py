@@ -41,7 +41,7 @@ _LARGEST_JUMP = 0.45
 class Programme:
     """A series of contacts; lengths of time are in frames.
 
-    build : creates the indenter(s) for a bend in degrees. offsets : their positions, px. period : time
+    indenters : functions that make them. offsets : their positions, px. period : time
     between contacts. rise : time from touch to full depth, and back. hold : time at full depth. depths :
     relative depths of successive contacts. place : mean position as a fraction of the frame; wander : maximum
     deviation from it, px.
@@ -52,7 +52,7 @@ class Programme:
     many as fit. partial : whether slip starts at the edge of the contact; for balls.
     """
 
-    build: Callable[[float], tuple[Shape, ...]]
+    indenters: tuple[Callable[..., Shape], ...]
     offsets: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     period: int = 60
     rise: int = 10

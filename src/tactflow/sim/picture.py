@@ -49,16 +49,18 @@ class Painter:
         self._half = markers.half_patch(layout.radius * (1.0 + settings.sizes), settings.shape, widened)
 
     def frame(
-        self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_]
+        self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None
     ) -> NDArray[np.uint8]:
         """Render the raw frame, a new (600, 800, 3) uint8 BGR array.
 
         index : of the frame. moment : of the scene it shows, in frames. shown : (N,), false for invisible
-        markers.
+        markers; None for a frame without markers, dirt and noise.
         """
         settings = self._settings
         canvas = self._canvas(index, moment, pressed, shown)
         scale = self._gain(moment) / FIXED_POINT
+        if shown is None:
+            return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), np.uint8)
         noise = optics.sensor_noise(settings.seed, moment, canvas.shape)
         if settings.shot:
             noisy = np.asarray(canvas, np.float32) * np.float32(scale)
@@ -69,17 +71,12 @@ class Painter:
             level = settings.noise / optics.NOISE_UNIT
             image = cv2.addWeighted(canvas, scale, noise, level, 0.0, dtype=cv2.CV_8U)
         if settings.hot:
-            x, y, value = self._hot_pixels
-            image[y, x] = value
+            rng = np.random.default_rng([settings.seed, 0x686F])
+            x, y = rng.integers(0, SIZE[0], settings.hot), rng.integers(0, SIZE[1], settings.hot)
+            image[y, x] = rng.integers(200, 256, (settings.hot, 3)).astype(np.uint8)
         if settings.jpeg:
             image = optics.compressed(np.asarray(image, np.uint8), settings.jpeg)
         return np.asarray(image, dtype=np.uint8)
-
-    def clean(self, index: int, moment: int, pressed: Sequence[gel.Press]) -> NDArray[np.uint8]:
-        """Render the raw frame without markers, dirt and noise, a new (600, 800, 3) uint8 BGR array."""
-        canvas = self._canvas(index, moment, pressed, None)
-        scale = self._gain(moment) / FIXED_POINT
-        return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)
 
     def _gain(self, moment: int) -> float:
         settings = self._settings
@@ -103,8 +100,8 @@ class Painter:
         half = self._half
         canvas = padded[half:-half, half:-half]
         if settings.speckle:
-            shade = self._speckle(pressed) if pressed else self._resting_speckle
-            canvas = np.asarray(cv2.multiply(canvas, cv2.merge([shade] * 3), dtype=cv2.CV_16S), np.int16)
+            shade = cv2.merge([self._speckle(pressed)] * 3)
+            canvas = np.asarray(cv2.multiply(canvas, shade, dtype=cv2.CV_16S), np.int16)
         if settings.stray:
             canvas = self._with_reflections(canvas, pressed)
         if settings.blur:
@@ -118,19 +115,9 @@ class Painter:
             gains = np.append(light.settling(index, settings.settle), 1.0)
             canvas = np.asarray(cv2.multiply(canvas, gains, dtype=cv2.CV_16S), np.int16)
         if settings.lamp and moment >= _LAMP_AT * settings.frames:
-            canvas = np.asarray(cv2.multiply(canvas, self._lamp, dtype=cv2.CV_16S), np.int16)
+            lamp = light.lamp(SIZE, settings.lamp)
+            canvas = np.asarray(cv2.multiply(canvas, lamp, dtype=cv2.CV_16S), np.int16)
         return canvas
-
-    @cached_property
-    def _lamp(self) -> NDArray[np.float32]:
-        return light.lamp(SIZE, self._settings.lamp)
-
-    @cached_property
-    def _hot_pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]]:
-        rng = np.random.default_rng([self._settings.seed, 0x686F])
-        count = self._settings.hot
-        x, y = rng.integers(0, SIZE[0], count), rng.integers(0, SIZE[1], count)
-        return x, y, rng.integers(200, 256, (count, 3)).astype(np.uint8)
 
     def _gel_blocks(self, step: int) -> NDArray[np.float64]:
         """Gel coordinates (600 // step, 800 // step, 2) of the centres of blocks of `step` x `step` raw
@@ -231,10 +218,6 @@ class Painter:
         cos, sin = np.cos(angle), np.sin(angle)
         axes = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], 1)
         return rest, rng.uniform(0.2, 0.75, count), axes * squeeze[:, :, None]
-
-    @cached_property
-    def _resting_speckle(self) -> NDArray[np.float32]:
-        return self._speckle(())
 
     def _speckle(self, pressed: Sequence[gel.Press]) -> NDArray[np.float32]:
         """(H, W): fraction of light transmitted by the speckle pattern."""

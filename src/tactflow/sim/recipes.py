@@ -3,46 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 from tactflow.sim import shapes
 from tactflow.sim.motion import Programme
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """A scene: description, programme of contacts (None: no contact), and settings that differ from the
-    defaults."""
+class Recipe(NamedTuple):
+    """A scene: description, programme of contacts (None: no contact), and settings that are no defaults."""
 
     description: str
     programme: Programme | None
-    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    settings: Mapping[str, Any] = {}
 
 
-def _sphere(_bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.sphere(),)
-
-
-def _box(_bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.box(),)
-
-
-def _pair(_bend: float) -> tuple[shapes.Shape, ...]:
-    return (shapes.sphere(radius=70.0, depth=22.0), shapes.box(half_width=48.0, half_height=36.0, depth=11.0))
-
-
-_PRESS = Programme(_sphere)
-_CABLE = Programme(
-    lambda bend: (shapes.cable(bend=bend),), wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25
-)
+_SPHERE = (shapes.sphere,)
+_PRESS = Programme(_SPHERE)
+_CABLE = Programme((shapes.cable,), wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25)
 """Programmes shared by several scenes; lengths in raw px, angles in degrees."""
 SCENES: dict[str, Recipe] = {
     "press": Recipe("a ball is pressed in several places, at several depths", _PRESS),
     "ball": Recipe(
         "a ball of radius 2.375 mm is pressed all over the gel, for calibration: 0.025 mm per raw pixel",
         Programme(
-            lambda _: (shapes.ball(),), wander=(300.0, 210.0), period=20, rise=4, hold=10,
+            (shapes.ball,), wander=(300.0, 210.0), period=20, rise=4, hold=10,
             depths=(1.0, 0.8, 0.9, 0.6),
         ),
         {"shear": 0.0},
@@ -51,67 +36,72 @@ SCENES: dict[str, Recipe] = {
     "bent_cable": Recipe("a cable that bends by 70 degrees", _CABLE, {"bend": 70.0}),
     "slide": Recipe(
         "a ball drags the gel along until it slips, and slides over it",
-        Programme(_sphere, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)),
+        Programme(_SPHERE, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)),
         {"shear": 0.9},
     ),
     "stick_slip": Recipe(
         "a ball is dragged until the gel slips, at the edge of the contact first",
         Programme(
-            _sphere, wander=(100.0, 60.0), travel=260.0, hold=80, period=120, depths=(1.0, 0.8), partial=True
+            _SPHERE, wander=(100.0, 60.0), travel=260.0, hold=80, period=120, depths=(1.0, 0.8), partial=True
         ),
         {"shear": 0.5},
     ),
     "roll": Recipe(
         "a ball rolls over the gel without dragging it",
-        Programme(_sphere, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)),
+        Programme(_SPHERE, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)),
         {"shear": 0.0},
     ),
     "idle": Recipe("nothing touches the gel", None),
     "twist": Recipe(
         "a flat punch is pressed and turned by 20 degrees to either side",
         Programme(
-            _box, wander=(120.0, 80.0), angles=(-40.0, 40.0), hold=50, period=90,
+            (shapes.box,), wander=(120.0, 80.0), angles=(-40.0, 40.0), hold=50, period=90,
             depths=(1.0, 0.6, 0.8), dilation=0.12,
         ),
         {"twist": 20.0, "shear": 0.0},
     ),
     "edge": Recipe(
         "a knife edge at several angles",
-        Programme(lambda _: (shapes.edge(),), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.2),
+        Programme((shapes.edge,), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.2),
     ),
     "box": Recipe(
         "a flat rectangular punch at several angles",
-        Programme(_box, wander=(170.0, 110.0), angles=(-90.0, 90.0), dilation=0.15),
+        Programme((shapes.box,), wander=(170.0, 110.0), angles=(-90.0, 90.0), dilation=0.15),
     ),
     "ring": Recipe(
         "a ring: a contact with a hole, and without a direction",
-        Programme(lambda _: (shapes.ring(),), wander=(150.0, 90.0), dilation=0.15),
+        Programme((shapes.ring,), wander=(150.0, 90.0), dilation=0.15),
     ),
     "screw": Recipe(
         "a threaded rod: a contact in many pieces",
-        Programme(lambda _: (shapes.screw(),), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.25),
+        Programme((shapes.screw,), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.25),
     ),
     "two": Recipe(
         "a ball and a small flat punch at once",
-        Programme(_pair, offsets=((-150.0, -40.0), (150.0, 50.0)), wander=(90.0, 90.0), dilation=0.2),
+        Programme(
+            (
+                partial(shapes.sphere, radius=70.0, depth=22.0),
+                partial(shapes.box, half_width=48.0, half_height=36.0, depth=11.0),
+            ),
+            offsets=((-150.0, -40.0), (150.0, 50.0)), wander=(90.0, 90.0), dilation=0.2),
     ),
     "border": Recipe(
         "a contact cut off by the border of the frame",
-        Programme(_sphere, place=(0.965, 0.5), wander=(25.0, 180.0)),
+        Programme(_SPHERE, place=(0.965, 0.5), wander=(25.0, 180.0)),
     ),
     "tap": Recipe(
         "contacts of a single frame",
-        Programme(_sphere, period=30, rise=0, hold=1, depths=(1.0, 0.6)),
+        Programme(_SPHERE, period=30, rise=0, hold=1, depths=(1.0, 0.6)),
     ),
     "creep": Recipe(
         "one long contact that drags the gel by 0.02 px per frame",
-        Programme(_sphere, contacts=1, period=300, rise=15, hold=225, depths=(0.9,), creep=0.02),
+        Programme(_SPHERE, contacts=1, period=300, rise=15, hold=225, depths=(0.9,), creep=0.02),
     ),
     "drift": Recipe("presses while the lights warm up", _PRESS, {"drift": 0.18}),
     "flicker": Recipe("presses under flickering light", _PRESS, {"flicker": 0.06, "gain": 0.03}),
     "jumps": Recipe(
         "a contact that drags the markers by up to 0.9 pitch between two frames",
-        Programme(_box, wander=(120.0, 80.0), jumps=True, hold=36, period=72, dilation=0.1),
+        Programme((shapes.box,), wander=(120.0, 80.0), jumps=True, hold=36, period=72, dilation=0.1),
     ),
     "worn": Recipe(
         "faded, missing and vanishing markers, and dirt",
@@ -138,7 +128,7 @@ SCENES: dict[str, Recipe] = {
     "stutter": Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
     "strong_shear": Recipe(
         "a ball that moves markers by up to 1.5 pitches",
-        Programme(_sphere, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2),
+        Programme(_SPHERE, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2),
         {"shear": 1.3},
     ),
     "warm_up": Recipe(
@@ -149,7 +139,7 @@ SCENES: dict[str, Recipe] = {
     ),
     "lamp": Recipe(
         "a lamp is switched on between two presses",
-        Programme(_sphere, contacts=2, rise=5, depths=(1.0, 0.7)),
+        Programme(_SPHERE, contacts=2, rise=5, depths=(1.0, 0.7)),
         {"lamp": 0.25},
     ),
     "round_gel": Recipe(
@@ -159,27 +149,27 @@ SCENES: dict[str, Recipe] = {
     ),
     "block": Recipe(
         "a grooved block that covers a quarter of the gel",
-        Programme(lambda _: (shapes.block(),), wander=(60.0, 50.0), angles=(-40.0, 40.0), dilation=0.1),
+        Programme((shapes.block,), wander=(60.0, 50.0), angles=(-40.0, 40.0), dilation=0.1),
     ),
     "coin": Recipe(
         "a coin: a large disc with a raised rim and figures",
-        Programme(lambda _: (shapes.coin(),), wander=(120.0, 80.0), angles=(-90.0, 90.0), dilation=0.1),
+        Programme((shapes.coin,), wander=(120.0, 80.0), angles=(-90.0, 90.0), dilation=0.1),
     ),
     "key": Recipe(
         "a flat key",
-        Programme(lambda _: (shapes.key(),), wander=(90.0, 60.0), angles=(-40.0, 40.0), dilation=0.1),
+        Programme((shapes.key,), wander=(90.0, 60.0), angles=(-40.0, 40.0), dilation=0.1),
     ),
     "long_edge": Recipe(
         "the edge of a box, one flank steep and one flat, at several angles",
         Programme(
-            lambda _: (shapes.edge(half_length=250.0, lean=0.5),), wander=(80.0, 80.0), angles=(-90.0, 90.0),
+            (partial(shapes.edge, half_length=250.0, lean=0.5),), wander=(80.0, 80.0), angles=(-90.0, 90.0),
             dilation=0.15,
         ),
     ),
     "finger": Recipe(
         "a fingertip at the border of the frame, in a gel without a crease at the edge of a contact",
         Programme(
-            lambda _: (shapes.finger(),), place=(0.93, 0.5), wander=(40.0, 150.0), angles=(-40.0, 40.0)
+            (shapes.finger,), place=(0.93, 0.5), wander=(40.0, 150.0), angles=(-40.0, 40.0)
         ),
         {"sink": 0.5, "rim": 1.0},
     ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.sim import gel, markers, motion
+from tactflow.sim import gel, markers, motion, shapes
 from tactflow.sim.camera import SIZE, Camera, delivered_frames
 from tactflow.sim.picture import Painter
 from tactflow.sim.recipes import SCENES
@@ -68,7 +68,10 @@ class Scene:
         self.layout = markers.layout(settings, SIZE)
         self._raw = PixelMapping.identity(SIZE)
         self._programme = programme
-        self._shapes = programme.build(settings.bend) if programme else ()
+        self._shapes = tuple(
+            make(bend=settings.bend) if make is shapes.cable else make()
+            for make in (programme.indenters if programme else ())
+        )
         self._delivered = delivered_frames(len(self), settings.dropped, settings.repeated, settings.seed)
         # Contacts and the lamp are timed by the moments that passed, not by the frames that were delivered.
         self._timed = settings.model_copy(update={"frames": self._delivered[-1] + 1})
@@ -97,7 +100,7 @@ class Scene:
     def clean(self, index: int) -> NDArray[np.uint8]:
         """Render raw frame `index` without markers, dirt and noise, a new (600, 800, 3) uint8 BGR array."""
         moment = self._moment(index)
-        return self._painter.clean(index, moment, self._contact(moment)[0])
+        return self._painter.frame(index, moment, self._contact(moment)[0], None)
 
     def truth(self, index: int, mapping: PixelMapping | Preprocessor | None = None) -> Truth:
         """Ground truth of frame `index`.
