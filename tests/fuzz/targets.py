@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import io
-import json
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -24,8 +23,6 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import Result, encode_message
-from tactflow.network.commands import Commands
-from tactflow.network.control_socket import ControlSocket
 from tactflow.recording.frames import RawFrame, encode_frame
 from tactflow.recording.records import NotARecordingError
 from tactflow.recording.repair import repair
@@ -43,6 +40,10 @@ from tests.messages import Results, result_of
 IMAGE = np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8)
 FRAMES = 20
 """Frames of an input that are read at most."""
+
+
+FileParser = tuple[Sequence[bytes], Callable[[Path], object]]
+"""Samples of a file, and what reads it."""
 
 
 class Parser(NamedTuple):
@@ -64,7 +65,7 @@ def play(spec: str) -> None:
         source.close()
 
 
-def pipelines(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def pipelines(_: Path) -> FileParser:
     """A pipeline file, read and checked."""
     files = [REPOSITORY / "pipeline.yaml", *sorted((REPOSITORY / "pipelines").glob("*.yaml"))]
     samples = [file.read_bytes() for file in files]
@@ -72,7 +73,7 @@ def pipelines(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     return [*samples, several + samples[0]], load_pipeline
 
 
-def recordings(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def recordings(folder: Path) -> FileParser:
     """An .mcap file: played, played from the middle, and repaired."""
     samples = [_recording(folder / "sample.mcap", finished=finished) for finished in (True, False)]
     samples += [_recording_of_others(packing) for packing in CompressionType]
@@ -112,7 +113,7 @@ def _recording_of_others(packing: CompressionType) -> bytes:
     return file.getvalue()
 
 
-def arrays(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def arrays(_: Path) -> FileParser:
     """A .npy file."""
     samples = []
     for array in (IMAGE[None], IMAGE[None, :, :, 0], IMAGE[None].astype(np.uint16), IMAGE[None, :, ::-1]):
@@ -122,7 +123,7 @@ def arrays(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     return [*samples, file.getvalue()], lambda path: play(str(path))
 
 
-def pictures(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def pictures(_: Path) -> FileParser:
     """A picture of any kind."""
     large = np.tile(IMAGE, (6, 6, 1))
     kinds = [(large, kind) for kind in (".png", ".jpg", ".bmp", ".tiff", ".webp", ".ppm", ".jp2")]
@@ -131,7 +132,7 @@ def pictures(_: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     return [cv2.imencode(kind, image)[1].tobytes() for image, kind in kinds], lambda path: play(str(path))
 
 
-def videos(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def videos(folder: Path) -> FileParser:
     """A video file, which FFmpeg reads."""
     samples = []
     for name, code in (("a.avi", "MJPG"), ("b.mp4", "mp4v")):
@@ -143,7 +144,7 @@ def videos(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     return [sample for sample in samples if sample], lambda path: play(str(path))
 
 
-def bags(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def bags(folder: Path) -> FileParser:
     """Recordings of ROS and Foxglove: .mcap, .bag, .db3."""
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
@@ -165,7 +166,7 @@ def bags(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     return [file.read_bytes() for file in files], read
 
 
-def lerobot(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def lerobot(folder: Path) -> FileParser:
     """What a LeRobot dataset says of itself."""
     root = write_lerobot(folder / "press", np.zeros((5, 48, 64, 3), np.uint8), "v3.0", "image")
     info = root / "meta" / "info.json"
@@ -177,7 +178,7 @@ def lerobot(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
     return [info.read_bytes()], read
 
 
-def calibrations(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object]]:
+def calibrations(folder: Path) -> FileParser:
     """A calibration: its YAML, or the arrays beside it."""
     file = folder / "left.yaml"
     known = {
@@ -202,9 +203,7 @@ def calibrations(folder: Path) -> tuple[Sequence[bytes], Callable[[Path], object
 
 
 @contextmanager
-def of_file(
-    make: Callable[[Path], tuple[Sequence[bytes], Callable[[Path], object]]], suffix: str, folder: Path
-) -> Iterator[Parser]:
+def of_file(make: Callable[[Path], FileParser], suffix: str, folder: Path) -> Iterator[Parser]:
     """A parser of a file of a kind."""
     samples, read = make(folder)
 
@@ -303,18 +302,6 @@ def commands(_: Path) -> Iterator[Parser]:
     yield Parser(samples, feed)
 
 
-@contextmanager
-def orders(_: Path) -> Iterator[Parser]:
-    """What another program asks of a run."""
-    control = ControlSocket("tcp://127.0.0.1:*", None, "main", Commands(None))
-
-    def feed(data: bytes) -> None:
-        assert json.loads(control._answer([data]))["message"]
-
-    yield Parser([b'{"do": "ping"}', b'{"do": "record_start"}'], feed)
-    control.close()
-
-
 # No HDF5: its library hangs on some damaged files, as docs/security.md says.
 FILES = {
     pipelines: ".yaml",
@@ -328,5 +315,5 @@ FILES = {
 }
 TARGETS: dict[str, Callable[[Path], AbstractContextManager[Parser]]] = {
     **{make.__name__: partial(of_file, make, suffix) for make, suffix in FILES.items()},
-    **{make.__name__: make for make in (overrides, messages, subscriptions, commands, orders)},
+    **{make.__name__: make for make in (overrides, messages, subscriptions, commands)},
 }
