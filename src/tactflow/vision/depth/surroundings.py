@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.depth.slopes import BAND, Bytes
-from tactflow.vision.geometry.region import Region, measure_region
+from tactflow.vision.geometry.region import measure_region
 
 MARGIN: Final = 1.25
 """How far the gel may have sunk beyond the contact, relative to half of the contact's shorter axis. Chosen on
@@ -63,7 +63,7 @@ def surroundings(mask: Bytes, whole: Window, relative: float = MARGIN) -> Surrou
     """
     contact = measure_region(mask)
     x, y, width, height = contact[:4]
-    margin = max(LEAST_MARGIN, round(relative * _shorter_axis(contact) / 4))
+    margin = max(LEAST_MARGIN, round(relative * math.sqrt(contact.moments().principal[1])))
     left, right = max(0, x // 2 - margin), min((x + width + 1) // 2 + margin, whole.right)
     # Rows of such a length are transformed in up to a third of the time.
     columns = min(cv2.getOptimalDFTSize(right - left), whole.right)
@@ -81,11 +81,3 @@ def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
     cv2.resize(mask[window.whole], size, contact[: window.height], interpolation=cv2.INTER_AREA)
     reach = np.ones((2 * -(-margin // BAND) + 1, 2 * margin + 1), np.uint8)
     return np.asarray(cv2.dilate(contact.reshape(bands, BAND, -1).max(axis=1), reach), np.uint8)
-
-
-def _shorter_axis(region: Region) -> float:
-    """Shorter axis of the ellipse that has a region's second moments, px: of a disc its diameter."""
-    count, x, y = region.pixels, region.x, region.y
-    sums = count * region.xx - x * x, count * region.xy - x * y, count * region.yy - y * y
-    xx, xy, yy = (value / (count * count) for value in sums)
-    return 4 * math.sqrt(max((xx + yy) / 2 - math.hypot((xx - yy) / 2, xy), 0.0))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats
+from tactflow.vision.geometry.region import Contours, Moments
 
 FALSE_DIRECTION: Final = 1e-3
 """Share of directionless regions that may be given a direction by chance. Chosen by hand."""
@@ -57,18 +56,10 @@ def axis_direction(theta: float) -> tuple[float, float | None]:
     return angle + 0.0, slope
 
 
-def anisotropy_limit(
-    contours: Callable[[], Sequence[NDArray[Any]]],
-    center: tuple[float, float],
-    covariance: tuple[float, float, float],
-    pixels: int,
-    confidence: float,
-) -> float:
+def anisotropy_limit(contours: Contours, moments: Moments, pixels: int, confidence: float) -> float:
     """Anisotropy that a directionless region reaches by chance in a share `FALSE_DIRECTION` of cases.
 
-    contours : gives outer outlines of the region, each (n, 1, 2) int, every pixel of them, px. center : of
-    the region, px. covariance : xx, xy and yy of its pixels, px^2. pixels : how many. confidence : its
-    anisotropy, 0 to 1.
+    contours, moments : of the region. pixels : how many it has. confidence : its anisotropy, 0 to 1.
 
     Two causes are known, and the larger limit counts.
 
@@ -88,17 +79,15 @@ def anisotropy_limit(
     limit = math.sqrt(-2 * math.log(FALSE_DIRECTION) * _GRID_NOISE / radius**3)
     if confidence > _LINEAR_LIMIT or confidence <= limit:
         return limit
-    power = _outline_power(contours(), center, covariance)
+    power = _outline_power(contours, moments)
     # Of seven numbers, `np.median` takes a hundred times as long.
     rough = 4 * math.sqrt(_MEDIAN_RATIO * statistics.median(power.tolist()))
     return min(max(limit, rough), _LINEAR_LIMIT)
 
 
-def _outline_power(
-    contours: Sequence[NDArray[Any]], center: tuple[float, float], covariance: tuple[float, float, float]
-) -> Floats:
+def _outline_power(contours: Contours, moments: Moments) -> Floats:
     """Power of the outlines' `_HARMONICS`, relative to the ellipse with the region's second moments."""
-    xx, xy, yy = covariance
+    center_x, center_y, xx, xy, yy = moments
     # Whitening by the Cholesky factor: in these coordinates the ellipse of second moments is a circle.
     l11 = math.sqrt(xx)
     l21 = xy / l11
@@ -107,8 +96,8 @@ def _outline_power(
     turns = []
     for contour in contours:
         z = np.empty(len(contour), np.complex128)
-        z.real = (contour[:, 0, 0] - center[0]) / l11
-        z.imag = (contour[:, 0, 1] - center[1] - l21 * z.real) / l22
+        z.real = (contour[:, 0, 0] - center_x) / l11
+        z.imag = (contour[:, 0, 1] - center_y - l21 * z.real) / l22
         distance = np.maximum(np.abs(z), _LEAST_RADIUS)
         turn = z / distance
         # Fraction of the full turn that each outline point stands for.

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import partial
 from typing import Any, Final
 
 import cv2
@@ -13,11 +11,8 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Mask, Points, check_mask
 from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
-from tactflow.vision.geometry.region import Region, measure_region
+from tactflow.vision.geometry.region import Contours, Region, measure_region
 from tactflow.vision.types import Contact, Ellipse, Evidence
-
-Contours = Sequence[NDArray[Any]]
-"""Outer outlines, each (n, 1, 2) int32, x and y of every pixel on it, px of the frame."""
 
 _FEWEST_PIXELS: Final = 5
 """Pixels that a region needs for an ellipse. Derived: an ellipse has five parameters."""
@@ -60,11 +55,8 @@ def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float
     >>> contact.center, contact.area, contact.angle
     ((29.5, 24.5), 400.0, 0.0)
     """
-    region = _measured(mask, min_area, min_confidence)
-    if region.in_one_piece:
-        return _describe(mask, region, min_confidence) if region.pixels >= min_area else None
-    contours = _large_contours(mask, region, min_area)
-    return _describe_some(mask, contours, min_confidence) if contours else None
+    region, contours = _large_regions(mask, min_area, min_confidence)
+    return _describe(region, contours, min_confidence) if contours else None
 
 
 def contact_parts(
@@ -94,81 +86,65 @@ def contact_parts(
     """
     if not max_gap >= 0:
         raise ValueError(f"required max_gap >= 0 px, got {max_gap}")
-    region = _measured(mask, min_area, min_confidence)
-    if region.in_one_piece:
-        return [_describe(mask, region, min_confidence, evidence)] if region.pixels >= min_area else []
-    groups = _groups(_large_contours(mask, region, min_area), max_gap)
-    groups.sort(key=_pixels, reverse=True)
-    return [_describe_some(mask, group, min_confidence, evidence) for group in groups]
+    region, contours = _large_regions(mask, min_area, min_confidence)
+    groups = sorted(_groups(contours, max_gap), key=_pixels, reverse=True)
+    regions = [region] if len(groups) == 1 else [_only(mask, group) for group in groups]
+    return [_describe(*part, min_confidence, evidence) for part in zip(regions, groups, strict=True)]
 
 
-def _measured(mask: Mask, min_area: float, min_confidence: float) -> Region:
-    """All that is set in a mask. Raises ValueError if anything is out of its range."""
+def _large_regions(mask: Mask, min_area: float, min_confidence: float) -> tuple[Region, Contours]:
+    """The components of a mask that are large enough, and their outlines.
+
+    Raises ValueError if anything is out of its range.
+    """
     if not (min_area >= 0 and math.isfinite(min_area)):
         raise ValueError(f"required min_area >= 0 px^2, got {min_area}")
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
     check_mask(mask)
-    return measure_region(mask)
+    region = measure_region(mask)
+    contours = region.contours()
+    large = [contour for contour in contours if _filled_area(contour) >= min_area]
+    return region if len(large) == len(contours) else _only(mask, large), large
 
 
-def _contours(mask: Mask, region: Region, method: int = cv2.CHAIN_APPROX_NONE) -> Contours:
-    """Outlines of all components of a mask."""
-    left, top, width, height = region[:4]
-    window = mask[top : top + height, left : left + width]
-    return cv2.findContours(window, cv2.RETR_EXTERNAL, method, offset=(left, top))[0] if width else ()
-
-
-def _large_contours(mask: Mask, region: Region, min_area: float) -> Contours:
-    return [contour for contour in _contours(mask, region) if _filled_area(contour) >= min_area]
-
-
-def _describe_some(
-    mask: Mask, contours: Contours, min_confidence: float, evidence: Evidence = "light"
-) -> Contact:
-    """The contact that some components of a mask are together."""
+def _only(mask: Mask, contours: Contours) -> Region:
+    """Some components of a mask."""
     only = np.zeros_like(mask)
     cv2.drawContours(only, contours, -1, 255, cv2.FILLED)
-    only &= mask
-    return _describe(only, measure_region(only), min_confidence, evidence)
+    return measure_region(only & mask)
 
 
-def _describe(mask: Mask, region: Region, min_confidence: float, evidence: Evidence = "light") -> Contact:
-    """The contact that all that is set in a mask is."""
-    # Whole numbers: no cancellation, a vertical bar is exactly vertical.
-    count, x, y = region.pixels, region.x, region.y
-    xx, xy, yy = count * region.xx - x * x, count * region.xy - x * y, count * region.yy - y * y
-    spread = math.hypot(xx - yy, 2 * xy)
-    square = float(count) * count
-    major = (xx + yy + spread) / (2 * square)
-    minor = (xx * yy - xy * xy) / (square * square * major) if major > 0 else 0.0
-    confidence = min(1.0, spread / (xx + yy)) if xx + yy > 0 else 0.0
-    center = (x / count, y / count)
+def _describe(
+    region: Region, contours: Contours, min_confidence: float, evidence: Evidence = "light"
+) -> Contact:
+    """The contact that a region is."""
+    moments = region.moments()
+    _, _, xx, xy, yy = moments
+    major, minor = moments.principal
+    confidence = min(1.0, moments.spread / (xx + yy)) if xx + yy > 0 else 0.0
     angle = slope = None
-    if confidence > min_confidence:
-        covariance = xx / square, xy / square, yy / square
-        contours = partial(_contours, mask, region)
-        if confidence > anisotropy_limit(contours, center, covariance, count, confidence):
-            angle, slope = axis_direction(0.5 * math.atan2(2 * xy, xx - yy))
-    ellipse = None
-    if count >= _FEWEST_PIXELS and minor > _WIDTH_OF_A_LINE:
+    if confidence > min_confidence and confidence > anisotropy_limit(
+        contours, moments, region.pixels, confidence
+    ):
+        angle, slope = axis_direction(0.5 * math.atan2(2 * xy, xx - yy))
+    center, ellipse = moments[:2], None
+    if region.pixels >= _FEWEST_PIXELS and minor > _WIDTH_OF_A_LINE:
         ellipse = Ellipse(center, (4 * math.sqrt(major), 4 * math.sqrt(minor)), angle)
-    polygon, area = _hull(region.ends)
-    return Contact(area, center, angle, slope, polygon, ellipse, confidence, float(count), evidence)
+    polygon, area = _hull(contours)
+    return Contact(area, center, angle, slope, polygon, ellipse, confidence, float(region.pixels), evidence)
 
 
-def _hull(points: NDArray[np.int32]) -> tuple[Points, float]:
-    """Convex hull of pixels (n, 2): its corners (m, 2), clockwise on the screen; pixels in it."""
-    corners = cv2.convexHull(points)[:, 0].tolist()
+def _hull(contours: Contours) -> tuple[Points, float]:
+    """Convex hull of some components: its corners (m, 2), clockwise on the screen; pixels in it."""
+    corners = cv2.convexHull(np.concatenate(contours))[:, 0]
     # The left one of the first row comes last.
-    first = min(range(len(corners)), key=lambda k: corners[k][::-1]) + 1
-    corners = corners[first:] + corners[:first]
-    # Pick's theorem: twice the area, and the pixels on the border.
-    twice = on_border = 0
-    for (x, y), (u, v) in zip(corners, corners[1:] + corners[:1], strict=True):
-        twice += x * v - u * y
-        on_border += math.gcd(u - x, v - y)
-    return np.array(corners, np.float64), (abs(twice) + on_border) / 2 + 1
+    first = int(np.lexsort(corners.T)[0]) + 1
+    corners = np.concatenate([corners[first:], corners[:first]])
+    steps = corners - np.concatenate([corners[-1:], corners[:-1]])
+    # Pick's theorem, with the pixels on the border.
+    on_border = int(np.gcd(steps[:, 0], steps[:, 1]).sum())
+    return corners.astype(np.float64), cv2.contourArea(corners) + on_border / 2 + 1
 
 
 def _filled_area(contour: NDArray[Any]) -> float:

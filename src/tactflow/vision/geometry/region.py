@@ -1,24 +1,47 @@
-"""What a mask shows: bounding box, moments and outline of all that is set."""
+"""What a mask shows: bounding box, number of pixels, outlines and moments."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Mask
-from tactflow.vision.compiled import kernel
+
+Contours = Sequence[NDArray[Any]]
+"""Outer outlines, each (n, 1, 2) int32, x and y of every pixel on it, px of the frame."""
+
+
+class Moments(NamedTuple):
+    """Centroid (x, y) of a region, px, and the covariance of its pixels, px^2."""
+
+    x: float
+    y: float
+    xx: float
+    xy: float
+    yy: float
+
+    @property
+    def spread(self) -> float:
+        """Difference of the principal variances, px^2."""
+        return math.hypot(self.xx - self.yy, 2 * self.xy)
+
+    @property
+    def principal(self) -> tuple[float, float]:
+        """The principal variances, px^2, the larger one first."""
+        major = (self.xx + self.yy + self.spread) / 2
+        return major, max(0.0, self.xx * self.yy - self.xy * self.xy) / major if major > 0 else 0.0
 
 
 class Region(NamedTuple):
-    """The pixels of a mask that are set; lengths in px, sums in whole numbers.
+    """The pixels of a mask that are set.
 
-    left, top, width, height : their bounding box; all 0 if there are none.
-    pixels : how many. x, y : sums of their coordinates. xx, xy, yy : sums of products of these.
-    in_one_piece : True for a region (8-connected) of which each row is one run of pixels; False where it
-        takes contours to tell.
-    ends : (2 h, 2) int32, x and y of the first and the last pixel of each row of the box that has any.
+    left, top, width, height : their bounding box, px; all 0 if there are none. pixels : how many.
+    window : (height, width) uint8, the part of the mask in that box.
     """
 
     left: int
@@ -26,65 +49,47 @@ class Region(NamedTuple):
     width: int
     height: int
     pixels: int
-    x: int
-    y: int
-    xx: int
-    xy: int
-    yy: int
-    in_one_piece: bool
-    ends: NDArray[np.int32]
+    window: Mask
+
+    @property
+    def in_one_piece(self) -> bool:
+        """Whether it is connected (8-connected)."""
+        return len(self.contours()) == 1
+
+    def contours(self) -> Contours:
+        """Outlines of its components (8-connected), without those of holes."""
+        if not self.pixels:
+            return ()
+        offset = (self.left, self.top)
+        return cv2.findContours(self.window, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=offset)[0]
+
+    def moments(self) -> Moments:
+        """Its moments; there is at least one pixel."""
+        sums = cv2.moments(self.window, binaryImage=True)
+        # Whole numbers: no cancellation, a vertical bar is exactly vertical.
+        count, x, y, xx, xy, yy = (int(sums[name]) for name in ("m00", "m10", "m01", "m20", "m11", "m02"))
+        square = count * count
+        return Moments(
+            (x + self.left * count) / count,
+            (y + self.top * count) / count,
+            (count * xx - x * x) / square,
+            (count * xy - x * y) / square,
+            (count * yy - y * y) / square,
+        )
 
 
 def measure_region(mask: Mask) -> Region:
-    """Measure a mask.
-
-    mask : (H, W) uint8, not 0 inside.
+    """Find all pixels of a mask (H, W) uint8 that are not 0.
 
     >>> mask = np.zeros((20, 20), np.uint8)
     >>> mask[5:7, 5:8] = 255
     >>> region = measure_region(mask)
     >>> region.width, region.height, region.pixels, region.in_one_piece
     (3, 2, 6, True)
+    >>> region.moments().x
+    6.0
     """
-    ends, found = np.empty((2 * len(mask), 2), np.int32), np.zeros(12, np.int64)
-    _measure(np.ascontiguousarray(mask), ends, found)
-    *numbers, in_one_piece, count = found.tolist()
-    return Region(*numbers, in_one_piece == 1, ends[:count])  # type: ignore[call-arg, arg-type]
-
-
-@kernel("void(Array(uint8, 2, 'C', readonly=True), int32[:, ::1], int64[::1])")
-def _measure(mask: Mask, ends: NDArray[np.int32], found: NDArray[np.int64]) -> None:
-    """Fill `found`, (12,), with the numbers of a `Region`, and how many of the ends are filled."""
-    height, width = mask.shape
-    left, right, top, bottom, count = width, -1, -1, -1, 0
-    in_one_piece = True
-    pixels = sum_x = sum_y = sum_xx = sum_xy = sum_yy = np.int64(0)
-    for y in range(height):
-        row, any_bits = mask[y], np.uint8(0)
-        for i in range(width):
-            any_bits = np.uint8(any_bits | row[i])
-        if not any_bits:
-            continue
-        first, last, number, ones, twos = 0, width - 1, 0, 0, 0
-        while row[first] == 0:
-            first += 1
-        while row[last] == 0:
-            last -= 1
-        for i in range(first, last + 1):
-            number += 1 if row[i] != 0 else 0
-            ones += i if row[i] != 0 else 0
-            twos += i * i if row[i] != 0 else 0
-        touching = count == 0 or (
-            bottom == y - 1 and ends[count - 2, 0] <= last + 1 and first <= ends[count - 1, 0] + 1
-        )
-        in_one_piece = in_one_piece and touching and number == last + 1 - first
-        ends[count, 0], ends[count, 1], ends[count + 1, 0], ends[count + 1, 1] = first, y, last, y
-        top, bottom, count = y if count == 0 else top, y, count + 2
-        left, right = min(left, first), max(right, last)
-        pixels, sum_x, sum_xx = pixels + number, sum_x + ones, sum_xx + twos
-        sum_y, sum_xy, sum_yy = sum_y + number * y, sum_xy + ones * y, sum_yy + number * y * y
-    if count:
-        found[0], found[1], found[2], found[3] = left, top, right + 1 - left, bottom + 1 - top
-        found[4], found[5], found[6] = pixels, sum_x, sum_y
-        found[7], found[8], found[9] = sum_xx, sum_xy, sum_yy
-        found[10], found[11] = 1 if in_one_piece else 0, count
+    mask = np.ascontiguousarray(mask)
+    left, top, width, height = cv2.boundingRect(mask) if mask.size else (0, 0, 0, 0)
+    window = mask[top : top + height, left : left + width]
+    return Region(left, top, width, height, cv2.countNonZero(window) if width else 0, window)
