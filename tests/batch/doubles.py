@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from pathlib import Path
+from textwrap import dedent, indent
 
 import numpy as np
 
@@ -19,6 +20,27 @@ stages:
 sinks: {}
 """
 """A pipeline without kernels."""
+
+
+STAGE = """
+import errno, os, pathlib, signal, time
+from tactflow import Stage
+from tactflow.ports import Image
+
+HERE = pathlib.Path(__file__).parent
+
+class Extra(Stage):
+    memory = "pure"
+
+    def process(self, image: Image) -> Image:
+"""
+
+
+def add_stage(folder: Path, body: str) -> None:
+    """Write the pipeline `p.yaml` with one more stage, in `extra.py`. body : of `process`."""
+    (folder / "extra.py").write_text(STAGE + indent(dedent(body).strip() + "\nreturn image\n", " " * 8))
+    text = PIPELINE.replace("preprocess.image", "extra.image")
+    (folder / "p.yaml").write_text(text.replace("  difference", "  extra: {use: ./extra.py}\n  difference"))
 
 
 class InThisProcess:

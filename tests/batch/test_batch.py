@@ -9,6 +9,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ import pytest
 from tactflow.batch.work import Task
 from tactflow.cli import batch as command
 from tactflow.cli.main import main, make_parser
-from tests.batch.doubles import PIPELINE, InThisProcess, recording
+from tests.batch.doubles import PIPELINE, InThisProcess, add_stage, recording
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -27,12 +28,12 @@ class Call:
     def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         self.folder = folder
         self._capsys = capsys
-        self.told = ""
+        self.stderr = ""
 
     def __call__(self, *words: str, format_: str = "jsonl") -> int:
         self._capsys.readouterr()
         code = main(["batch", "p.yaml", "rec", "--out", "out", "--format", format_, *words])
-        self.told = self._capsys.readouterr().err
+        self.stderr = self._capsys.readouterr().err
         return code
 
     def rows(self) -> list[dict[str, object]]:
@@ -56,7 +57,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
 def test_every_recording_has_a_result_and_a_second_call_does_nothing(call: Call) -> None:
     assert call() == 0
-    assert "2 done now, 0 done before, 0 failed" in call.told
+    assert "2 done now, 0 done before, 0 failed" in call.stderr
     assert [(row["name"], row["status"], row["frames"], row["contacts"]) for row in call.rows()] == [
         ("a/press.npy", "done", 6, 1),
         ("b/press.npy", "done", 6, 1),
@@ -64,19 +65,13 @@ def test_every_recording_has_a_result_and_a_second_call_does_nothing(call: Call)
     messages = [json.loads(line) for line in call.result(0).read_text().splitlines()]
     assert [bool(message["contact"]) for message in messages] == [False] * 2 + [True] * 4
     assert not list((call.folder / "out" / "unfinished").iterdir())
+    page = (call.folder / "out" / "index.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == page.count("time, s</text>") == 2
+    assert not re.search(r"(?:src|href)=\"?https?:", page)
     written = call.result(0).stat().st_mtime_ns
     assert call() == 0
-    assert "0 done now, 2 done before, 0 failed" in call.told
+    assert "0 done now, 2 done before, 0 failed" in call.stderr
     assert call.result(0).stat().st_mtime_ns == written
-
-
-def test_the_page_has_pictures_and_plots_in_one_file(call: Call) -> None:
-    assert call() == 0
-    page = (call.folder / "out" / "index.html").read_text()
-    assert f"look at {call.folder / 'out' / 'index.html'}" in call.told
-    assert page.count("data:image/jpeg;base64,") == 2
-    assert page.count("time, s</text>") == 2
-    assert not re.search(r"(?:src|href)=\"?https?:", page)
 
 
 def test_a_worker_does_not_import_matplotlib_and_the_page_of_an_older_folder_is_kept(call: Call) -> None:
@@ -93,7 +88,7 @@ def test_a_worker_does_not_import_matplotlib_and_the_page_of_an_older_folder_is_
         preview.with_suffix(".html").write_text("<p>drawn before</p>")
         preview.unlink()
     assert call() == 0
-    assert "0 done now, 2 done before, 0 failed" in call.told
+    assert "0 done now, 2 done before, 0 failed" in call.stderr
     assert (call.folder / "out" / "index.html").read_text().count("drawn before") == 2
 
 
@@ -101,46 +96,39 @@ def test_only_what_has_changed_is_done_again(call: Call) -> None:
     call()
     recording(call.folder / "rec" / "b" / "press.npy", brightness=250)
     call()
-    assert "1 done now, 1 done before" in call.told
-    assert "1 outdated (input, pipeline or version changed)" in call.told
+    assert "1 done now, 1 done before" in call.stderr
+    assert "1 outdated (input, pipeline or version changed)" in call.stderr
     call("--set", "stages.hull.min_area=7")
-    assert "2 done now, 0 done before" in call.told
+    assert "2 done now, 0 done before" in call.stderr
     recording(call.folder / "rec" / "c.npy")
     call("--set", "stages.hull.min_area=7")
-    assert "1 done now, 2 done before" in call.told
+    assert "1 done now, 2 done before" in call.stderr
 
 
 def test_code_beside_the_pipeline_is_part_of_the_pipeline(call: Call) -> None:
-    code = call.folder / "dim.py"
-    code.write_text(
-        "from tactflow import Stage\nfrom tactflow.ports import Image\n"
-        "class Dim(Stage):\n    memory = 'pure'\n"
-        "    def process(self, image: Image) -> Image:\n        return image // 2\n"
-    )
-    text = PIPELINE.replace("preprocess.image", "dim.image")
-    (call.folder / "p.yaml").write_text(text.replace("  difference", "  dim: {use: ./dim.py}\n  difference"))
+    add_stage(call.folder, "image = image // 2")
     call()
-    code.write_text(code.read_text().replace("// 2", "// 3 "))
+    add_stage(call.folder, "image = image // 3 ")
     call()
-    assert "2 outdated (input, pipeline or version changed)" in call.told
+    assert "2 outdated (input, pipeline or version changed)" in call.stderr
 
 
-@pytest.mark.parametrize("damage", ["cut off", "gone", "no record", "damaged record"])
+DAMAGES: dict[str, Callable[[Path, Path], object]] = {
+    "truncated": lambda result, _: os.truncate(result, 100),
+    "no result": lambda result, _: result.unlink(),
+    "no record": lambda _, record: record.unlink(),
+    "damaged record": lambda _, record: record.write_text('{"recording": "cut o'),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_result_that_is_not_as_it_was_written_is_made_again(call: Call, damage: str) -> None:
     call()
     path = call.result(1)
-    (record,) = (call.folder / "out" / "records").glob(f"{path.stem}.json")
     whole = path.read_bytes()
-    if damage == "cut off":
-        os.truncate(path, 100)
-    elif damage == "gone":
-        path.unlink()
-    elif damage == "no record":
-        record.unlink()
-    else:
-        record.write_text('{"recording": "cut o')
+    DAMAGES[damage](path, call.folder / "out" / "records" / f"{path.stem}.json")
     assert call() == 0
-    assert "1 done now, 1 done before" in call.told
+    assert "1 done now, 1 done before" in call.stderr
     assert path.read_bytes() == whole
 
 
@@ -153,7 +141,7 @@ def test_tables_are_whole_only_with_all_their_parts(call: Call) -> None:
     assert pq.read_table(tables / "frames")["seq"].to_pylist() == list(range(6))
     next(tables.rglob("*.parquet")).unlink()
     call(format_="parquet")
-    assert "1 done now, 1 done before" in call.told
+    assert "1 done now, 1 done before" in call.stderr
     assert len(list(tables.rglob("*.parquet"))) == 3
 
 
@@ -161,14 +149,14 @@ def test_one_that_fails_stops_no_other_and_is_tried_again(call: Call) -> None:
     whole = call.folder / "rec" / "a" / "press.npy"
     whole.write_bytes(b"<no array>")
     assert call() == 3
-    assert "failed: a/press.npy: capture" in call.told
+    assert "failed: a/press.npy: capture" in call.stderr
     assert [row["status"] for row in call.rows()] == ["failed", "done"]
     page = (call.folder / "out" / "index.html").read_text()
     assert page.index("<h2>a/press.npy") < page.index("<h2>b/press.npy")
     assert "not a .npy file" in page
     recording(whole)
     assert call() == 0
-    assert "1 done now, 1 done before, 0 failed" in call.told
+    assert "1 done now, 1 done before, 0 failed" in call.stderr
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
@@ -202,32 +190,22 @@ def test_one_signal_finishes_what_runs_and_leaves_the_rest_for_the_next_call(
         patched.setattr(InThisProcess, "submit", interrupted)
         patched.setattr(InThisProcess, "slots", 1)
         assert call() == 130
-    assert "1 not done: call again to do the rest\nended early: interrupted" in call.told
+    assert "1 not done: call again to do the rest\nended early: interrupted" in call.stderr
     assert call() == 0
-    assert "1 done now, 1 done before" in call.told
+    assert "1 done now, 1 done before" in call.stderr
 
 
 def test_a_full_disk_ends_the_batch_and_loses_nothing(call: Call) -> None:
-    (call.folder / "full.py").write_text(
-        "import errno, pathlib\nfrom tactflow import Stage\nfrom tactflow.ports import Image\n"
-        "class Full(Stage):\n    memory = 'pure'\n"
-        "    def process(self, image: Image) -> Image:\n"
-        "        if pathlib.Path(__file__).with_name('full').exists():\n"
-        "            raise OSError(errno.ENOSPC, 'No space left on device')\n"
-        "        return image\n"
-    )
-    text = PIPELINE.replace("preprocess.image", "full.image")
-    (call.folder / "p.yaml").write_text(
-        text.replace("  difference", "  full: {use: ./full.py}\n  difference")
-    )
+    full = "if (HERE / 'full').exists():\n    raise OSError(errno.ENOSPC, 'No space left on device')"
+    add_stage(call.folder, full)
     assert call() == 0
     (call.folder / "full").touch()
     recording(call.folder / "rec" / "c.npy")
     assert call() == 3
-    assert "ended early: the disk is full" in call.told
+    assert "ended early: the disk is full" in call.stderr
     (call.folder / "full").unlink()
     assert call() == 0
-    assert "1 done now, 2 done before" in call.told
+    assert "1 done now, 2 done before" in call.stderr
 
 
 def test_a_warning_is_reported_at_the_end_and_on_the_page(call: Call) -> None:
@@ -235,8 +213,8 @@ def test_a_warning_is_reported_at_the_end_and_on_the_page(call: Call) -> None:
     assert main(["sim", "press?frames=6", "--out", str(film), "--quiet"]) == 0
     film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
     assert call() == 0
-    assert "1 done with warnings: " in call.told
-    assert "of 6 frames; the file may be damaged; the table of runs has all" in call.told
+    assert "1 done with warnings: " in call.stderr
+    assert "of 6 frames; the file may be damaged; the table of runs has all" in call.stderr
     assert "the file may be damaged" in (call.folder / "out" / "index.html").read_text()
 
 
@@ -265,7 +243,7 @@ def test_two_calls_do_not_work_in_one_folder_but_two_shards_do(
     monkeypatch.setattr(InThisProcess, "submit", meanwhile)
     assert call() == 0
     assert codes == [2, 0]
-    assert "another tactflow batch is using it" in call.told
+    assert "another tactflow batch is using it" in call.stderr
 
 
 @pytest.mark.parametrize("format_", ["jsonl", "parquet"])
@@ -274,7 +252,7 @@ def test_two_pipelines_are_compared_frame_by_frame(call: Call, format_: str) -> 
         pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'tactflow[parquet]'")
     (call.folder / "other.yaml").write_text(PIPELINE.replace("rotate: 0", "rotate: 180"))
     assert call("--compare", "other.yaml", format_=format_) == 0
-    assert "prepare their pictures differently (rotate)" in call.told
+    assert "prepare their pictures differently (rotate)" in call.stderr
     page = (call.folder / "out" / "compare.html").read_text()
     row = page[page.index("<td>a/press.npy") :].partition("</tr>")[0]
     cells = re.findall(r"<td[^>]*>([^<]*)", row)
@@ -286,7 +264,7 @@ def test_two_pipelines_are_compared_frame_by_frame(call: Call, format_: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["p.yaml", "nothing", "--out", "o"], "nothing: no such file or folder"),
         (["p.yaml", "--out", "o"], "there are no recordings"),
@@ -296,10 +274,10 @@ def test_two_pipelines_are_compared_frame_by_frame(call: Call, format_: str) -> 
     ],
 )
 def test_a_wrong_command_line_starts_nothing(
-    call: Call, words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+    call: Call, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["batch", *words, "--format", "jsonl"]) == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (call.folder / "o").exists()
 
 

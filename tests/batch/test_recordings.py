@@ -22,13 +22,18 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def names(*words: str) -> list[str]:
-    return [one.name for one in find_recordings(words)]
+    return [recording.name for recording in find_recordings(words)]
 
 
 def test_a_folder_is_searched_and_one_of_pictures_is_a_recording(data: Path) -> None:
     found = find_recordings([str(data)])
-    assert [one.name for one in found] == ["a/press-2.npy", "b/press-2.npy", "b/press-10.npy", "pictures"]
-    assert all(Path(one.source).is_absolute() for one in found)
+    assert [recording.name for recording in found] == [
+        "a/press-2.npy",
+        "b/press-2.npy",
+        "b/press-10.npy",
+        "pictures",
+    ]
+    assert all(Path(recording.source).is_absolute() for recording in found)
 
 
 def test_each_recording_comes_once_however_it_is_named(data: Path) -> None:
@@ -44,7 +49,9 @@ def test_a_pattern_stands_for_what_matches_and_pictures_are_one_recording(data: 
 
 def test_options_behind_a_pattern_hold_for_all_that_match(data: Path) -> None:
     found = find_recordings(["b/*.npy?fps=30"])
-    assert [one.source for one in found] == [f"{data}/b/press-{number}.npy?fps=30" for number in (2, 10)]
+    assert [recording.source for recording in found] == [
+        f"{data}/b/press-{number}.npy?fps=30" for number in (2, 10)
+    ]
     assert names("b/p*-?.npy") == ["press-2.npy"]
     assert names("b/press-2.npy?topic=/gel") == ["press-2.npy?topic=/gel"]
     assert names("lerobot:a?episode=1", "b/press-2.npy")[0] == f"lerobot:{data / 'a'}?episode=1"
@@ -57,7 +64,7 @@ def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["b/press-3.npy"], "did you mean b/press-2.npy"),
         (["nothing/*.mp4"], "no file matches"),
@@ -66,12 +73,14 @@ def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.Monkey
         (["rtsp://camera/1"], "is a live source"),
         (["pictures/1.png"], "name its folder"),
         (["list.txt"], "there are no recordings"),
+        (["nested.txt"], "lists cannot be nested"),
     ],
 )
-def test_what_names_no_recording_is_said(data: Path, words: list[str], told: str) -> None:
+def test_what_names_no_recording_is_said(data: Path, words: list[str], message: str) -> None:
     (data / "a" / "empty").mkdir()
     (data / "list.txt").write_text("# nothing\n")
-    with pytest.raises(ConfigError, match=told):
+    (data / "nested.txt").write_text("nested.txt\na/press-2.npy\n")
+    with pytest.raises(ConfigError, match=message):
         find_recordings(words)
 
 
@@ -80,12 +89,6 @@ def test_all_mistakes_are_told_at_once(data: Path) -> None:
     with pytest.raises(ConfigError) as raised:
         find_recordings(["no.npy", "none.npy", "empty"])
     assert len(raised.value.mistakes) == 3
-
-
-def test_a_list_does_not_name_lists(data: Path) -> None:
-    (data / "b" / "list.txt").write_text("list.txt\npress-2.npy\n")
-    with pytest.raises(ConfigError, match="lists cannot be nested"):
-        find_recordings(["b/list.txt"])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows asks for a privilege")
@@ -101,7 +104,7 @@ def test_a_file_may_be_named_like_a_pattern_or_as_if_options_followed(data: Path
         (data / "c" / name).parent.mkdir(exist_ok=True)
         (data / "c" / name).touch()
         assert find_recordings([f"c/{name}"])[0].path == data / "c" / name
-    assert {one.path for one in find_recordings(["c"])} == set((data / "c").iterdir())
+    assert {recording.path for recording in find_recordings(["c"])} == set((data / "c").iterdir())
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux alone")

@@ -17,29 +17,19 @@ import pytest
 
 from tactflow.batch import workers
 from tactflow.cli.main import main
-from tests.batch.doubles import PIPELINE, recording
+from tests.batch.doubles import add_stage, recording
 from tests.clock import PATIENCE, until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills processes by signals")
 
 MORTAL = """
-import os, pathlib, signal, time
-from tactflow import Stage
-from tactflow.ports import Image
-
-class Mortal(Stage):
-    memory = "pure"
-
-    def process(self, image: Image) -> Image:
-        level = int(image[0, 0, 0])
-        here = pathlib.Path(__file__).parent
-        if level == 1 or (level == 2 and not (here / "died").exists()):
-            (here / "died").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        if level == 3:
-            (here / f"pid-{os.getpid()}").touch()
-            time.sleep(600)
-        return image
+level = int(image[0, 0, 0])
+if level == 1 or (level == 2 and not (HERE / "died").exists()):
+    (HERE / "died").touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+if level == 3:
+    (HERE / f"pid-{os.getpid()}").touch()
+    time.sleep(600)
 """
 """A stage that kills its process at level 1, does it once at level 2, and never returns at level 3."""
 LEVELS = {"deadly": 1, "unlucky": 2, "endless": 3, "a": 60, "b": 60}
@@ -52,11 +42,7 @@ def batch(*words: str) -> list[str]:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a pipeline of such a stage, and a recording for each level; the current one."""
-    (tmp_path / "mortal.py").write_text(MORTAL)
-    text = PIPELINE.replace("preprocess.image", "mortal.image")
-    (tmp_path / "p.yaml").write_text(
-        text.replace("  difference", "  mortal: {use: ./mortal.py}\n  difference")
-    )
+    add_stage(tmp_path, MORTAL)
     for name, level in LEVELS.items():
         np.save(tmp_path / f"{name}.npy", np.full((4, 48, 64, 3), level, np.uint8))
     monkeypatch.chdir(tmp_path)
@@ -118,9 +104,9 @@ def test_a_second_signal_gives_up_what_runs(folder: Path, endless: tuple[subproc
     time.sleep(1.0)
     assert process.poll() is None
     until(lambda: process.send_signal(signal.SIGINT) or process.poll() is not None)
-    _, told = process.communicate(timeout=PATIENCE)
+    _, stderr = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert "2 not done: call again to do the rest" in told
+    assert "2 not done: call again to do the rest" in stderr
     assert statuses(folder) == {"endless": "not done", "a": "not done"}
     assert not is_running(worker)
 
