@@ -118,7 +118,7 @@ def test_a_gel_that_looks_unlike_is_warned_of_with_the_numbers(
                     "found_by": "",
                 }
             },
-            "> 0",
+            "greater than 0",
         ),
         ({"scale": {"mm_per_pixel": [0.1]}}, "scale"),
         ({"colour": 1}, "colour"),

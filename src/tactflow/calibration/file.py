@@ -17,15 +17,7 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveFloat, ValidationError
 
 from tactflow import __version__
 from tactflow.calibration.stored import MAX_ARRAYS, stored_arrays, stored_text
@@ -35,7 +27,7 @@ from tactflow.system.redaction import public_address
 from tactflow.system.signals import ending_held_back
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
-from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, ForceModel, LinearForce
+from tactflow.vision.force import ForceModel, LinearForce
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
 
@@ -59,7 +51,7 @@ class _Entry(BaseModel):
 class ScaleEntry(_Entry):
     """`scale` of the file: along x and y, mm per px, their standard errors, the origin (px), the method."""
 
-    mm_per_pixel: Annotated[Pair, AfterValidator(lambda pair: _positive(pair))]
+    mm_per_pixel: Annotated[tuple[PositiveFloat, PositiveFloat], BeforeValidator(tuple)]
     stderr: Pair
     origin: Pair
     found_by: str
@@ -133,15 +125,6 @@ class ForceEntry(_Entry):
     presses: int
     left_out: Literal["recording", "press"]
 
-    @model_validator(mode="after")
-    def _known_features(self) -> ForceEntry:
-        for part, known in ((self.press, {*BY_DEPTH, *BY_CHANGE}), (self.drag, {*BY_SHEAR})):
-            if part is not None and not (part.stiffness.keys() == part.greatest.keys() <= known):
-                raise ValueError(
-                    f"required features from {sorted(known)}, each with its stiffness and greatest"
-                )
-        return self
-
     def model(self) -> ForceModel:
         """The model that the stage `force` evaluates."""
         drag = None if self.drag is None else self.drag.model()
@@ -180,10 +163,6 @@ class Calibration(_Entry):
         """Millimetres per pixel."""
         entry = self.scale_entry
         return Scale(*entry.mm_per_pixel, entry.stderr, entry.origin)
-
-    def with_force(self, force: ForceEntry) -> Self:
-        """A copy with another force."""
-        return self.model_copy(update={"force": force})
 
     def save(self, path: Path) -> None:
         """Write the YAML file, and beside it the arrays in a `.npz` of the same name.
@@ -288,12 +267,6 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
             raise ValueError(f"its arrays unpack to more than {MAX_ARRAYS >> 20} MiB")
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         return dict(arrays)
-
-
-def _positive(pair: tuple[float, float]) -> tuple[float, float]:
-    if min(pair) <= 0:
-        raise ValueError("required > 0")
-    return pair
 
 
 def _by(size: tuple[int, int]) -> str:

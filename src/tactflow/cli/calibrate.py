@@ -307,7 +307,7 @@ def _add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> in
     fit = force.fit_force(watched, references)
     for words in _force_words(fit, references):
         say(words)
-    calibration.with_force(fit.entry).save(path)
+    calibration.model_copy(update={"force": fit.entry}).save(path)
     say(f"{path} has the force now")
     return 0
 
