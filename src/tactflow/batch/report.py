@@ -22,8 +22,8 @@ from tactflow.report import COLORS, Html, Section, Table, figure, link, mark, pi
 from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
-MAX_DETAILS = 1000
-"""Recordings shown in detail: each takes about 60 kB of the page, and browsers can open 60 MB."""
+MAX_DETAILS = 300
+"""Recordings shown in detail: each takes 50 ms to draw and 60 kB of the page, which shall open quickly."""
 NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full"}
 """Internal fields of an outcome."""
 _TYPES = {"int": "int64", "float": "float64"}
