@@ -253,7 +253,7 @@ def test_frames_in_memory_are_a_source(form: Callable[[np.ndarray], Iterable[np.
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        (np.zeros((48, 64, 3), np.uint8), r"required N x H x W x 3 .* give array\[None\]"),
+        (np.zeros((48, 64, 3), np.uint8), r"required uint8 or uint16 of N x H x W x 3 .* give array\[None\]"),
         (["a.png", "b.png"], "picture 0: required an array"),
     ],
 )
