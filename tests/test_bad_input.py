@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +26,9 @@ from tests.sources.flaky import Flaky
 IMAGES = np.stack(pictures(5))
 
 
-def bag(folder: Path, kind: str = "sqlite3", encoding: str = "bgr8") -> Path:
-    return write_bag(folder / ("press.bag" if kind == "ros1" else "press"), list(IMAGES), kind, encoding)
+def bag(folder: Path, kind: str = "sqlite3", encoding: str = "bgr8", others: Sequence[str] = ()) -> Path:
+    path = folder / ("press.bag" if kind == "ros1" else "press")
+    return write_bag(path, list(IMAGES), kind, encoding, others)
 
 
 def one_file(folder: Path, kind: str) -> Path:
@@ -90,7 +91,7 @@ def without_info(folder: Path) -> Path:
 
 ROSBAGS = "need rosbags: pip install 'tactflow[bags]'"
 SOURCES: list[tuple[str, Callable[[Path], str], int, str]] = [
-    ("a bag without ?topic=", lambda f: str(bag(f)), 4, "add ?topic= one of: /gel/image ("),
+    ("a bag of two cameras", lambda f: str(bag(f, others=["/b"])), 4, "add ?topic= one of: /b ("),
     ("no such topic", lambda f: topic(bag(f), "/x"), 4, "there is no topic /x; required one of:"),
     ("a topic without pictures", lambda f: topic(bag(f), "/chatter"), 4, "which hold no picture"),
     (
@@ -113,10 +114,10 @@ SOURCES: list[tuple[str, Callable[[Path], str], int, str]] = [
         "is not an MCAP file",
     ),
     (
-        "an MCAP file of another program without ?topic=",
-        lambda f: str(one_file(f, "mcap")),
+        "an MCAP file of another program from a time on",
+        lambda f: f"{one_file(f, 'mcap')}?start=1",
         4,
-        "no frames that tactflow recorded; to play one of its topics, add",
+        "no frames that tactflow recorded; choose by ?topic= one of /chatter, /gel/image",
     ),
     ("a rosbag2 that was cut off", lambda f: topic(cut(one_file(f, "sqlite3"))), 4, "is damaged or cut off"),
     ("a ROS 1 bag that was cut off", lambda f: topic(cut(bag(f, "ros1"))), 4, "is damaged or cut off"),

@@ -43,8 +43,10 @@ def message(store: Any, image: NDArray[Any], taken: int, encoding: str, *, one: 
     )
 
 
-def write_bag(path: Path, images: Sequence[NDArray[Any]], kind: str, encoding: str = "bgr8") -> Path:
-    """A recording of some pictures and one text. kind : "ros1", "sqlite3" or "mcap"."""
+def write_bag(
+    path: Path, images: Sequence[NDArray[Any]], kind: str, encoding: str = "bgr8", others: Sequence[str] = ()
+) -> Path:
+    """A recording of some pictures and one text. kind : "ros1", "sqlite3" or "mcap". others : more topics."""
     one = kind == "ros1"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
     encode = store.serialize_ros1 if one else store.serialize_cdr
@@ -54,6 +56,8 @@ def write_bag(path: Path, images: Sequence[NDArray[Any]], kind: str, encoding: s
         chatter = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
         type_name = "CompressedImage" if encoding in ("jpeg", "png") else "Image"
         camera = writer.add_connection(TOPIC, f"sensor_msgs/msg/{type_name}", typestore=store)
+        for topic in others:
+            writer.add_connection(topic, camera.msgtype, typestore=store)
         writer.write(chatter, BEGIN - 1, encode(text, "std_msgs/msg/String"))
         for index, image in enumerate(images):
             taken = BEGIN + index * PERIOD

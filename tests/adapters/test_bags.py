@@ -107,7 +107,8 @@ def test_pictures_of_foxglove_are_read(packing: str, tmp_path: Path) -> None:
             one = schemas.CompressedImage(format="png", data=png)
             one.timestamp.FromNanoseconds(taken)
             messages.append(one)
-    found = played(f"{write_foxglove(tmp_path / 'press.mcap', messages, packing)}?topic={TOPIC}")
+    # The only topic with pictures need not be named.
+    found = played(str(write_foxglove(tmp_path / "press.mcap", messages, packing)))
     assert [t for _, t in found] == [0.0, 0.04, 0.08]
     assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
 

@@ -135,6 +135,9 @@ def _axes() -> tuple[Any, Any]:
 def _plot(points: NDArray[np.float64]) -> Any:
     """Plot the points (N, 4) of a recording."""
     drawing, axes = _axes()
+    # An axis that turns past 90 degrees continues at -90: no line is drawn between the two.
+    jumps = np.flatnonzero(np.abs(np.diff(points[:, 3])) > 90.0) + 1
+    points = np.insert(points, jumps, np.nan, axis=0)
     for axis, curve in zip(axes, points.T[1:], strict=True):
         axis.lines[0].set_data(points[:, 0], curve)
         axis.relim()

@@ -12,6 +12,9 @@ from typing import Any
 from tactflow.calibration.presses import Press, PressFinder, usual_radius
 from tactflow.calibration.progress import PARTS, fault, part, part_name, progress
 
+NAMED = 3
+"""Parts of the gel without a press that are named; more are counted. Chosen by hand."""
+
 
 class Guide:
     """Tells whether each press was good, and where one is missing.
@@ -69,7 +72,7 @@ def judged(presses: Sequence[Press], number: int) -> str:
     >>> import numpy as np
     >>> gel, mask = np.zeros((60, 60, 3), np.uint8), np.zeros((60, 60), np.uint8)
     >>> judged([Press(0, gel, mask, mask > 0, (30, 30), 9.0)], 0)
-    'good, radius 9 px; nothing yet at the upper left, upper centre, upper right, middle left, ...'
+    'good, radius 9 px; 8 of 9 parts of the gel have none yet'
     """
     press = presses[number]
     usual = usual_radius(presses)
@@ -86,7 +89,9 @@ def _missing(presses: Sequence[Press]) -> str:
     empty = [part_name(row, column) for row, column in everywhere if (row, column) not in there]
     if not empty:
         return "all parts of the gel have one"
-    return f"nothing yet at the {', '.join(empty[:4])}{', ...' if len(empty) > 4 else ''}"
+    if len(empty) > NAMED:
+        return f"{len(empty)} of {PARTS**2} parts of the gel have none yet"
+    return f"nothing yet at the {', '.join(empty)}"
 
 
 def typed_lines() -> Callable[[], Sequence[str]]:

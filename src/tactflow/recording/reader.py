@@ -10,7 +10,13 @@ from mcap.records import Attachment, Channel, Message, Schema
 from mcap.summary import Summary
 
 from tactflow.recording.frames import TYPE_NAME
-from tactflow.recording.records import Damage, NotARecordingError, intact_records, read_summary
+from tactflow.recording.records import (
+    Damage,
+    ForeignRecordingError,
+    NotARecordingError,
+    intact_records,
+    read_summary,
+)
 
 MOST_NAMED = 20
 """Topics that a message lists at most. Chosen by hand."""
@@ -66,9 +72,12 @@ def _frame_topics(found: Summary) -> tuple[str, str]:
         if schema is not None and schema.name == TYPE_NAME and channel.topic.endswith("/frames"):
             return channel.topic, channel.topic.removesuffix("frames") + "references"
     topics = list(dict.fromkeys(channel.topic for channel in channels))
-    hint = f"to play one of its topics, add ?topic={topics[0]}" if topics else "it is empty"
-    others = f" or {', '.join(topics[1:MOST_NAMED])}" if len(topics) > 1 else ""
-    raise NotARecordingError(f"holds no frames that tactflow recorded; {hint}{others}")
+    if topics:
+        names = ", ".join(topics[:MOST_NAMED])
+        raise ForeignRecordingError(
+            f"holds no frames that tactflow recorded; choose by ?topic= one of {names}"
+        )
+    raise NotARecordingError("holds no frames that tactflow recorded; it is empty")
 
 
 def attachments(path: Path) -> dict[str, bytes]:

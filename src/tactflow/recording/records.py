@@ -50,6 +50,10 @@ class NotARecordingError(Exception):
     """The file is not an MCAP file, or holds no frames of ours."""
 
 
+class ForeignRecordingError(NotARecordingError):
+    """An MCAP file that another program has written."""
+
+
 @dataclass(frozen=True, slots=True)
 class Damage:
     """Bytes of the file, from `start` up to `end`, that belong to no intact record."""

@@ -138,9 +138,14 @@ def _open_recording(spec: str, directory: Path | None, fps: float | None) -> Fra
         problem = missing_packages()
         if problem is not None:
             raise SourceError(f"{spec}: {problem}")
+        from tactflow.recording.records import ForeignRecordingError
         from tactflow.sources.mcap import Recording
 
-        return Recording(spec, directory)
+        try:
+            return Recording(spec, directory)
+        except SourceError as error:
+            if query or not isinstance(error.__cause__, ForeignRecordingError):
+                raise
     for key in _keys(name, directory, is_pattern):
         for point in plugins(GROUP):
             if point.name == key:

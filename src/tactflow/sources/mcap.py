@@ -36,7 +36,7 @@ class Recording(StampedReader):
         try:
             contents = look_into(self._path)
         except NotARecordingError as error:
-            raise SourceError(f"{self._path}: {error}") from None
+            raise SourceError(f"{self._path}: {error}") from error
         except OSError as error:
             raise damaged(self.name, error) from error
         self._frame_topic, self._reference_topic = contents.frame_topic, contents.reference_topic
