@@ -34,8 +34,10 @@ TABLES = {
     "frames": tuple(frame_columns()),
 }
 """In the order in which they are written: what belongs to a frame of `frames` is there before it."""
-PART_ROWS = 200_000
-"""A part is written early when a table has so many rows: some hundred megabytes of memory."""
+PART_BYTES = 64_000_000
+"""A part is written early when a table takes so much memory, bytes."""
+BATCH_ROWS = 1000
+"""Rows are converted to Arrow by so many: all those of a part at once would hold up the other threads."""
 
 
 class Parquet(Sink):
@@ -80,6 +82,8 @@ class Parquet(Sink):
         self._control = control
         self._schemas: dict[str, pa.Schema] = {}
         self._rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in TABLES}
+        self._batches: dict[str, list[pa.RecordBatch]] = {name: [] for name in TABLES}
+        self._frames = 0
         self._flushed = 0.0
         self._next = 0
         self._counts = {"frames": 0, "parts": 0}
@@ -107,9 +111,10 @@ class Parquet(Sink):
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
             raise StageError(problem)
-        # Now, and not in the middle of the run, when the first part is written.
-        import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
+        # Now, and not in the middle of the run; the first array imports pandas, where that is installed.
+        import pyarrow.parquet  # type: ignore[import-untyped]
 
+        pyarrow.array([0])
         try:
             for name in TABLES:
                 make_folder(self._folder / name)
@@ -137,8 +142,11 @@ class Parquet(Sink):
         message = orjson.loads(encode_message(result, detail=True))
         for name, rows in _rows(message).items():
             self._rows[name].extend(rows)
-        due = time.monotonic() - self._flushed >= self.params.flush
-        if due or any(len(rows) >= PART_ROWS for rows in self._rows.values()):
+            if len(self._rows[name]) >= BATCH_ROWS:
+                self._convert(name)
+        self._frames += 1
+        size = sum(batch.nbytes for batches in self._batches.values() for batch in batches)
+        if time.monotonic() - self._flushed >= self.params.flush or size >= PART_BYTES:
             self._flush()
 
     def close(self) -> None:
@@ -164,25 +172,35 @@ class Parquet(Sink):
         numbers = (part.stem.removeprefix("part-") for part in present)
         self._next = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
 
+    def _convert(self, table: str) -> None:
+        import pyarrow as pa
+
+        rows, schema = self._rows[table], self._schemas[table]
+        if rows:
+            columns = zip(zip(*rows, strict=True), schema, strict=True)
+            arrays = [pa.array(column, field.type) for column, field in columns]
+            self._batches[table].append(pa.record_batch(arrays, schema=schema))
+        self._rows[table] = []
+
     def _flush(self) -> None:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        rows, self._rows = self._rows, {name: [] for name in TABLES}
+        count, self._frames = self._frames, 0
         self._flushed = time.monotonic()
-        count = len(rows["frames"])
         if not count or not self._schemas:
             return
         try:
             for name, schema in self._schemas.items():
-                columns = zip(*rows[name], strict=True) if rows[name] else repeat(())
-                arrays = [
-                    pa.array(column, field.type) for column, field in zip(columns, schema, strict=False)
-                ]
+                self._convert(name)
+                batches, self._batches[name] = self._batches[name], []
+                table = pa.Table.from_batches(batches, schema)
                 # Its name begins with a dot until it is complete: readers of folders leave such files out.
                 part = self._folder / name / f"part-{self._next:05d}.parquet"
+                # A folder that somebody removed is an error, not made anew.
+                part.parent.stat()
                 with completed(part) as unfinished, unfinished.open("wb") as file:
-                    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
+                    pq.write_table(table, file, compression="zstd")
                     file.flush()
                     # On the disk before it gets its name, so that a power cut leaves no empty part.
                     os.fsync(file.fileno())
