@@ -7,20 +7,21 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench.gels import GELS, left_out, measure_gels
+from tactflow.bench.gels import GELS, GelJudge, measure_gels
 from tactflow.bench.labels import (
     Label,
-    compare_decisions,
     labels_of,
     outlines_by_eye,
     touch_of,
 )
+from tactflow.bench.lockstep import TimedResult
 from tactflow.bench.pipelines import Bench
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import BenchResult
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
+from tactflow.engine.frame import Frame
 from tactflow.sim import open_scene
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Contact
@@ -83,23 +84,13 @@ def test_rest_and_touch_of_a_recording_are_read(tmp_path: Path) -> None:
 
 def test_decisions_count_only_where_something_is_known() -> None:
     touched = np.array([1, 0, 0, -1, 1, 1, 1, 1, 1, 1], np.int8)
-    late = np.array([0, 1, 0, 1, 0, 0, 0, 0, 1, 1], np.bool_)
     tally = Tally()
-    compare_decisions(tally, touched, late)
-    errors = tally.errors()
-    assert errors.pop("missed_contacts") == pytest.approx(100 * 5 / 7)
-    assert errors == {"false_contacts": 50.0}
-
-
-def test_what_is_missing_and_what_is_unknown_is_said(tmp_path: Path) -> None:
-    assert left_out(tmp_path) == [f"gels: not in {tmp_path}, left out"]
-    for name in ("mini_ball", "another"):
-        (tmp_path / "gels" / name).mkdir(parents=True)
-    (tmp_path / "gels" / "mini_ball" / "000.png").touch()
-    missing, unknown = left_out(tmp_path)
-    assert "seu_a" in missing
-    assert "mini_ball" not in missing
-    assert unknown == "gels: left out, because unknown: another"
+    judge = GelJudge(GELS[0], {}, touched, tally)
+    for found in (0, 1, 0, 1, 0, 0, 0, 0, 1, 1):
+        frame = Frame("main", 5, 0.0, np.zeros((4, 4, 3), np.uint8))
+        judge.add(TimedResult(frame, {"contact": contact(SQUARE)} if found else {}))
+    judge.finish()
+    assert tally.errors() == {"false_contacts": 50.0, "missed_contacts": pytest.approx(100 * 5 / 7)}
 
 
 def test_simulated_balls_in_the_place_of_real_ones_are_measured_against_their_circles(tmp_path: Path) -> None:

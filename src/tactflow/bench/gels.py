@@ -16,22 +16,18 @@ from numpy.typing import NDArray
 
 from tactflow.bench.labels import (
     Label,
-    compare_decisions,
     labels_of,
     outlines_by_eye,
     touch_of,
 )
 from tactflow.bench.lockstep import TimedResult, on_recording, with_params
-from tactflow.bench.pipelines import PIPELINE, Bench, Judge
+from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import RECORDING
 from tactflow.engine.graph import Pipeline
 
 FOLDER = "gels"
 """Where the recordings of gels are, in the folder of recordings."""
-
-OUTLINES = "outlines by eye"
-"""Name of the recording that stands for the outlines of all gels together."""
 
 _VIDEOS = (".avi", ".mp4", ".m4v", ".gif")
 _PICTURES = (".png", ".jpg")
@@ -44,7 +40,7 @@ class Gel:
     folder : a video, several, or a folder of pictures. sensor : what it is. dots : counted by eye; 0 for a
     gel without, None where nobody counted.
     rest : so many first frames show the untouched gel. touched : from this frame on it is touched, or None.
-    frames : only so many first frames are used, or None for all. every : one recording of so many is used.
+    every : one recording of so many is used.
     chosen : whether constants were chosen on it; the others are the test.
     """
 
@@ -54,7 +50,6 @@ class Gel:
     downsample: int = 1
     rest: int = 0
     touched: int | None = None
-    frames: int | None = None
     every: int = 1
     chosen: bool = False
 
@@ -97,62 +92,36 @@ GELS = (
     Gel("purdue_apple_grasping", "Purdue wedge, begins in contact", 126),
     Gel("jar_8_06_1", "home-made gel in a jar", 0, 2, rest=1, touched=1),
     Gel("jar_7_31_2", "home-made gel in a jar", 0, 2, rest=1, touched=1),
-    Gel("fingervision", "FingerVision, transparent skin", 26, frames=60),
+    Gel("fingervision", "FingerVision, transparent skin", 26),
 )
 """Half of the sensors are for choosing constants, the others for reporting what comes of it."""
-
-
-def present(data: Path) -> list[Gel]:
-    """The known recordings that are in a folder of recordings."""
-    return [gel for gel in GELS if gel.sources(data / FOLDER)]
-
-
-def left_out(data: Path) -> list[str]:
-    """In words: which recordings are missing from a folder of recordings, and which are unknown."""
-    if not (data / FOLDER).is_dir():
-        return [f"{FOLDER}: not in {data}, left out"]
-    here, known = {gel.folder for gel in present(data)}, {gel.folder for gel in GELS}
-    missing = [gel.folder for gel in GELS if gel.folder not in here]
-    unknown = sorted(
-        path.name for path in (data / FOLDER).iterdir() if path.is_dir() and path.name not in known
-    )
-    return [
-        f"{FOLDER}: left out, because {why}: {', '.join(names)}"
-        for why, names in (("missing", missing), ("unknown", unknown))
-        if names
-    ]
 
 
 def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pipeline], data: Path) -> None:
     """Measure every recording of a gel that is known here and in the folder.
 
-    For a gel without dots, also what the pipeline for dots takes for such; and all outlines together.
+    For a gel without dots, also what the pipeline for dots takes for such.
 
     marked, bare : name and pipeline for gels with dots, and for gels without. data : folder of recordings.
     """
     drawn = outlines_by_eye(data / FOLDER)
-    together = Tally()
-    for gel in present(data):
+    for gel in GELS:
+        sources, scene = gel.sources(data / FOLDER), RECORDING + gel.folder
+        if not sources:
+            continue
         # No other preprocessing than making the picture smaller.
         dotted, plain = (
             with_params(pipeline, "preprocess", rotate=0, downsample=gel.downsample)
             for pipeline in (marked[1], bare[1])
         )
         ready = {bare[0]: plain} if gel.dots == 0 else {marked[0]: dotted}
-        sources, scene = gel.sources(data / FOLDER), RECORDING + gel.folder
         parts = []
         for source in sources:
             labels = labels_of(source, data / FOLDER, gel.downsample, drawn)
             parts.append((source, partial(GelJudge, gel, labels, touch_of(source, data / FOLDER))))
-        (tally,) = bench.measure(ready, scene, parts).values()
-        if not {"label_distance_p50", "line_angle_p50"} & set(tally.values):
-            for key in ("outline_iou_p50", "outline_iou_min"):
-                together.values[key] += tally.values[key]
+        bench.measure(ready, scene, parts)
         if gel.dots == 0:
             bench.measure_refusal(marked[0], on_recording(dotted, sources[0]), scene)
-    if errors := together.errors():
-        count = len(together.values["outline_iou_p50"])
-        bench.result.add(PIPELINE, marked[0], RECORDING + OUTLINES, errors, frames=count)
 
 
 class GelJudge(Judge):
@@ -177,15 +146,11 @@ class GelJudge(Judge):
             self.worst.add(label.compare(self.tally, contact, shape), result, label.mask(shape))
         return "idle" if contact is None else "contact"
 
-    def is_over(self) -> bool:
-        """Whether enough frames were seen."""
-        return self._gel.frames is not None and len(self._found) >= self._gel.frames
-
     def finish(self) -> None:
         """Compare the decisions and the number of dots with what is known of the whole recording."""
         found, counted = np.array(self._found, np.bool_), self._gel.dots
         touched = self._gel.known(len(found)) if self._touch is None else self._touch[: len(found)]
-        compare_decisions(self.tally, touched, found)
+        self.tally.percent(false_contacts=found[touched == 0], missed_contacts=~found[touched == 1])
         if counted and self._dots is not None:
             self.tally.add(
                 dots_found=100.0 * min(self._dots, counted) / counted,

@@ -108,11 +108,3 @@ def _label(entry: Mapping[str, Any]) -> Label:
     # Their angle is that of image coordinates, y down.
     flanks = (np.asarray(entry["rect1"], np.float64), np.asarray(entry["rect2"], np.float64))
     return Label(flanks, angle=-float(entry["line_angle"]))
-
-
-def compare_decisions(tally: Tally, touched: NDArray[np.int8], found: NDArray[np.bool_]) -> None:
-    """Compare the decisions on a recording with what is known.
-
-    touched : (N,): 1 touched, 0 at rest, -1 unknown. found : (N,), whether a contact was found.
-    """
-    tally.percent(false_contacts=found[touched == 0], missed_contacts=~found[touched == 1])

@@ -42,10 +42,6 @@ class Judge:
     def finish(self) -> None:
         """Compare what can be compared only when the recording is over."""
 
-    def is_over(self) -> bool:
-        """Whether no more frames are wanted."""
-        return False
-
 
 @dataclass(frozen=True, slots=True)
 class Bench:
@@ -87,11 +83,8 @@ class Bench:
                 judges[name].frames += 1
                 return judges[name].add(found)
 
-            def is_over(judges: Mapping[str, Judge] = judges) -> bool:
-                return all(judge.is_over() for judge in judges.values())
-
             ready = {name: on_recording(pipeline, path) for name, pipeline in pipelines.items()}
-            measured, failed = take_turns(ready, see, unit=self.unit, late=is_over)
+            measured, failed = take_turns(ready, see, unit=self.unit)
             failures.update(failed)
             for name, judge in judges.items():
                 judge.finish()

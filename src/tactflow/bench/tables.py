@@ -9,7 +9,7 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from tactflow.bench.gels import GELS, OUTLINES
+from tactflow.bench.gels import GELS
 from tactflow.bench.pipelines import CLASSIC, PIPELINE
 from tactflow.bench.quantities import QUANTITIES, format_number
 from tactflow.bench.results import RECORDING, TIMES, BenchResult, Measurement
@@ -120,7 +120,7 @@ def _scenes(result: BenchResult) -> Section:
 
 def _recordings(result: BenchResult) -> Iterator[Section]:
     """One row for each recording of the Wedge and each pipeline."""
-    gels = {RECORDING + gel.folder for gel in GELS} | {RECORDING + OUTLINES}
+    gels = {RECORDING + gel.folder for gel in GELS}
     rows = []
     for m in result.measured:
         if m.scene.startswith(RECORDING) and m.scene not in gels:
@@ -147,10 +147,6 @@ def _gels(result: BenchResult) -> Iterator[Section]:
         half = "chosen on" if gel.chosen else "test"
         frames = f"{m.values['frames']:g}"
         rows.append([gel.folder, gel.sensor, half, frames, dots, *_cells(m, GEL_COLUMNS.values())])
-    rows += [
-        [OUTLINES, "", "", f"{m.values['frames']:g}", "", *_cells(m, GEL_COLUMNS.values())]
-        for m in by_scene.get(OUTLINES, [])
-    ]
     if rows:
         text = (
             "With the settings as they are shipped, but for `rotate: 0` and a `downsample` of 1 or 2. "

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tactflow.bench.gels import left_out
 from tactflow.bench.pipelines import CLASSIC
 from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import load_errors, regressions
@@ -98,8 +97,6 @@ def run(args: argparse.Namespace) -> int:
     _write(args.write_baseline, result.save_errors)
     _write(args.html, lambda path: write_bench_report(result, path))
     _write(args.markdown, lambda path: write_markdown(found, path))
-    for line in left_out(args.data) if args.data is not None else ():
-        say(f"tactflow: --data: {line}")
     if stored is None:
         return 0
     worse = regressions(result, stored, scenes)
