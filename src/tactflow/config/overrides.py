@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+from pydantic_core import to_jsonable_python
 
 from tactflow.config.document import Document, Keys, parse_value
 from tactflow.engine.errors import ConfigError
@@ -55,6 +55,7 @@ def _part(settings: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 def as_yaml(value: Any) -> str:
     """A value as `--set` takes it: JSON, which is YAML too.
 
+    >>> import numpy as np
     >>> from pathlib import Path
     >>> as_yaml({"path": Path("out/a.jsonl"), "rate": np.float32(0.5), "size": np.arange(2)})
     '{"path": "out/a.jsonl", "rate": 0.5, "size": [0, 1]}'
@@ -69,19 +70,16 @@ def plain(value: Any) -> Any:
     ------
     ConfigError : a text, such as the name of a file, that UTF-8 cannot write.
 
+    >>> import numpy as np
     >>> plain({"size": (1, np.float32(0.5))})
     {'size': [1, 0.5]}
     """
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    value = value if isinstance(value, str | int | float | None) else str(value)
-    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
-        raise ConfigError(f"{value!r} is not UTF-8; rename the file")
-    return value
+    result = to_jsonable_python(value, fallback=lambda part: getattr(part, "tolist", part.__str__)())
+    try:
+        json.dumps(result, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{value!r} is not UTF-8; rename the file") from None
+    return result
 
 
 def apply(document: Document, override: Override | str, base: Keys = ()) -> None:

@@ -58,7 +58,7 @@ class Progress:
 
 
 class Runner:
-    """One run of a pipeline.
+    """One run of a pipeline; what sinks may ask of it is documented in `tactflow.engine.control.Control`.
 
     pipeline : validated. max_frames : stop after so many captured frames. check : check arrays against
     their port types, and hand inputs over read-only, in every tick. trace : filled with what each thread
@@ -152,7 +152,6 @@ class Runner:
         return RunResult(0, None, stats)
 
     def stop(self, reason: str = "signal") -> None:
-        """End the run soon: no more frames are captured, those under way are finished. From any thread."""
         with self._lock:
             self._end = self._end or reason
             self._hurried = self._hurried or reason != "max_frames"
@@ -174,12 +173,10 @@ class Runner:
         self.stop(f"error: {error}")
 
     def retake_reference(self) -> None:
-        """Take the next frames as a new reference. From any thread."""
         if self._source is not None:
             self._source.retake()
 
     def pause(self, paused: bool) -> None:
-        """Hold capturing, or go on. A recording waits; a live source's frames are let go. From any thread."""
         with self._turn:
             self._paused = paused
             self._steps = 0
@@ -187,23 +184,20 @@ class Runner:
 
     @property
     def paused(self) -> bool:
-        """Whether capturing is held."""
         return self._paused
 
     @property
     def hurried(self) -> bool:
-        """Whether the run was told to end before its source did, or has failed."""
         return self._hurried
 
     def step(self) -> None:
-        """While paused, let one frame through; steps that wait are forgotten at the end. From any thread."""
+        # Steps that wait are forgotten when it goes on.
         with self._turn:
             self._steps += self._paused
             self._turn.notify_all()
 
     @property
     def source(self) -> Source | None:
-        """The instance of the source stage, once it is built."""
         return self._source
 
     def calls(self) -> dict[str, int]:
@@ -211,7 +205,6 @@ class Runner:
         return {name: segment.calls for name, segment in list(self._segments.items()) if segment.at_work}
 
     def recorder(self) -> Recorder | None:
-        """The first sink that can be told to record, or None."""
         sinks = [node.sink for node in list(self.nodes.values())]
         return next((sink for sink in sinks if isinstance(sink, Recorder)), None)
 
@@ -423,7 +416,6 @@ class Runner:
         return max((link.drops for link in links), default=0), missed
 
     def snapshot(self) -> dict[str, Any]:
-        """The statistics so far. From any thread."""
         # A sink may ask while others are still being opened.
         nodes = list(self.nodes.values())
         dropped, missed = self._dropped()
