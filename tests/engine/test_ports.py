@@ -144,72 +144,51 @@ def test_a_source_gives_the_port_frame(annotation: Any) -> None:
     assert (ports.inputs, ports.outputs) == ((), (Port("frame", Frame),))
 
 
-class SourceOfNumbers:
-    def frames(self) -> Iterator[int]: ...
+class Broken:
+    """Methods whose annotations break the contract."""
 
+    def numbers(self) -> Iterator[int]: ...
 
-class StageWithTick:
-    def process(self, tick: Tick) -> Contact: ...
+    def tick(self, tick: Tick) -> Contact: ...
 
+    def bare_result(self, result): ...  # type: ignore[no-untyped-def]
 
-class SinkWithBareResult:
-    def write(self, result): ...  # type: ignore[no-untyped-def]
+    def by_name(self, *, gain: Flow) -> Contact: ...
 
+    def no_input(self) -> Contact: ...
 
-class StageByName:
-    def process(self, *, gain: Flow) -> Contact: ...
+    def no_return(self, image: Image): ...  # type: ignore[no-untyped-def]
 
+    def default(self, image: Image, gain: float = 1.0) -> Contact: ...
 
-class StageWithoutInputs:
-    def process(self) -> Contact: ...
+    def hidden_name(self, ellipse: Ellipse) -> Contact: ...
 
+    def bare_input(self, image: NDArray[np.uint8]) -> Contact: ...
 
-class StageWithoutReturn:
-    def process(self, image: Image): ...  # type: ignore[no-untyped-def]
-
-
-class StageWithDefault:
-    def process(self, image: Image, gain: float = 1.0) -> Contact: ...
-
-
-class StageWithHiddenName:
-    def process(self, ellipse: Ellipse) -> Contact: ...
-
-
-class StageWithBareInput:
-    def process(self, image: NDArray[np.uint8]) -> Contact: ...
-
-
-class StageWithAbsentInput:
-    def process(self, contact: Contact | Absent) -> Flow: ...
+    def absent_input(self, contact: Contact | Absent) -> Flow: ...
 
 
 @pytest.mark.parametrize(
-    ("cls", "method", "words"),
+    ("function", "method", "words"),
     [
-        (SourceOfNumbers, "frames", r"must be Iterator\[Frame\]"),
-        (StageWithTick, "process", "only a sink may take a result"),
-        (SinkWithBareResult, "write", "result has no annotation; .* is annotated result: Result"),
-        (StageByName, "process", "gain: an input is passed by position"),
-        (StageWithoutInputs, "process", "needs at least one input"),
-        (StageWithoutReturn, "process", "no return annotation"),
-        (StageWithDefault, "process", "gain has a default"),
-        (
-            StageWithHiddenName,
-            "process",
-            "the annotations of process use Ellipse, which is not known when the program runs",
-        ),
-        (StageWithBareInput, "process", "image: a bare array"),
-        (StageWithAbsentInput, "process", r"annotated X \| None"),
+        (Broken.numbers, "frames", r"must be Iterator\[Frame\]"),
+        (Broken.tick, "process", "only a sink may take a result"),
+        (Broken.bare_result, "write", "result has no annotation; .* is annotated result: Result"),
+        (Broken.by_name, "process", "gain: an input is passed by position"),
+        (Broken.no_input, "process", "needs at least one input"),
+        (Broken.no_return, "process", "no return annotation"),
+        (Broken.default, "process", "gain has a default"),
+        (Broken.hidden_name, "process", "use Ellipse, which is not known when the program runs"),
+        (Broken.bare_input, "process", "image: a bare array"),
+        (Broken.absent_input, "process", r"annotated X \| None"),
     ],
 )
 def test_annotations_that_break_the_contract_are_reported_with_their_line(
-    cls: type, method: str, words: str
+    function: Any, method: str, words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words) as caught:
-        read_ports(cls, method)
-    line = getattr(cls, method).__code__.co_firstlineno
-    assert str(caught.value).startswith(f"{__file__}:{line}: {cls.__name__}.{method}: ")
+        read_ports(type("Stage", (), {method: function}), method)
+    assert str(caught.value).startswith(f"{__file__}:{function.__code__.co_firstlineno}: Stage.{method}: ")
 
 
 @pytest.mark.parametrize(
