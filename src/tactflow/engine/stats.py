@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass, field
 from itertools import accumulate
+from math import ceil, exp, log
 from typing import Any
 
 _BINS_PER_E = 50
@@ -16,6 +16,8 @@ _SMALLEST = 1e-7
 _BINS = 26 * _BINS_PER_E
 """Shortest duration that is resolved, s, and the number of bins from there on: 26 factors of e, 5 h."""
 
+_OFFSET = -log(_SMALLEST) * _BINS_PER_E
+
 
 class Durations:
     """A histogram of durations with bins of equal ratio; quantiles are good to 1 %.
@@ -23,22 +25,25 @@ class Durations:
     Covers 0.1 us to about 5 h; shorter and longer ones count in the outermost bins. Any thread may
     add and ask.
 
-    count : how many were counted. total : their sum, s.
+    total : their sum, s.
     """
 
     def __init__(self) -> None:
-        self.count = 0
         self.total = 0.0
         self._bins = [0] * _BINS
         self._lock = threading.Lock()
 
     def add(self, seconds: float) -> None:
         """Count one duration, s."""
-        index = int(math.log(seconds / _SMALLEST) * _BINS_PER_E) if seconds > _SMALLEST else 0
+        index = int(log(seconds) * _BINS_PER_E + _OFFSET) if seconds > _SMALLEST else 0
         with self._lock:
             self._bins[index if index < _BINS else -1] += 1
-            self.count += 1
             self.total += seconds
+
+    @property
+    def count(self) -> int:
+        """How many were counted."""
+        return sum(self._bins)
 
     def quantile(self, q: float) -> float | None:
         """The duration that a share `q` in [0, 1] does not exceed, s; None when nothing was counted."""
@@ -46,8 +51,8 @@ class Durations:
             counts = list(accumulate(self._bins))
         if not counts[-1]:
             return None
-        index = bisect_left(counts, max(1, math.ceil(q * counts[-1])))
-        return _SMALLEST * math.exp((index + 0.5) / _BINS_PER_E)
+        index = bisect_left(counts, max(1, ceil(q * counts[-1])))
+        return _SMALLEST * exp((index + 0.5) / _BINS_PER_E)
 
     def milliseconds(self, q: float) -> float | None:
         """`quantile` in ms, rounded to 4 digits after the point."""
