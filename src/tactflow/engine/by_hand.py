@@ -29,24 +29,19 @@ def with_frames_made(process: Callable[..., Any], inputs: Sequence[Port]) -> Cal
     >>> with_frames_made(process, [Port("frame", Frame)])(np.zeros((4, 6, 3), np.uint8))
     (4, 6, 3)
     """
-    names = [port.name for port in inputs if port.annotation is not Frame]
     frame = next((port.name for port in inputs if port.annotation is Frame), None)
     if frame is None:
         return process
+    names = [port.name for port in inputs if port.name != frame] or [frame]
     numbers = count()
 
     @wraps(process)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if frame in kwargs or any(isinstance(value, Frame) for value in args):
+        values = dict(zip(names, args, strict=False)) | kwargs
+        if len(args) > len(names) or any(isinstance(value, Frame) for value in values.values()):
             return process(*args, **kwargs)
-        pictures = [value for value in (*args, *kwargs.values()) if isinstance(value, np.ndarray)]
+        picture = next((value for value in values.values() if isinstance(value, np.ndarray)), NO_PICTURE)
         seq = next(numbers)
-        kwargs[frame] = Frame("main", seq, seq / FPS, pictures[0] if pictures else NO_PICTURE)
-        if names:
-            kwargs |= dict(zip(names, args, strict=False))
-            args = args[len(names) :]
-        else:
-            args = args[1:]
-        return process(*args, **kwargs)
+        return process(**values | {frame: Frame("main", seq, seq / FPS, picture)})
 
     return call

@@ -124,7 +124,7 @@ class Segment:
         began = perf_counter()
         if track is not None:
             for link in self.inputs:
-                track.arrives(link.name, tick.index, began)
+                track.arrow("f", link.name, tick.index, began)
         self._execute(tick)
         self._forward(tick)
         if track is not None:
@@ -237,7 +237,7 @@ class Segment:
         for link, only_sinks in self.outputs:
             if only_sinks is None or not only_sinks.isdisjoint(tick.demand):
                 if self.track is not None:
-                    self.track.leaves(link.name, tick.index)
+                    self.track.arrow("s", link.name, tick.index, perf_counter())
                 link.put(tick, keep=tick.frame.reference)
 
     def _next_tick(self) -> TickState | None:

@@ -10,7 +10,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Literal
 
 KEPT = 300_000
 """Events kept per thread, the newest: some five minutes of the shipped pipeline at 60 Hz, about 100 MB."""
@@ -33,15 +33,9 @@ class Track:
         """A slice from `began` to `ended`, s. args : shown when it is selected."""
         self.events.append(("X", name, began, {"dur": round((ended - began) * 1e6, 3), "args": args}))
 
-    def leaves(self, link: str, tick: int) -> None:
-        """A frame is handed to a link, now: an arrow starts."""
-        arrow = {"cat": "frame", "id": f"{link} {tick}"}
-        self.events.append(("s", "frame", time.perf_counter(), arrow))
-
-    def arrives(self, link: str, tick: int, when: float) -> None:
-        """A frame has come out of a link: its arrow ends. `when`, s, lies in the slice of that frame."""
-        arrow = {"cat": "frame", "id": f"{link} {tick}", "bp": "e"}
-        self.events.append(("f", "frame", when, arrow))
+    def arrow(self, end: Literal["s", "f"], link: str, tick: int, when: float) -> None:
+        """Start or finish the arrow of a frame through a link; `when`, s, lies in the slice of that frame."""
+        self.events.append((end, "frame", when, {"cat": "frame", "id": f"{link} {tick}", "bp": "e"}))
 
 
 class Trace:
