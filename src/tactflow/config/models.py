@@ -1,7 +1,7 @@
 """What a pipeline file may say, apart from the parameters of its stages and sinks.
 
 From these models come both the checks of a file and its JSON Schema. What depends on several parts of a file
-(wiring, gates, sensors) is checked in code beside them.
+(wiring, gates, sensors) is checked elsewhere in this package.
 """
 
 from __future__ import annotations
@@ -112,13 +112,13 @@ _USE = (
 
 
 class StageEntry(Entry):
-    """A stage of a pipeline, beside its parameters."""
+    """A stage of a pipeline, besides its parameters."""
 
     use: str = Field("", description=_USE.format("stage"))
 
 
 class SinkEntry(Entry):
-    """A sink of a pipeline, beside its parameters."""
+    """A sink of a pipeline, besides its parameters."""
 
     use: str = Field("", description=_USE.format("sink"))
     max_rate: float | None = Field(

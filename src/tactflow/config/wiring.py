@@ -86,8 +86,8 @@ def ordered(drafts: Sequence[Draft], document: Document) -> list[Draft]:
 
 def _report_cycle(members: Sequence[Draft], document: Document) -> None:
     steps = []
-    for user, giver in zip(members, [*members[1:], members[0]], strict=True):
-        steps.append(next((user, ref, mark) for ref, mark in user.edges if ref.node == giver.id))
+    for user, producer in zip(members, [*members[1:], members[0]], strict=True):
+        steps.append(next((user, ref, mark) for ref, mark in user.edges if ref.node == producer.id))
     steps.reverse()
     start = min(range(len(steps)), key=lambda index: (steps[index][2].line, steps[index][2].column))
     steps = steps[start:] + steps[:start]
@@ -162,18 +162,18 @@ class _Wiring:
             ref = self._nearest(text, user)
             if ref is not None:
                 return ref
-        giver = self._by_id.get(stage)
-        if giver is None:
+        producer = self._by_id.get(stage)
+        if producer is None:
             # An unknown signal may come from a stage that could not be found.
             if self._complete or dot or not by_port:
                 document.report(place, self._unknown(text, user, by_port))
-        elif giver.section == "sinks":
+        elif producer.section == "sinks":
             document.report(place, f"{stage} is a sink and gives nothing")
-        elif giver.component is not None:
-            outputs = list(giver.outputs)
+        elif producer.component is not None:
+            outputs = list(producer.outputs)
             if dot and port not in outputs:
                 hint = did_you_mean(port, outputs, "it gives ")
-                document.report(place, f"{stage} ({giver.mark}) has no output {port!r}{hint}")
+                document.report(place, f"{stage} ({producer.mark}) has no output {port!r}{hint}")
             elif not dot and len(outputs) > 1:
                 refs = ", ".join(f"{stage}.{name}" for name in outputs)
                 document.report(place, f"{stage} has several outputs; name one of {refs}")
@@ -209,25 +209,25 @@ class _Wiring:
         return kind if isinstance(kind, SignalPort) else None
 
     def _check_type(self, ref: Ref, port: Port, mark: Mark, place: Keys) -> None:
-        giver = self._by_id[ref.node]
-        output = giver.outputs[ref.port]
+        producer = self._by_id[ref.node]
+        output = producer.outputs[ref.port]
         reason = mismatch(output, port)
         if reason is not None:
             self._document.report_at(
                 mark,
                 f"{dotted(place)}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} "
-                f"({giver.mark}) gives {describe_type(output.annotation)}: {reason}",
+                f"({producer.mark}) gives {describe_type(output.annotation)}: {reason}",
             )
 
     def _dangling(self, port: Port, user: Draft) -> str:
         where = "" if user.section == "sinks" else " above"
-        given = [f"{name} ({draft.id})" for draft in reversed(self._above(user)) for name in draft.outputs]
+        outputs = [f"{name} ({draft.id})" for draft in reversed(self._above(user)) for name in draft.outputs]
         text = f"needs {port.name}, but no stage{where} gives it"
         below = next((draft for draft in self._stages if port.name in draft.outputs), None)
         if below is not None and below is not user:
             text += f"; {below.id} gives it but stands below: move it up, or write in: "
             return text + f"{{{port.name}: {below.id}.{port.name}}}"
-        text += f"; there are {', '.join(given)}" if given else "; there are none"
+        text += f"; there are {', '.join(outputs)}" if outputs else "; there are none"
         makers = [c.name for c in catalogue()[0] if port.name in (output.name for output in c.ports.outputs)]
         if makers:
             return text + f"; it comes from the stage {' or '.join(makers)}"
@@ -239,19 +239,21 @@ class _Wiring:
             return
         signal = self._signal(ref)
         if signal is None:
-            giver = self._by_id[ref.node]
-            kind = describe_type(giver.outputs[ref.port].annotation)
+            producer = self._by_id[ref.node]
+            kind = describe_type(producer.outputs[ref.port].annotation)
             needed = "a gate takes a signal (a bool port such as touching)"
-            self._document.report(place, f"{needed}, but {ref} ({giver.mark}) gives {kind}")
+            self._document.report(place, f"{needed}, but {ref} ({producer.mark}) gives {kind}")
             return
         draft.gates.append((ref, self._meaning(ref, signal)))
         draft.edges.append((ref, self._document.mark(*place)))
 
     def _meaning(self, ref: Ref, signal: SignalPort, visited: Sequence[str] = ()) -> SignalPort:
         """The signal that defines what a closed gate means: behind a stage that holds one, the held one."""
-        giver = self._by_id[ref.node]
-        for source in giver.inputs.values() if signal.closed is None and giver.id not in visited else ():
+        producer = self._by_id[ref.node]
+        for source in (
+            producer.inputs.values() if signal.closed is None and producer.id not in visited else ()
+        ):
             held = self._signal(source) if source else None
             if source and held:
-                return self._meaning(source, held, [*visited, giver.id])
+                return self._meaning(source, held, [*visited, producer.id])
         return signal

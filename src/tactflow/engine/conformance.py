@@ -18,7 +18,7 @@ METHODS: dict[Kind, str] = {"source": "frames", "stage": "process", "sink": "wri
 """The method whose annotations are the ports."""
 
 OFFERED = ("sensor", "directory", "skipping", "control", "calibration")
-"""What a constructor may ask for beside `params`."""
+"""What a constructor may ask for besides `params`."""
 
 
 def kind_of(cls: type[Any]) -> Kind | None:
@@ -60,8 +60,8 @@ def build(cls: type[Any], params: StageParams, offered: Mapping[str, Any]) -> Pa
 def _problems(cls: type[Part], kind: Kind, reserved: Collection[str]) -> Iterator[str]:
     method = METHODS[kind]
     if getattr(cls, method, None) is getattr(BASES[kind], method, None):
-        made = "which yields its frames" if kind == "source" else "whose annotations are its ports"
-        yield f": a {kind} has a method {method}(), {made}"
+        role = "which yields its frames" if kind == "source" else "whose annotations are its ports"
+        yield f": a {kind} has a method {method}(), {role}"
     params: Any = cls.Params
     if not (inspect.isclass(params) and issubclass(params, StageParams)):
         yield ".Params must be a subclass of tactflow.StageParams"

@@ -181,7 +181,7 @@ class Sink(Part):
 
     Its inputs are read from the annotations of `write`, which every sink defines and which returns nothing:
     single ports as for a stage, or a result, which has the frame, the ports that its class names, and the
-    reasons of what is missing; `tick: Tick` is the frame and the ports named beside it.
+    reasons of what is missing; `tick: Tick` is the frame and the ports that are named next to it.
 
     >>> from tactflow import Result
     >>> class Print(Sink):
@@ -241,7 +241,7 @@ class Sink(Part):
     def binds(cls, params: Any) -> Mapping[str, str]:  # noqa: ARG003 (for sinks that listen)
         """The addresses that it takes for itself alone: parameter -> address; not those of `publishes`.
 
-        Several sensors with one address are refused. An address whose port is free to choose is none.
+        Several sensors with one address are refused. An address that picks a free port is left out.
         """
         return {}
 

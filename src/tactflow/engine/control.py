@@ -27,7 +27,7 @@ class Control(Protocol):
 
     @property
     def hurried(self) -> bool:
-        """Whether the run was told to end before its source did: nobody waits for a slow reader any more."""
+        """Whether the run was asked to end before its source did: slow readers are no longer waited for."""
 
     def step(self) -> None:
         """While paused, let one frame through."""

@@ -181,14 +181,14 @@ def _segment_names(nodes: Sequence[Node]) -> dict[str, str]:
 
 
 def _ancestors(name: str, before: Mapping[str, Iterable[str]]) -> set[str]:
-    seen: set[str] = set()
+    ancestors: set[str] = set()
     pending = list(before[name])
     while pending:
-        other = pending.pop()
-        if other not in seen:
-            seen.add(other)
-            pending.extend(before[other])
-    return seen
+        ancestor = pending.pop()
+        if ancestor not in ancestors:
+            ancestors.add(ancestor)
+            pending.extend(before[ancestor])
+    return ancestors
 
 
 def _circles(

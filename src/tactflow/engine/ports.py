@@ -111,17 +111,17 @@ def mismatch(output: Port, input_: Port) -> str | None:
     Classes must be the same or a subclass. Arrays must agree in rank, in each dimension (an exact size fits a
     named one), in dtype and in unit. A signal fits any signal and a plain bool.
     """
-    given, wanted = port_type(output.annotation), port_type(input_.annotation)
+    offered, wanted = port_type(output.annotation), port_type(input_.annotation)
     if wanted is Any or wanted is object:
         return None
-    if isinstance(given, ArrayPort) and isinstance(wanted, ArrayPort):
-        return _array_misfit(given, wanted)
-    if isinstance(given, SignalPort):
+    if isinstance(offered, ArrayPort) and isinstance(wanted, ArrayPort):
+        return _array_misfit(offered, wanted)
+    if isinstance(offered, SignalPort):
         fits = isinstance(wanted, SignalPort) or wanted is bool
-    elif inspect.isclass(given) and inspect.isclass(wanted):
-        fits = issubclass(given, wanted)
+    elif inspect.isclass(offered) and inspect.isclass(wanted):
+        fits = issubclass(offered, wanted)
     else:
-        fits = given == wanted
+        fits = offered == wanted
     return None if fits else "the types differ"
 
 
@@ -261,15 +261,15 @@ def _members(annotation: Any) -> tuple[Any, ...]:
     return get_args(annotation) if is_union else (annotation,)
 
 
-def _array_misfit(given: ArrayPort, wanted: ArrayPort) -> str | None:
-    if len(given.shape) != len(wanted.shape):
-        return f"{len(given.shape)} axes where {len(wanted.shape)} are wanted"
-    for have, want in zip(given.shape, wanted.shape, strict=True):
+def _array_misfit(offered: ArrayPort, wanted: ArrayPort) -> str | None:
+    if len(offered.shape) != len(wanted.shape):
+        return f"{len(offered.shape)} axes where {len(wanted.shape)} are wanted"
+    for have, want in zip(offered.shape, wanted.shape, strict=True):
         # An exact size is a case of a named one, but a named size need not be the exact one.
         if have != want and not (isinstance(want, str) and isinstance(have, int)):
             return f"axis of size {have} where {want} is wanted"
-    if given.dtype != wanted.dtype:
-        return f"dtype {given.dtype} where {wanted.dtype} is wanted"
-    if given.unit != wanted.unit:
-        return f"unit '{given.unit}' where '{wanted.unit}' is wanted"
+    if offered.dtype != wanted.dtype:
+        return f"dtype {offered.dtype} where {wanted.dtype} is wanted"
+    if offered.unit != wanted.unit:
+        return f"unit '{offered.unit}' where '{wanted.unit}' is wanted"
     return None

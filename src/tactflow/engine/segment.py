@@ -284,7 +284,7 @@ def _of(mine: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode
 def _roots(run: Runner, mine: Mapping[str, RunningNode]) -> list[tuple[RunningNode, frozenset[str] | None]]:
     """Sinks, stages that remember, and what other segments take; each with the sinks that need it, or None.
 
-    Gates of other segments are taken for open: too much may be computed, never too little.
+    Gates of other segments are assumed to be open: too much may be computed, never too little.
     """
     pipeline = run.plan.pipeline
     needs = demand(pipeline)
