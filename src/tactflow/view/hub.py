@@ -124,8 +124,8 @@ class Hub:
         self.shown: frozenset[str] = frozenset()
         """Layers of `ON_DEMAND` shown by at least one page."""
         self.pages: set[Page] = set()
-        self._any_page = asyncio.Event()
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self.loop: asyncio.AbstractEventLoop | None = None
+        """The event loop that serves the pages."""
         self._latest: Packet | None = None
         self._number = 0
         self._sent = 0
@@ -143,10 +143,6 @@ class Hub:
 
     # -- from other threads -------------------------------------------------------------------------------
 
-    def attach(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Set the event loop that serves the pages."""
-        self._loop = loop
-
     def publish(self, header: bytes, pixels: bytes, captured: float) -> None:
         """Offer a frame to every page; never blocks.
 
@@ -161,8 +157,8 @@ class Hub:
         # A little-endian length, the JSON header, the heights and the picture.
         data = struct.pack("<I", len(header)) + header + pixels
         packet = Packet(self._number, data, captured, time.perf_counter())
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._take, packet)
+        if self.loop is not None and not self.loop.is_closed():
+            self.loop.call_soon_threadsafe(self._take, packet)
 
     def counters(self) -> dict[str, int]:
         """Statistics: open `pages`, frames `sent` to all pages, and quantiles of the time from capture to
@@ -184,7 +180,6 @@ class Hub:
         if self._latest is not None and not self._fresh(self._latest):
             self._latest = None
         self.pages.add(page)
-        self._any_page.set()
         self._recount()
         page.wake.set()
         sender = asyncio.create_task(self._send(page))
@@ -194,8 +189,6 @@ class Hub:
         finally:
             self.pages.discard(page)
             self._recount()
-            if not self.pages:
-                self._any_page.clear()
             for task in (sender, reader):
                 task.cancel()
             await asyncio.gather(sender, reader, return_exceptions=True)
@@ -203,7 +196,6 @@ class Hub:
     async def report(self) -> None:
         """Send the statistics of the run periodically while pages are open."""
         while True:
-            await self._any_page.wait()
             self.post_stats()
             await asyncio.sleep(STATS_SECONDS)
 

@@ -90,8 +90,7 @@ class Server:
             self._ready.set()
 
     async def _serve(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        self.hub.attach(self._loop)
+        self._loop = self.hub.loop = asyncio.get_running_loop()
         connections: WeakSet[ServerConnection] = WeakSet()
 
         def connect(*words: Any, **named: Any) -> ServerConnection:
