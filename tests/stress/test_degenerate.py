@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from tactflow.drawing.results import Annotator
 from tactflow.vision.change import ChangeProbe
 from tactflow.vision.flow import flow_in_mask
-from tactflow.vision.markers.detection import NoMarkersError
+from tactflow.vision.markers.detection import NoMarkersError, detect_markers
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 from tactflow.vision.types import Markers
 from tests.stress.builders import (
@@ -62,6 +66,25 @@ def test_every_pair_of_degenerate_pictures_has_a_defined_answer(method: str, sha
             assert (answer.shape, answer.dtype) == (image.shape, np.uint8)
         else:
             assert_mask(answer, shape)
+
+
+ANY_PICTURE = arrays.arrays(np.uint8, st.tuples(st.integers(1, 20), st.integers(1, 20), st.just(3)))
+
+
+@settings(max_examples=60, derandomize=True, deadline=None, database=None)
+@given(ANY_PICTURE, st.sampled_from(DIFFERENCES), st.data())
+def test_any_pair_of_pictures_has_a_mask_and_marks_within_it_or_none(
+    reference: Image, method: str, data: st.DataObject
+) -> None:
+    contact = detector(method, reference)
+    assert not contact.detect(reference).touching
+    result = contact.detect(data.draw(arrays.arrays(np.uint8, reference.shape)))
+    assert_defined(result.strength)
+    assert_mask(result.mask, reference.shape[:2])
+    with suppress(NoMarkersError):
+        centers = detect_markers(reference).centers
+        assert (centers > -1).all()
+        assert (centers < reference.shape[1::-1]).all()
 
 
 @pytest.mark.parametrize("name", PICTURES)
