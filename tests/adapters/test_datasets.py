@@ -51,7 +51,7 @@ def test_an_array_gives_its_frames_and_its_times(name: str, tmp_path: Path) -> N
     path = KINDS[name](tmp_path / name, frames=IMAGES, rgb=IMAGES[..., ::-1], seconds=seconds, ns=whole)
     expected = {
         "dataset=/gel/frames": [0, 1 / 30, 2 / 30, 3 / 30, 4 / 30],
-        "dataset=gel/frames&times=gel/seconds": [0.0, 0.5, 0.5, 2.0, 3.0],
+        "dataset=gel/frames&times=gel/seconds": [0.0, 0.5, 0.25, 2.0, 3.0],
         "dataset=/gel/rgb&order=rgb&times=/gel/ns": [0.0, 0.04, 0.08, 0.12, 0.16],
     }
     for query, times in expected.items():

@@ -96,7 +96,7 @@ class ArrayDataset(FrameReader):
         return min(chunks * length, claimed)
 
     def _seconds(self, array: Any) -> NDArray[np.float64]:
-        """Times from 0 at the first frame, s; where they would go back, they stay."""
+        """Times from 0 at the first frame, s."""
         length = self._array.shape[0]
         if array.shape != (length,) or array.dtype.kind not in "fiu":
             raise SourceError(
@@ -104,10 +104,10 @@ class ArrayDataset(FrameReader):
             )
         times = np.asarray(array[: self.total])
         # Whole numbers are subtracted before they are rounded: Unix time in ns has 19 digits.
-        seconds = (times - times[:1]) / (1e9 if array.dtype.kind in "iu" else 1.0)
+        seconds: NDArray[np.float64] = (times - times[:1]) / (1e9 if array.dtype.kind in "iu" else 1.0)
         if not np.isfinite(seconds).all():
             raise SourceError(f"{self.name}: required finite times")
-        return np.maximum.accumulate(seconds)
+        return seconds
 
 
 class _Hdf5:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_pixel_count, damaged, log, require
+from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
 from tactflow.sources.files import decode_image
 from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
@@ -54,7 +54,7 @@ class Bag(FrameReader):
     """The pictures of one topic.
 
     A frame's time is the stamp in its message, or, where that is 0, when it was recorded; from 0 at the first
-    frame. Where it would go back, it stays.
+    frame.
 
     spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder. directory : as for
     `open_source`. Raises SourceError if there is no such file or topic (it lists those that are there), or a
@@ -84,19 +84,13 @@ class Bag(FrameReader):
         to_image = _decoder(self._type)
         assert to_image is not None
         first: int | None = None
-        t, went_back = 0.0, False
         for written, message in self._store.messages(self._topic):
             image = to_image(message, self.name)
             if image is None:
                 continue
             taken = _stamp(message) or written
             first = taken if first is None else first
-            seconds = (taken - first) / 1e9
-            if seconds < t and not went_back:
-                went_back = True
-                log.warning("%s: time goes back %.3f s after the beginning; it is held there", self.name, t)
-            t = max(t, seconds)
-            yield image, t
+            yield image, (taken - first) / 1e9
 
     def close(self) -> None:
         """Close the file."""
