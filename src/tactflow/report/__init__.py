@@ -47,15 +47,13 @@ class Table:
 class Section:
     """A heading followed by text, pictures and tables.
 
-    text : paragraphs, separated by empty lines. pictures : from `picture`. folded : collapse to the heading
-    until clicked.
+    text : paragraphs, separated by empty lines. pictures : from `picture`.
     """
 
     title: str
     text: str = ""
     pictures: Sequence[Html] = ()
     tables: Sequence[Table] = ()
-    folded: bool = False
 
 
 def write_report(path: Path, title: str, sections: Iterable[Section], text: str = "") -> Path:
@@ -148,8 +146,6 @@ def _svg(drawing: Figure) -> str:
 def _section(section: Section) -> str:
     body = _paragraphs(section.text) + f'<div class="pictures">{"".join(section.pictures)}</div>'
     body += "".join(_table(table) for table in section.tables)
-    if section.folded:
-        return f"<details><summary>{escape(section.title)}</summary>{body}</details>"
     return f"<section><h2>{escape(section.title)}</h2>{body}</section>"
 
 
