@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import jsonschema
@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactflow.engine.frame import Frame, Tick
-from tactflow.message.result import encode_message
+from tactflow.message.result import Result, encode_message
 from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, MarkerStatus, Scale
@@ -292,3 +292,28 @@ def test_a_calibrated_message_has_millimetres_and_with_detail_their_errors() -> 
     assert detailed["flow"]["mean_mm_stderr"] == pytest.approx(
         [math.hypot(1.21 * 0.001, 0.1 * 0.1), math.hypot(0.33 * 0.004, 0.2 * 0.2)]
     )
+
+
+def test_a_message_is_read_back_as_the_result_it_was_made_of() -> None:
+    depth = Depth(np.zeros((400, 300), np.float32), 0.75, 0.03, 4.5, None)
+    results = Results(
+        PROCESSED,
+        replace(CONTACT, separate=(CONTACT, replace(CONTACT, ellipse=None))),
+        *(FLOW, MARKERS, Scale(0.1, 0.2, (0.0, 0.0), (5.0, 9.0)), depth),
+        force=Force((None, 0.5, 2.5), (None, 0.1, 0.2), True),
+    )
+    sent = result_of(Tick(TICK.frame, skipped={"flow": "unchanged"}), results)
+    read = Result.from_message(encode_message(sent, detail=True))
+    assert (read.sensor, read.seq, read.t, read.size) == ("main", 36, 1.2, (300, 400))
+    assert read.contact is not None
+    np.testing.assert_equal(asdict(read.contact), asdict(sent.contact))
+    np.testing.assert_equal(asdict(read.markers), asdict(sent.markers))
+    assert (read.flow, read.force, read.skipped) == (sent.flow, sent.force, sent.skipped)
+    assert read.depth is not None
+    assert (read.depth.greatest, read.depth.volume, read.depth.volume_stderr) == (0.75, 4.5, None)
+
+
+@pytest.mark.parametrize("change", [{"size": [math.inf, 1]}, {"seq": "1"}, {"skipped": []}, {"contact": {}}])
+def test_what_is_no_message_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"required a message tactflow\.frame/1"):
+        Result.from_message(build_message(TICK, Results(PROCESSED)) | change)

@@ -148,7 +148,7 @@ class Result(Tick):
             width, height = parsed.get("size", (0, 0))
             result._size = int(width), int(height)
             result._message = parsed
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise ValueError(f"required a message {SCHEMA}: {type(error).__name__}: {error}") from None
         return result
 
