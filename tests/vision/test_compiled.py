@@ -105,7 +105,7 @@ def test_a_kernel_refuses_types_that_its_signature_does_not_name() -> None:
 def test_what_was_compiled_once_is_read_from_disk_without_a_word(folder: Path) -> None:
     first, second = run(folder), run(folder)
     assert first.stdout == f"3 3 {RESULTS}"
-    assert first.stderr.startswith("tactflow: compiling loops for this processor, once; 2 are left\n")
+    assert first.stderr.startswith("tactflow: compiling loops for this processor, once: 1 of 3 are done\n")
     assert (second.stdout, second.stderr) == (f"3 0 {RESULTS}", "")
 
 

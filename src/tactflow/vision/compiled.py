@@ -52,6 +52,9 @@ _OPTIONS: Final = {
 _SAY_EVERY_S: Final = 2.0
 """Seconds between two messages about progress. Chosen by hand."""
 
+_BAR: Final = 24
+"""Length of the progress bar, characters."""
+
 _kernels: list[Kernel[..., Any]] = []
 _said_at = -_SAY_EVERY_S
 
@@ -192,8 +195,16 @@ def load(*, backwards: bool = False) -> tuple[int, int]:
 
 
 def _say_progress(left: int) -> None:
-    """Say on standard error that loops are being compiled, and how many are left."""
+    """Say on standard error that loops are being compiled, and how many are left: by a bar on a terminal."""
     global _said_at
-    if left and time.monotonic() - _said_at >= _SAY_EVERY_S:
+    total = len(_kernels)
+    done, text = total - left, "tactflow: compiling loops for this processor, once"
+    if sys.stderr.isatty():
+        bar = "#" * (_BAR * done // total)
+        print(f"\r{text} [{bar.ljust(_BAR)}] {done} of {total}", end="", file=sys.stderr, flush=True)
+        if not left:
+            # Erase the line: it was for those who waited.
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    elif left and time.monotonic() - _said_at >= _SAY_EVERY_S:
         _said_at = time.monotonic()
-        print(f"tactflow: compiling loops for this processor, once; {left} are left", file=sys.stderr)
+        print(f"{text}: {done} of {total} are done", file=sys.stderr)
