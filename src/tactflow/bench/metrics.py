@@ -44,7 +44,7 @@ def mask_iou(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
 def filled_polygons(polygons: Sequence[NDArray[Any]], shape: tuple[int, int]) -> NDArray[np.uint8]:
     """(H, W) uint8: 255 inside any of the polygons (N, 2), px. shape : (H, W)."""
     mask = np.zeros(shape, np.uint8)
-    for polygon in polygons:
+    for polygon in filter(len, polygons):
         cv2.fillPoly(mask, [np.rint(polygon).astype(np.int32)], (255,))
     return mask
 

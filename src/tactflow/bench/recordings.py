@@ -40,9 +40,8 @@ def measure_presses(bench: Bench, pipelines: Mapping[str, Pipeline], folder: Pat
         name: with_params(pipeline, "preprocess", homography=RECTIFY) for name, pipeline in pipelines.items()
     }
     files, labels = labelled_presses(folder)
-    bench.measure(
-        ready, f"{RECORDING}wedge_ball", [(stack(files, bench.scratch), partial(PressJudge, labels))]
-    )
+    ball = [(stack(files, bench.scratch), partial(PressJudge, labels))]
+    bench.measure(ready, f"{RECORDING}wedge_ball", ball)
 
 
 def check(data: Path) -> None:

@@ -165,12 +165,9 @@ class PipelineScore(Judge):
             if result.contact_mask is not None:
                 add_mask(self.tally, result.contact_mask, truth)
         if deep and truth.touching:
-            overlap = (
-                0.0
-                if contact is None
-                else metrics.polygon_iou(contact.hull, truth.hull, truth.contact_mask.shape)
-            )
-            self.worst.add(overlap, result, truth.contact_mask)
+            mask = truth.contact_mask
+            overlap = 0.0 if contact is None else metrics.polygon_iou(contact.hull, truth.hull, mask.shape)
+            self.worst.add(overlap, result, mask)
         if result.markers is not None:
             self._markers.add(result.markers, truth)
         add_flow(self.tally, result.flow, truth)
