@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -66,7 +65,7 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
     supervisor = Supervisor()
     with ending_handled(supervisor.count_signal), ExitStack() as stack:
         # The path of a local socket has 107 bytes at most (Linux), and TMPDIR may be longer.
-        short = "/tmp" if os.path.isdir("/tmp") else None
+        short = None if len(tempfile.gettempdir()) < 40 else "/tmp"
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-", dir=short)))
         for group in shared:
             upstream = [_private(scratch, sensor, node) for sensor, node in group.sinks]
