@@ -26,6 +26,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.engine.frame import Frame
+from tactflow.message.result import Result
+from tactflow.view.compact import encode_packet
+from tactflow.vision.types import Contact, Ellipse, Flow, Markers
 from tests import clock
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: playwright is not installed")
@@ -429,44 +433,22 @@ def staged() -> Iterator[Callable[..., Stage]]:
 
 def frame(sensor: str, number: int, colour: int, *, contact: bool = False, directed: bool = False) -> bytes:
     """A frame as the view sends it."""
-    image = np.full((40, 60, 3), colour, np.uint8)
-    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
-    points = [[10.0, 10.0], [30.0, 10.0], [50.0, 20.0]]
-    message: dict[str, Any] = {
-        "schema": "tactflow.frame/1",
-        "sensor": sensor,
-        "seq": number,
-        "t": number / 30,
-        "size": [60, 40],
-        "contact": None,
-        "flow": None,
-        "markers": None,
-        "skipped": {},
-    }
-    markers = {
-        "origin": [round(10 * value) for point in points for value in point],
-        "position": [round(10 * value) for x, y in points for value in (x + 3, y + 2)],
-        "status": "til",
+    origin = np.array([[10.0, 10], [30, 10], [50, 20]])
+    values: dict[str, Any] = {
+        "markers": Markers(
+            origin, origin + np.array([3, 2]), np.arange(3, dtype=np.uint8), np.full(3, np.nan)
+        )
     }
     if contact:
-        message["contact"] = {
-            "area": 300.0,
-            "center": [30.0, 20.0],
-            "angle": None,
-            "slope": None,
-            "hull": [[20.0, 10.0], [40.0, 10.0], [30.0, 30.0]],
-            "ellipse": None,
-            "confidence": 0.0,
-        }
-        message["flow"] = {"mean": None, "count": 0}
-    if directed:
-        message["contact"] |= {
-            "angle": -30.0,
-            "ellipse": {"center": [30.0, 20.0], "axes": [30.0, 12.0], "angle": -30.0},
-        }
-        message["flow"] = {"mean": [4.0, -2.0], "count": 3, "rotation": None}
-    described = {"latency_ms": 3.0, "epoch": 0, "message": message, "markers": markers, "number": number}
-    header = json.dumps(described).encode()
+        hull = np.array([[20.0, 10], [40, 10], [30, 30]])
+        ellipse = Ellipse((30.0, 20.0), (30.0, 12.0), -30.0) if directed else None
+        angle = -30.0 if directed else None
+        values["contact"] = Contact(300.0, (30.0, 20.0), angle, None, hull, ellipse)
+        values["flow"] = Flow((4.0, -2.0), 3) if directed else Flow(None, 0)
+    result = Result(Frame(sensor, number, number / 30, np.full((40, 60, 3), colour, np.uint8)), values, {})
+    options: dict[str, Any] = {"latency_ms": 3.0, "guide": None, "quality": 95, "max_size": 1280}
+    header, jpeg = encode_packet(result, None, (), **options)
+    header += b',"number":%d}' % number
     return struct.pack("<I", len(header)) + header + jpeg
 
 
