@@ -65,7 +65,7 @@ def surroundings(mask: Bytes, whole: Window, relative: float = MARGIN) -> Surrou
     x, y, width, height = contact[:4]
     margin = max(LEAST_MARGIN, round(relative * math.sqrt(contact.moments().principal[1])))
     left, right = max(0, x // 2 - margin), min((x + width + 1) // 2 + margin, whole.right)
-    # Rows of such a length are transformed in up to a third of the time.
+    # Rows of such a length are transformed in a third of the time.
     columns = min(cv2.getOptimalDFTSize(right - left), whole.right)
     left = min(left, whole.right - columns)
     top, bottom = max(0, y // 2 - margin), min((y + height + 1) // 2 + margin, whole.bottom)
