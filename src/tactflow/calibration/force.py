@@ -19,9 +19,8 @@ from tactflow.calibration.file import ForceEntry, LinearForceEntry
 from tactflow.calibration.reference import Reference, nonnegative, time_offset
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
+from tactflow.vision.arrays import Floats
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, Seen, seen, total_change
-
-Double = NDArray[np.float64]
 
 NEEDED: Final = {"contact": "hull", "untouched": "untouched", "scale": "scale"}
 """Ports that a pipeline must have -> the stage that gives them; heights need `depth`, shear a flow."""
@@ -45,9 +44,9 @@ class Watched:
     change_at_rest : see `ForceModel`.
     """
 
-    frames: Double
-    times: Double
-    press: dict[str, Double]
+    frames: Floats
+    times: Floats
+    press: dict[str, Floats]
     drag: dict[str, NDArray[np.complex128]]
     touched: NDArray[np.bool_]
     change_at_rest: float
@@ -112,9 +111,9 @@ class Aligned:
 
     name: str
     offset: float
-    press: Double
+    press: Floats
     drag: NDArray[np.complex128]
-    force: Double
+    force: Floats
     presses: NDArray[np.intp]
 
 
@@ -232,7 +231,7 @@ def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Referen
 
 
 def _learn(
-    names: Sequence[str], features: Double, force: Double, groups: NDArray[np.intp]
+    names: Sequence[str], features: Floats, force: Floats, groups: NDArray[np.intp]
 ) -> LinearForceEntry:
     """Fit one component. features : (n, k). force : (n,). groups : (n,), left out in turn."""
     # Features differ by orders of magnitude.
@@ -255,7 +254,7 @@ def _learn(
     )
 
 
-def _error(residual: Double, force: Double) -> tuple[float, float]:
+def _error(residual: Floats, force: Floats) -> tuple[float, float]:
     """The absolute and the relative part of the standard error that make the residuals (n,) most likely.
 
     force : (n,), N, at which they were made.

@@ -27,12 +27,11 @@ from numpy.typing import NDArray
 from tactflow.calibration.file import PhotometricEntry
 from tactflow.calibration.presses import Press, Session, usual_radius
 from tactflow.engine.errors import ConfigError
+from tactflow.vision.arrays import Floats
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
 from tactflow.vision.depth.surface import Rest, Surface, colour_change
 from tactflow.vision.depth.surroundings import Window, surroundings
 from tactflow.vision.types import Scale
-
-Double = NDArray[np.float64]
 
 FEWEST_PRESSES: Final = 8
 """Presses that a fit needs at least; 20 or more are advised. Chosen by hand."""
@@ -86,9 +85,9 @@ class Photometry:
 
     model: SlopeModel
     found: PhotometricEntry
-    centers: Double
+    centers: Floats
     kept: NDArray[np.bool_]
-    misfit: Double
+    misfit: Floats
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -100,26 +99,26 @@ class _Sample:
     ball_radius : mm.
     """
 
-    x: Double
-    y: Double
+    x: Floats
+    y: Floats
     terms: NDArray[np.float32]
     hidden: NDArray[np.bool_]
     inner: NDArray[np.bool_]
-    start: Double
+    start: Floats
     reach: float
     window: Window
     ball_radius: float
 
-    def on_ball(self, center: Double) -> NDArray[np.bool_]:
+    def on_ball(self, center: Floats) -> NDArray[np.bool_]:
         """(m,): visible pixels where the surface is a ball with this centre."""
         near = np.hypot(self.x - center[0], self.y - center[1]) < self.reach
         return np.asarray(near & ~self.hidden)
 
-    def normals(self, weights: Double, chosen: NDArray[np.bool_]) -> Double:
+    def normals(self, weights: Floats, chosen: NDArray[np.bool_]) -> Floats:
         """(k, 2): horizontal part of the normals at some pixels, by the fit."""
         return np.asarray(self.terms[chosen] @ weights.T.astype(np.float32), np.float64)
 
-    def center(self, start: Double, weights: Double) -> Double:
+    def center(self, start: Floats, weights: Floats) -> Floats:
         """(2,), mm: the median of where pixels of the press say that the middle of the ball is."""
         center = start
         for _ in range(TURNS):
@@ -130,7 +129,7 @@ class _Sample:
             center = np.median(places - self.ball_radius * self.normals(weights, ball), axis=0)
         return center
 
-    def misfit(self, center: Double, weights: Double) -> float:
+    def misfit(self, center: Floats, weights: Floats) -> float:
         """Mean angle between the normals of the press and those of the ball, degrees; 180 if it has none."""
         ball = self.on_ball(center)
         if not ball.any():
@@ -264,7 +263,7 @@ def _prepare(
     )
 
 
-def _fitting(misfit: Double) -> NDArray[np.bool_]:
+def _fitting(misfit: Floats) -> NDArray[np.bool_]:
     """(n,): which presses fit about as well as the others."""
     from scipy.stats import median_abs_deviation
 
@@ -272,7 +271,7 @@ def _fitting(misfit: Double) -> NDArray[np.bool_]:
     return np.asarray(misfit <= np.median(misfit) + OUTLIER * max(scatter, LEAST_SCATTER))
 
 
-def _fit(samples: Sequence[_Sample], chosen: NDArray[np.intp]) -> tuple[Double, Double]:
+def _fit(samples: Sequence[_Sample], chosen: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Coefficients (2, 114), and the centres (n, 2), mm, of all samples, from the chosen ones."""
     centers = np.array([sample.start for sample in samples])
     for turn in range(TURNS):
@@ -283,7 +282,7 @@ def _fit(samples: Sequence[_Sample], chosen: NDArray[np.intp]) -> tuple[Double, 
     return weights, centers
 
 
-def _solve(presses: Sequence[tuple[_Sample, Double]]) -> tuple[Double, Double]:
+def _solve(presses: Sequence[tuple[_Sample, Floats]]) -> tuple[Floats, Floats]:
     """Coefficients (2, 114) for given centres, and how far all of these lie off in common, (2,) mm.
 
     The second comes from a constant beside the terms: where no change of colour would have a slope.
@@ -310,7 +309,7 @@ def _solve(presses: Sequence[tuple[_Sample, Double]]) -> tuple[Double, Double]:
     return solved[:, :count], ball_radius * solved[:, count]
 
 
-def _roundness(terms: NDArray[np.float32], dx: Double, dy: Double) -> Double:
+def _roundness(terms: NDArray[np.float32], dx: Floats, dy: Floats) -> Floats:
     """(228, 228): quadratic form that is 0 for normals which point to the middle, the same all around."""
     distance = np.hypot(dx, dy)
     ux, uy = ((part / distance).astype(np.float32)[:, None] for part in (dx, dy))
@@ -328,7 +327,7 @@ def _roundness(terms: NDArray[np.float32], dx: Double, dy: Double) -> Double:
     return np.asarray(across.T @ across + along.T @ along, np.float64)
 
 
-def _upright(flat: Double) -> Double:
+def _upright(flat: Floats) -> Floats:
     """(m, 3): unit normals from their horizontal parts (m, 2); longer ones than 1 lie flat."""
     flat = flat / np.maximum(np.hypot(flat[:, 0], flat[:, 1]), 1)[:, None]
     return np.concatenate([flat, np.sqrt(np.maximum(1 - (flat**2).sum(axis=1, keepdims=True), 0))], axis=1)
@@ -357,7 +356,7 @@ def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDAr
     return whole[window.part]
 
 
-def _errors(sample: _Sample, weights: Double, heights: NDArray[np.float32]) -> list[float]:
+def _errors(sample: _Sample, weights: Floats, heights: NDArray[np.float32]) -> list[float]:
     """Of one press: mean angle, relative error of the radius, RMS from the sphere, of depth, of volume.
 
     The depth is judged by how far the surface falls from the middle of the ball to the rim of the contact,
@@ -394,7 +393,7 @@ def _summary(tried: Sequence[Sequence[float]]) -> dict[str, float]:
     }
 
 
-def fit_sphere(points: Double) -> tuple[float, float]:
+def fit_sphere(points: Floats) -> tuple[float, float]:
     """Radius of the sphere through points (n, 3), by linear least squares, and their RMS distance from it.
 
     >>> angle = np.linspace(0, 6, 40)
@@ -411,6 +410,6 @@ def fit_sphere(points: Double) -> tuple[float, float]:
     return radius, float(np.sqrt(np.mean(distance**2)))
 
 
-def _shaped(weights: Double) -> Double:
+def _shaped(weights: Floats) -> Floats:
     """(6, 19, 2) coefficients, as `SlopeModel` takes them, from (2, 114)."""
     return weights.reshape(2, PLACE_TERMS, COLOUR_TERMS).transpose(1, 2, 0)

@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.engine.errors import ConfigError
 from tactflow.system.files import expanded
-
-Double = NDArray[np.float64]
+from tactflow.vision.arrays import Floats
 
 NAMES: Final = {
     "t": ("t", "time", "t_s", "time_s"),
@@ -47,11 +45,11 @@ class Reference:
     """
 
     name: str
-    time: Double
+    time: Floats
     by_frame: bool
-    force: Double
+    force: Floats
 
-    def seconds(self, frames: Double, times: Double) -> Double:
+    def seconds(self, frames: Floats, times: Floats) -> Floats:
         """(N,): its time, s. frames, times : (M,) number and time of each frame that was seen, growing."""
         return np.interp(self.time, frames, times) if self.by_frame else self.time
 
@@ -161,7 +159,7 @@ def recordings_with_csv(source: str) -> dict[str, Path]:
     return pairs
 
 
-def nonnegative(features: Double, aim: Double) -> Double:
+def nonnegative(features: Floats, aim: Floats) -> Floats:
     """(k,) coefficients >= 0 of the least-squares fit aim = features @ coefficients, without a constant.
 
     features : (N, k). aim : (N,).
@@ -173,11 +171,11 @@ def nonnegative(features: Double, aim: Double) -> Double:
     from scipy.optimize import nnls
 
     # QR leaves as many rows as there are unknowns, which nnls solves at once.
-    triangle: Double = np.asarray(np.linalg.qr(np.column_stack([features, aim]), mode="r"))
+    triangle: Floats = np.asarray(np.linalg.qr(np.column_stack([features, aim]), mode="r"))
     return np.asarray(nnls(triangle[:, :-1], triangle[:, -1])[0], np.float64)
 
 
-def time_offset(reference: Reference, seconds: Double, times: Double, features: Double) -> float:
+def time_offset(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
     """By how much the time of the frames is ahead of the reference's, s.
 
     It is the shift at which the force follows the contact best, to a fraction of a frame. A gel that answers
@@ -218,7 +216,7 @@ def time_offset(reference: Reference, seconds: Double, times: Double, features: 
     return float(shifts[best] + part * step)
 
 
-def _explained(reference: Reference, seconds: Double, times: Double, features: Double) -> float:
+def _explained(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
     """Share of the force's variance that the features explain; NaN where too few frames have a force."""
     there = (times >= seconds[0]) & (times <= seconds[-1])
     touched = features.any(axis=1)

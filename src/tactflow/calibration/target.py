@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.calibration.scale import centre
+from tactflow.vision.arrays import Points
 from tactflow.vision.geometry.homography import find_homography, project
 from tactflow.vision.geometry.lens import Lens
 from tactflow.vision.types import Scale
-
-Points = NDArray[np.float64]
 
 FEWEST_VIEWS: Final = 6
 """Pictures in different poses that a lens needs at least; 10 or more are better. Chosen by hand."""

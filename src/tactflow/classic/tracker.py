@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.classic.functions import marker_center
+from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.detection import NoMarkersError
 from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.types import Markers, MarkerStatus
-
-FloatArray = NDArray[np.float64]
 
 MAX_VISITS: Final = 5000
 """Nodes that the search may visit per frame, about as many as Python visits in the original's time limit of
@@ -45,7 +44,7 @@ class Matcher:
     spacing : typical distance between neighbours, px. max_visits : see `MAX_VISITS`.
     """
 
-    def __init__(self, grid: FloatArray, spacing: float, *, max_visits: int = MAX_VISITS) -> None:
+    def __init__(self, grid: Floats, spacing: float, *, max_visits: int = MAX_VISITS) -> None:
         self._spacing = spacing
         self._max_visits = max_visits
         nodes = [(row, column) for row, column in np.argwhere(np.isfinite(grid[..., 0])).tolist()]
@@ -60,7 +59,7 @@ class Matcher:
         ]
         self._places: list[complex] = [complex(*grid[node]) for node in nodes]
 
-    def match(self, centers: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    def match(self, centers: Floats) -> tuple[Floats, NDArray[np.int64]]:
         """Search for the cheapest assignment of centres (N, 2), px, within `max_visits`.
 
         Returns
@@ -148,7 +147,7 @@ class GridTracker:
         return Markers(self._origin.copy(), position, status, np.full(len(status), np.nan))
 
 
-def grid_of(centers: FloatArray) -> tuple[FloatArray, float]:
+def grid_of(centers: Floats) -> tuple[Floats, float]:
     """Arrange centres that lie on a (bent) grid in rows and columns.
 
     Parameters

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float32]
+from tactflow.vision.arrays import Floats32
 
 COLUMNS: Final = 40
 """Cells across a picture, about. Chosen by hand: a cell is smaller than most contacts."""
@@ -62,7 +62,7 @@ class Look(NamedTuple):
     """What is kept of a frame: light : (h, w, channels) float32, logarithm of the mean of each cell. seen :
     the same shape, bool, whether it is neither black nor saturated."""
 
-    light: Float
+    light: Floats32
     seen: NDArray[np.bool_]
 
 
@@ -86,7 +86,7 @@ def look_at(frame: NDArray[np.uint8]) -> Look:
     return Look(light, clipped < CLIPPED)
 
 
-def change_between(before: Look, after: Look) -> tuple[Float, bool]:
+def change_between(before: Look, after: Look) -> tuple[Floats32, bool]:
     """How the light changed from one frame to another, and whether anything else did.
 
     Returns the logarithm of each channel's gain, (channels,) float32: the median over the picture, which an
@@ -122,7 +122,7 @@ def unevenness(look: Look) -> float:
 
 
 @lru_cache(maxsize=4)
-def _polynomials(high: int, wide: int) -> Float:
+def _polynomials(high: int, wide: int) -> Floats32:
     """(high * wide, terms): powers of x and y up to the degree `SMOOTH`."""
     y, x = np.meshgrid(np.linspace(-1, 1, high), np.linspace(-1, 1, wide), indexing="ij")
     terms = [x**i * y**j for i in range(SMOOTH + 1) for j in range(SMOOTH + 1 - i)]
@@ -151,7 +151,7 @@ class Settling:
     def __init__(self) -> None:
         self._looks: list[Look] = []
         self._times: list[float] = []
-        self._gains: list[Float] = []
+        self._gains: list[Floats32] = []
         self._states: list[list[int]] = []
 
     def __len__(self) -> int:
@@ -281,7 +281,7 @@ class Settling:
         steps = np.square(np.diff(gains, axis=0)).sum(axis=0)
         return bool(np.all((np.ptp(gains, axis=0) < STEADY) | (steps > UNRELATED * scatter)))
 
-    def _level(self, state: list[int]) -> tuple[Float, Float]:
+    def _level(self, state: list[int]) -> tuple[Floats32, Floats32]:
         """Where the light of a state ends, and how far from there it is still the same: (channels,) each."""
         gains = np.array([self._gains[i] for i in state[-self._calm :]])
         level = np.median(gains, axis=0)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.contact.background_kernels import (
     change_strength,
     scaled_change,
@@ -25,8 +26,6 @@ from tactflow.vision.contact.illumination import IlluminationModel, positions, u
 from tactflow.vision.contact.response import EVEN, light_response
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
-
-Float = NDArray[np.float32]
 
 CELL: Final = 4
 """Side of a cell, px: averages 16 pixels, so that noise of 2 grey levels is half a level."""
@@ -65,10 +64,10 @@ class Change(NamedTuple):
 
     whole: NDArray[np.uint8]
     half: NDArray[np.uint8]
-    illumination: Float
-    squared: Float
-    colour: Float
-    evidence: Float
+    illumination: Floats32
+    squared: Floats32
+    colour: Floats32
+    evidence: Floats32
     largest: float
     largest_colour: float
     remaining: float
@@ -82,9 +81,9 @@ class _Untouched:
     that is left out, as `scaled_change` takes it.
     """
 
-    mean: Float
-    scale: Float
-    pattern: Float
+    mean: Floats32
+    scale: Floats32
+    pattern: Floats32
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +95,10 @@ class _Derived:
     """
 
     illumination: IlluminationModel
-    mean: Float
-    weight: Float
-    brightness: Float
-    colour_factor: Float
+    mean: Floats32
+    weight: Floats32
+    brightness: Floats32
+    colour_factor: Floats32
 
 
 class BackgroundModel:
@@ -136,7 +135,7 @@ class BackgroundModel:
     ) -> None:
         whole, half = _halves(image)
         self._pictures = {1: _planes(whole), 2: _planes(half)}
-        self._mean: Float = _smoothed(half)
+        self._mean: Floats32 = _smoothed(half)
         self._squares = np.zeros_like(self._mean)
         self._noise = _spatial_noise(halved(half))
         self._gel = _gel_cells(half, valid)
@@ -151,7 +150,7 @@ class BackgroundModel:
         whole, half = _halves(image)
         smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
-        change: Float = smooth - under_illumination(known.mean, coefficients)
+        change: Floats32 = smooth - under_illumination(known.mean, coefficients)
         count = self._frames
         self._squares = self._squares + change * change * np.float32(count / (count + 1))
         self._mean = self._mean + change / np.float32(count + 1)
@@ -163,7 +162,7 @@ class BackgroundModel:
         self._untouched.clear()
 
     def compare(
-        self, image: NDArray[np.uint8], before: NDArray[np.bool_] | None, evidence_before: Float | None
+        self, image: NDArray[np.uint8], before: NDArray[np.bool_] | None, evidence_before: Floats32 | None
     ) -> Change:
         """How a frame of the same size differs.
 
@@ -286,12 +285,12 @@ class BackgroundModel:
         return {1: _Untouched(*map(_interleaved, whole)), 2: _Untouched(*map(_interleaved, half))}
 
 
-def _interleaved(planes: Float) -> Float:
+def _interleaved(planes: Floats32) -> Floats32:
     """(h, 3 w) float32 of (3, h, w)."""
     return np.ascontiguousarray(planes.transpose(1, 2, 0), np.float32).reshape(planes.shape[1], -1)
 
 
-def _cut_by_border(peaks: Float, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
+def _cut_by_border(peaks: Floats32, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
     """Whether a contact, not only what is left of its change further out, reaches the picture's border.
 
     peaks : (5,), of the window's change, from `scaled_change`. rows, columns : the window, cells. shape : of
@@ -305,12 +304,12 @@ def _cut_by_border(peaks: Float, rows: slice, columns: slice, shape: tuple[int, 
     )
 
 
-def _planes(picture: NDArray[np.uint8]) -> Float:
+def _planes(picture: NDArray[np.uint8]) -> Floats32:
     """(3, h, w) float32 of (h, w, 3)."""
     return np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32)
 
 
-def _smoothed(half: NDArray[np.uint8]) -> Float:
+def _smoothed(half: NDArray[np.uint8]) -> Floats32:
     """(3, h, w) float32: means over 3 x 3 cells of a picture at half resolution, (2 h, 2 w, 3)."""
     high, wide = half.shape[:2]
     planes = np.empty((3, high // 2, wide // 2), np.float32)
@@ -338,12 +337,12 @@ def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDAr
     return None if gel.all() else np.asarray(gel)
 
 
-def _steepness(planes: Float) -> Float:
+def _steepness(planes: Floats32) -> Floats32:
     """Grey levels per cell by which the brightness changes, here or in the cells around; (3, h, w)."""
     return np.stack([_length_around(*_gradient(plane)) for plane in planes])
 
 
-def _steepness_of_pattern(planes: Float) -> tuple[Float, Float]:
+def _steepness_of_pattern(planes: Floats32) -> tuple[Floats32, Floats32]:
     """Grey levels per cell by which all channels change in proportion, and those by which each does beside.
 
     As `_steepness`.
@@ -358,19 +357,19 @@ def _steepness_of_pattern(planes: Float) -> tuple[Float, Float]:
     return planes * _length_around(across, down), np.stack(apart)
 
 
-def _gradient(plane: Float) -> tuple[Float, Float]:
+def _gradient(plane: Floats32) -> tuple[Floats32, Floats32]:
     """Changes per cell along x and y, (h, w) each."""
     across = cv2.Scharr(plane, cv2.CV_32F, 1, 0, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
     down = cv2.Scharr(plane, cv2.CV_32F, 0, 1, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(across, np.float32), np.asarray(down, np.float32)
 
 
-def _length_around(across: Float, down: Float) -> Float:
+def _length_around(across: Floats32, down: Floats32) -> Floats32:
     """(h, w): the largest length of a gradient, here or in the cells around."""
     return np.asarray(cv2.dilate(cv2.magnitude(across, down), np.ones((3, 3), np.uint8)), np.float32)
 
 
-def _spatial_noise(picture: NDArray[np.uint8]) -> Float:
+def _spatial_noise(picture: NDArray[np.uint8]) -> Floats32:
     """Standard deviation of smoothed cells guessed from one frame, as a function of brightness: (3, h, w).
 
     Second differences of neighbouring cells see the noise and hardly the shading; their median is not moved
@@ -395,7 +394,7 @@ def _spatial_noise(picture: NDArray[np.uint8]) -> Float:
     return np.asarray(np.hypot(noise, QUANTISATION) * (NOISE_CORRELATION / 3), np.float32)
 
 
-def _fine_noise(planes: Float) -> Float:
+def _fine_noise(planes: Floats32) -> Floats32:
     """Variance of smoothed pixels at half resolution, guessed from a picture (3, 2 h, 2 w): (3, 1, 1).
 
     Two pixels of a cell along one diagonal minus those along the other: noise differs between them, while

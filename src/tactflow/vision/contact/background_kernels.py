@@ -12,12 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32, Indices
 from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.contact.illumination import WHITE
 
-Float = NDArray[np.float32]
 Byte = NDArray[np.uint8]
-Index = NDArray[np.int64]
 
 BLUR_SIGMA: Final = 0.8
 """Standard deviation by which changes are smoothed, pixels of the window. Chosen by hand."""
@@ -30,7 +29,7 @@ NINTH: Final = np.float32(1 / 9)
 
 
 @kernel("void(uint8[:, ::1], float32[:, :, ::1])")
-def smooth_cells(half: Byte, smooth: Float) -> None:
+def smooth_cells(half: Byte, smooth: Floats32) -> None:
     """Means over 3 x 3 cells into the planes `smooth`, (3, h, w).
 
     half : (2 h, 6 w), a picture of which 2 x 2 pixels are a cell; their mean is rounded, as `halved` does.
@@ -70,19 +69,19 @@ def smooth_cells(half: Byte, smooth: Float) -> None:
     " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
 )
 def weigh_change(
-    smooth: Float,
-    coefficients: Float,
-    across: Float,
-    down: Float,
-    mean: Float,
-    weight: Float,
-    brightness: Float,
-    colour_factor: Float,
+    smooth: Floats32,
+    coefficients: Floats32,
+    across: Floats32,
+    down: Floats32,
+    mean: Floats32,
+    weight: Floats32,
+    brightness: Floats32,
+    colour_factor: Floats32,
     before: Byte,
-    evidence_before: Float,
-    squared: Float,
-    colour: Float,
-    evidence: Float,
+    evidence_before: Floats32,
+    squared: Floats32,
+    colour: Floats32,
+    evidence: Floats32,
 ) -> tuple[float, float, float, float]:
     """Squared deviations of each cell from the background under this frame's illumination.
 
@@ -138,16 +137,16 @@ def scaled_change(
     picture: Byte,
     top: int,
     left: int,
-    coefficients: Float,
-    across: Float,
-    down: Float,
-    mean: Float,
-    scale: Float,
-    pattern: Float,
+    coefficients: Floats32,
+    across: Floats32,
+    down: Floats32,
+    mean: Floats32,
+    scale: Floats32,
+    pattern: Floats32,
     inside: Byte,
-    blurred: Float,
-    spans: Index,
-    peaks: Float,
+    blurred: Floats32,
+    spans: Indices,
+    peaks: Floats32,
 ) -> None:
     """How a window has changed where it counts, in standard deviations, smoothed along x.
 
@@ -197,7 +196,7 @@ def scaled_change(
 
 
 @helper
-def _note_peaks(most: Float, peaks: Float) -> None:
+def _note_peaks(most: Floats32, peaks: Floats32) -> None:
     """The first and the last column's peaks and that of all, of the largest change in each column, (3 w,)."""
     for c in range(3):
         peaks[2], peaks[3] = max(peaks[2], most[c]), max(peaks[3], most[most.size - 3 + c])
@@ -206,7 +205,7 @@ def _note_peaks(most: Float, peaks: Float) -> None:
 
 
 @helper
-def _find_spans(inside: Byte, side: int, spans: Index) -> None:
+def _find_spans(inside: Byte, side: int, spans: Indices) -> None:
     """Fill `spans` as `scaled_change` does; both 0 where nothing in a row of blocks counts."""
     for row in range(len(inside)):
         first, end = 0, inside.shape[1]
@@ -218,7 +217,7 @@ def _find_spans(inside: Byte, side: int, spans: Index) -> None:
 
 
 @helper
-def _light_along(coefficients: Float, places: Float) -> Float:
+def _light_along(coefficients: Floats32, places: Floats32) -> Floats32:
     """(3, 3 w) float32: gain in the frame's middle row, its slope along y, offset; of each channel."""
     light = np.empty((3, 3 * places.size), np.float32)
     for x in range(places.size):
@@ -231,13 +230,13 @@ def _light_along(coefficients: Float, places: Float) -> Float:
 @helper
 def _scale_line(
     values: Byte,
-    mean: Float,
-    scale: Float,
-    pattern: Float,
-    light: Float,
+    mean: Floats32,
+    scale: Floats32,
+    pattern: Floats32,
+    light: Floats32,
     first: int,
     place: np.float32,
-    changes: Float,
+    changes: Floats32,
 ) -> None:
     """Fill `changes` with the change of a line from pixel `first` of the window on, standard deviations."""
     gain, slope, offset = light[0, 3 * first :], light[1, 3 * first :], light[2, 3 * first :]
@@ -255,7 +254,7 @@ def _scale_line(
 
 
 @helper
-def _neighbours(spans: Index, row: int, wide: int) -> tuple[int, int]:
+def _neighbours(spans: Indices, row: int, wide: int) -> tuple[int, int]:
     """The first pixel in the spans of a row and of those above and below, and that after the last."""
     begin, end = wide, 0
     for near in range(max(row - 1, 0), min(row + 2, len(spans))):
@@ -269,13 +268,13 @@ def _neighbours(spans: Index, row: int, wide: int) -> tuple[int, int]:
     " float32[:, ::1])",
 )
 def change_strength(
-    blurred: Float,
+    blurred: Floats32,
     inside: Byte,
-    spans: Index,
+    spans: Indices,
     gain: np.float32,
-    strongest: Float,
-    strength: Float,
-    common: Float,
+    strongest: Floats32,
+    strength: Floats32,
+    common: Floats32,
 ) -> None:
     """Smooth a change along y, and reduce its channels to one.
 

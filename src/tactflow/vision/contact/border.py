@@ -21,12 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats, Floats32, Mask
 from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.contact.filling import Region
 
-Float = NDArray[np.float32]
-Double = NDArray[np.float64]
-Mask = NDArray[np.uint8]
 Whole = NDArray[np.int32]
 
 BORDER: Final = 0.85
@@ -96,7 +94,7 @@ class RegionDepth(NamedTuple):
     outline, how many corners and steps there are so far, and how many pixels it passes.
     """
 
-    depth: Float
+    depth: Floats32
     nearest: Whole
     middle: float
     corners: Whole
@@ -122,7 +120,7 @@ def depth_of(region: Region) -> RegionDepth:
     )
 
 
-def inside_border(inner: RegionDepth, parts: Float, strength: Float, hidden: Mask | None) -> Float:
+def inside_border(inner: RegionDepth, parts: Floats32, strength: Floats32, hidden: Mask | None) -> Floats32:
     """Level set of a contact: how far inside its border each pixel is, pixels of the window.
 
     inner : of the changed region. parts : (h, w), its depth, but below 0 where it does not belong to the
@@ -146,7 +144,7 @@ def inside_border(inner: RegionDepth, parts: Float, strength: Float, hidden: Mas
 
 @helper
 def _border_depth(
-    bins: Double, least: int, middle: float, otherwise: float, at: Double, profile: Double
+    bins: Floats, least: int, middle: float, otherwise: float, at: Floats, profile: Floats
 ) -> float:
     """How deep the border lies by one profile, or `otherwise` if too little of it is known.
 
@@ -185,7 +183,7 @@ def _border_depth(
 
 
 @helper
-def _steps_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float, beside: Whole) -> None:
+def _steps_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Floats32, beside: Whole) -> None:
     """Label of a pixel outside -> 1 and the step of the outline that it is beside; `beside`, 0, is filled."""
     high, wide = parts.shape
     for outline in range(1, outlines.shape[0]):
@@ -208,7 +206,7 @@ def _steps_beside(corners: Whole, outlines: Whole, nearest: Whole, parts: Float,
 
 
 @helper
-def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, border: Double) -> float:
+def _step_depths(bins: Floats, outlines: Whole, middle: float, around: Floats, border: Floats) -> float:
     """How deep the border lies at each step along the outlines, and in the mean, which is returned.
 
     bins : (steps, n), as `border_level` fills them. around : (n,), the profile of all pixels, changed.
@@ -253,14 +251,14 @@ def _step_depths(bins: Double, outlines: Whole, middle: float, around: Double, b
     " float64, float32[:, ::1])"
 )
 def border_level(
-    parts: Float,
+    parts: Floats32,
     nearest: Whole,
     corners: Whole,
     outlines: Whole,
-    strength: Float,
+    strength: Floats32,
     hidden: Mask,
     middle: float,
-    level: Float,
+    level: Floats32,
 ) -> None:
     """What `inside_border` finds; `level` is filled.
 

@@ -11,13 +11,9 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Flags, Floats32, Mask
 from tactflow.vision.compiled import helper, kernel
-
-Float = NDArray[np.float32]
-Cells = NDArray[np.bool_]
-Mask = NDArray[np.uint8]
 
 STRAY: Final = 0.04
 """Separate changes with less of the summed squared deviation than this part of the strongest one's are no
@@ -42,12 +38,12 @@ class Component(NamedTuple):
 
     rows: slice
     columns: slice
-    inside: Cells
+    inside: Flags
     cells: int
     peak: float
 
 
-def union(components: list[Component], shape: tuple[int, ...]) -> Cells:
+def union(components: list[Component], shape: tuple[int, ...]) -> Flags:
     """(h, w) bool: cells of all components.
 
     >>> import numpy as np
@@ -62,7 +58,7 @@ def union(components: list[Component], shape: tuple[int, ...]) -> Cells:
     return cells
 
 
-def wide_change(colour: Float, extent: float) -> Cells | None:
+def wide_change(colour: Floats32, extent: float) -> Flags | None:
     """Cells of connected changes of colour that cover `extent` cells at least.
 
     colour : (h, w) float32, squared deviations. Returns (h, w) bool, or None if there is no such change.
@@ -83,7 +79,7 @@ def wide_change(colour: Float, extent: float) -> Cells | None:
 
 
 def contact_components(
-    squared: Float, weak: float, largest: float, start: float, stay: float, before: Cells | None
+    squared: Floats32, weak: float, largest: float, start: float, stay: float, before: Flags | None
 ) -> list[Component]:
     """Connected changes that are contact, the strongest first if there are several.
 
@@ -110,7 +106,7 @@ def contact_components(
     return _strongest(found, squared)
 
 
-def _several_parts(changed: Mask, squared: Float, least: int) -> list[Component]:
+def _several_parts(changed: Mask, squared: Floats32, least: int) -> list[Component]:
     """Each connected part of what has changed.
 
     least : cells of a part's bounding box, below which it is left out.
@@ -139,12 +135,12 @@ def _window(bounds: Sequence[int], shape: tuple[int, ...]) -> tuple[slice, slice
     return rows, slice(max(left - 1, 0), min(left + wide + 1, shape[1]))
 
 
-def _overlaps(component: Component, cells: Cells | None) -> bool:
+def _overlaps(component: Component, cells: Flags | None) -> bool:
     """Whether a component has any of these cells, (h, w)."""
     return cells is not None and bool((cells[component.rows, component.columns] & component.inside).any())
 
 
-def _strongest(components: list[Component], squared: Float) -> list[Component]:
+def _strongest(components: list[Component], squared: Floats32) -> list[Component]:
     """The components without stray ones, by their summed squared deviation."""
     if len(components) < 2:
         return components
@@ -154,7 +150,7 @@ def _strongest(components: list[Component], squared: Float) -> list[Component]:
 
 
 @kernel("UniTuple(int64, 5)(float32[:, ::1], float32, uint8[:, ::1])")
-def close_changes(squared: Float, weak: float, closed: Mask) -> tuple[int, int, int, int, int]:
+def close_changes(squared: Floats32, weak: float, closed: Mask) -> tuple[int, int, int, int, int]:
     """1 where `squared` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled.
 
     Returns the left and upper end, width, height and number of these cells if they are one piece without a

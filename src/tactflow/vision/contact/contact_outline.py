@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32, Mask
 from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.border import depth_of, inside_border
 from tactflow.vision.contact.components import STRAY
@@ -43,9 +44,6 @@ from tactflow.vision.contact.filling import (
     traced,
 )
 from tactflow.vision.contact.nearby import FAINT, OUTER, largest_nearby
-
-Float = NDArray[np.float32]
-Mask = NDArray[np.uint8]
 
 DIM: Final = 0.5
 """Part of `OUTER` at which a change is seen in a bay of the outline, where lights hardly reach the border.
@@ -83,11 +81,11 @@ class WindowChange:
     Both 0 where it does not belong to the contact.
     """
 
-    strength: Float
-    brightness: Float
+    strength: Floats32
+    brightness: Floats32
 
 
-def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None = None) -> Float:
+def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None = None) -> Floats32:
     """Level set of one contact's outline.
 
     Parameters
@@ -123,7 +121,7 @@ def contact_level(change: WindowChange, bridge: float = 4.0, hidden: Mask | None
     return level
 
 
-def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Float, Float | None]:
+def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Floats32, Floats32 | None]:
     """Level set of the outline; and, if there are specks, (h, w) float32, 1 near the contact, else 0.
 
     pixels : of a `Hidden`; None where nothing is hidden.
@@ -146,7 +144,7 @@ def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Fl
     "UniTuple(float64, 3)(float32[:, ::1], float32[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, ::1])",
 )
 def cut_gloss(
-    strength: Float, brightness: Float, hidden: Mask, beside: Mask, cut: Float
+    strength: Floats32, brightness: Floats32, hidden: Mask, beside: Mask, cut: Floats32
 ) -> tuple[float, float, float]:
     """Cut what is a mirror image of a lamp; returns the cap, and sums of squares of `cut` and `brightness`.
 
@@ -177,7 +175,7 @@ def cut_gloss(
     return most, squares, common
 
 
-def _sidedness(brightness: Float) -> float:
+def _sidedness(brightness: Floats32) -> float:
     """How far apart what has brightened and what has darkened are, 0..1.
 
     The distance of the centroids of both, weighted by the squared change, times twice the product of their
@@ -197,12 +195,12 @@ def _sidedness(brightness: Float) -> float:
     return 2 * share * math.hypot(*apart) / gyration
 
 
-def _typical(values: Float) -> float:
+def _typical(values: Floats32) -> float:
     """Mean of values >= 0, weighted by the values themselves."""
     return max(cv2.norm(values, cv2.NORM_L2SQR) / max(cv2.norm(values, cv2.NORM_L1), 1e-9), 1e-9)
 
 
-def _level_of_brightness(brightness: Float, hidden: Hidden | None) -> Float:
+def _level_of_brightness(brightness: Floats32, hidden: Hidden | None) -> Floats32:
     """Level set of a contact that has brightened or darkened as a whole, whichever is stronger."""
     brighter = np.clip(brightness, np.float32(0), np.float32(np.inf))
     darker = brighter - brightness
@@ -222,7 +220,9 @@ def _level_of_brightness(brightness: Float, hidden: Hidden | None) -> Float:
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
-def _level_of_slopes(strength: Float, bridge: float, hidden: Hidden | None) -> tuple[Float, Float | None]:
+def _level_of_slopes(
+    strength: Floats32, bridge: float, hidden: Hidden | None
+) -> tuple[Floats32, Floats32 | None]:
     """`_level` of a contact that shows its slopes."""
     local = strength / largest_nearby(strength)
     region, solid, specks = _sloping_region(local, strength, bridge, hidden)
@@ -242,7 +242,7 @@ def _level_of_slopes(strength: Float, bridge: float, hidden: Hidden | None) -> t
 
 
 def _sloping_region(
-    local: Float, strength: Float, bridge: float, hidden: Hidden | None
+    local: Floats32, strength: Floats32, bridge: float, hidden: Hidden | None
 ) -> tuple[Region, bool, NDArray[np.bool_] | None]:
     """What slopes enclose; whether that is one piece without bays; and (h, w), specks in it or beside it.
 
@@ -269,7 +269,7 @@ def _sloping_region(
     return region, False, specks
 
 
-def _specks(region: Region, strength: Float) -> NDArray[np.bool_] | None:
+def _specks(region: Region, strength: Floats32) -> NDArray[np.bool_] | None:
     """(h, w): separate parts of a region that hold little of the clear change; None if there are none."""
     if len(region.outlines) < 2:
         return None
@@ -281,7 +281,7 @@ def _specks(region: Region, strength: Float) -> NDArray[np.bool_] | None:
     return np.asarray(little[labels], np.bool_) if little.any() else None
 
 
-def _without_specks(level: Float, strength: Float) -> Float:
+def _without_specks(level: Floats32, strength: Floats32) -> Floats32:
     """The level, negative in specks, too."""
     specks = _specks(traced((level > 0).view(np.uint8)), strength)
     return level if specks is None else np.where(specks, -np.abs(level), level)

@@ -33,13 +33,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
 from tactflow.vision.contact.contact_outline import contact_level
 from tactflow.vision.contact.resolution import draw_level, window_mask
 
 ContactMethod = Literal["noise", "colour"]
-Float = NDArray[np.float32]
 
 CONNECTED: Final = 0.25
 """Part of the threshold, squared deviations, from which a cell belongs to a contact beside it: half the
@@ -191,7 +191,7 @@ class ContactDetector:
         self._background: BackgroundModel | None = None
         self._before: NDArray[np.bool_] | None = None
         self._strongest = self._strongest_wide = 0.0
-        self._evidence: Float | None = None
+        self._evidence: Floats32 | None = None
         self._suspected: NDArray[np.bool_] | None = None
         self._mask: NDArray[np.uint8] | None = None
         self._crowded: bool | None = None

@@ -17,9 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Mask
 from tactflow.vision.compiled import helper, kernel
-
-Mask = NDArray[np.uint8]
 
 BAY: Final = 2.5
 """A region with a bay that is deeper, pixels of the window, may be a ring with a gap. A gap that is

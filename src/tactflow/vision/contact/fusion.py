@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Mask
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
 from tactflow.vision.geometry.region import Region, measure_region
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
-
-Mask = NDArray[np.uint8]
 
 UNMOVED: Final = 6
 """Markers below a change of the light, none of which moves, from which on it is no contact; and as many

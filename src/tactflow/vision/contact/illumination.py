@@ -8,9 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.compiled import kernel
-
-Float = NDArray[np.float32]
 
 BLOCK: Final = 8
 """Side of the blocks whose means are fitted, cells. Chosen by hand."""
@@ -70,11 +69,11 @@ class IlluminationModel:
     True
     """
 
-    def __init__(self, reference: Float, variance: Float, gel: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, reference: Floats32, variance: Floats32, gel: NDArray[np.bool_] | None = None) -> None:
         height, width = reference.shape[1:]
         self._row_weights = _block_weights(max(1, height // BLOCK), height)
         self._column_weights = _block_weights(max(1, width // BLOCK), width)
-        self._center: Float = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))
+        self._center: Floats32 = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))
         relative = reference / self._center[:, None, None]
         slopes = np.stack([relative * positions(width), relative * positions(height)[:, None]], axis=1)
         terms = np.concatenate([relative[:, None], slopes, np.ones_like(relative)[:, None]], axis=1)
@@ -86,16 +85,16 @@ class IlluminationModel:
         fitted = basis * weight
         penalty = weight.sum(axis=2)[:, :, None] * np.diag(RIDGE)
         inverse = np.linalg.inv(fitted @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
-        self._basis: Float = np.ascontiguousarray(basis, np.float32)
+        self._basis: Floats32 = np.ascontiguousarray(basis, np.float32)
         brightness = self._basis[:, 0]
         lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
-        self._per_brightness: Float = np.where(lit, 1 / np.maximum(brightness, DARK), np.float32(0))
-        self._step: Float = np.ascontiguousarray(inverse @ fitted, np.float32)
-        self._shrink: Float = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
+        self._per_brightness: Floats32 = np.where(lit, 1 / np.maximum(brightness, DARK), np.float32(0))
+        self._step: Floats32 = np.ascontiguousarray(inverse @ fitted, np.float32)
+        self._shrink: Floats32 = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
-        self._limit: Float = np.float32(CLIP) * np.sqrt(self._block_means(variance))
+        self._limit: Floats32 = np.float32(CLIP) * np.sqrt(self._block_means(variance))
 
-    def fit(self, cells: Float) -> Float:
+    def fit(self, cells: Floats32) -> Floats32:
         """Coefficients of the change of illumination between the reference and a frame.
 
         cells : (3, h, w) float32, the frame's cells, grey levels.
@@ -125,13 +124,13 @@ class IlluminationModel:
         fitted = self._block_means(gel[None].astype(np.float32))[0] >= np.float32(0.5)
         return fitted if fitted.any() else None
 
-    def _block_means(self, planes: Float) -> Float:
+    def _block_means(self, planes: Floats32) -> Floats32:
         """(n, blocks) float32: means over blocks of (n, h, w) planes; a cell may belong to two in parts."""
         means = self._row_weights @ planes @ self._column_weights.T
         return np.asarray(means.reshape(len(planes), -1), np.float32)
 
 
-def under_illumination(untouched: Float, coefficients: Float) -> Float:
+def under_illumination(untouched: Floats32, coefficients: Floats32) -> Floats32:
     """The untouched gel under another illumination, grey levels up to 255: (3, h, w) float32.
 
     untouched : (3, h, w) float32, grey levels. coefficients : (3, 4) float32, from `IlluminationModel.fit`.
@@ -143,12 +142,12 @@ def under_illumination(untouched: Float, coefficients: Float) -> Float:
 
 
 @lru_cache(maxsize=16)
-def positions(count: int) -> Float:
+def positions(count: int) -> Floats32:
     """(count,) float32: places of a line's pixels, -0.5 to 0.5 across the frame; not to be written."""
     return np.linspace(-0.5, 0.5, count, dtype=np.float32)
 
 
-def _block_weights(blocks: int, count: int) -> Float:
+def _block_weights(blocks: int, count: int) -> Floats32:
     """(blocks, count) float32: weight of each of `count` pixels of a line in the mean of each block."""
     edges = np.arange(blocks + 1) * (count / blocks)
     pixels = np.arange(count)
@@ -161,15 +160,15 @@ def _block_weights(blocks: int, count: int) -> Float:
     " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
 )
 def compare_blocks(
-    cells: Float,
-    row_weights: Float,
-    column_weights: Float,
-    reference: Float,
-    per_brightness: Float,
-    usual_limit: Float,
-    excess: Float,
-    limit: Float,
-    coefficients: Float,
+    cells: Floats32,
+    row_weights: Floats32,
+    column_weights: Floats32,
+    reference: Floats32,
+    per_brightness: Floats32,
+    usual_limit: Floats32,
+    excess: Floats32,
+    limit: Floats32,
+    coefficients: Floats32,
 ) -> None:
     """What a fit starts from: `excess` and `limit`, (3, n), and gains in `coefficients`, (3, 4), are filled.
 
@@ -222,7 +221,13 @@ def compare_blocks(
     " float32[::1], float32[:, ::1])",
 )
 def fit_robustly(
-    excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, center: Float, coefficients: Float
+    excess: Floats32,
+    basis: Floats32,
+    step: Floats32,
+    shrink: Floats32,
+    limit: Floats32,
+    center: Floats32,
+    coefficients: Floats32,
 ) -> None:
     """Least-squares steps with clipped residuals; `coefficients`, (3, 4), start and result.
 

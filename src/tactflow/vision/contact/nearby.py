@@ -6,11 +6,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.compiled import kernel
-
-Float = NDArray[np.float32]
 
 OUTER: Final = 0.45
 """Fraction of the largest change nearby at which a change of slope is cut. Lower takes in more of the
@@ -22,7 +20,7 @@ FAINT: Final = 0.3
 Chosen by hand."""
 
 
-def largest_nearby(values: Float, part: float = 1.0) -> Float:
+def largest_nearby(values: Floats32, part: float = 1.0) -> Floats32:
     """(h, w): the largest value around, smoothed; no less than `FAINT` of the largest anywhere.
 
     "Around" reaches as far as the radius of a disc of as many pixels as have clearly changed, or a part of
@@ -37,7 +35,7 @@ def largest_nearby(values: Float, part: float = 1.0) -> Float:
 
 
 @kernel("Tuple((int64, float64))(float32[:, ::1], float64, float32[:, ::1])")
-def halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, float]:
+def halve_smoothed(values: Floats32, part: float, halved: Floats32) -> tuple[int, float]:
     """Means over 3 x 3 pixels, and over 2 x 2 of them.
 
     Returns how far "around" reaches, two pixels, and the least that counts.
@@ -77,7 +75,7 @@ def halve_smoothed(values: Float, part: float, halved: Float) -> tuple[int, floa
 
 
 @kernel("void(float32[:, ::1], int64, float64, float32[:, ::1])")
-def spread_largest(values: Float, reach: int, least: float, nearby: Float) -> None:
+def spread_largest(values: Floats32, reach: int, least: float, nearby: Floats32) -> None:
     """The mean, over a square, of the largest values in as large ones, interpolated to twice the resolution.
 
     values : (h, w). reach : half the side of a square. least : of what is interpolated, at least.

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32, Mask
 from tactflow.vision.compiled import kernel
-
-Float = NDArray[np.float32]
-Mask = NDArray[np.uint8]
 
 
 def window_mask(mask: Mask, top: int, left: int, inside: NDArray[np.bool_], side: int = 2) -> Mask:
@@ -36,7 +34,7 @@ def window_mask(mask: Mask, top: int, left: int, inside: NDArray[np.bool_], side
     return halved
 
 
-def draw_level(level: Float, top: int, left: int, mask: Mask, side: int = 2) -> bool:
+def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) -> bool:
     """Set to 255 the pixels of a mask where a level set, interpolated to their resolution, is positive.
 
     Returns whether there are any.
@@ -61,7 +59,7 @@ def draw_level(level: Float, top: int, left: int, mask: Mask, side: int = 2) -> 
 
 
 @kernel("boolean(float32[:, ::1], int64, int64, uint8[:, ::1])")
-def raise_mask(level: Float, top: int, left: int, mask: Mask) -> bool:
+def raise_mask(level: Floats32, top: int, left: int, mask: Mask) -> bool:
     """What `draw_level` does from half resolution."""
     high, wide = level.shape
     near, far = np.float32(0.75), np.float32(0.25)

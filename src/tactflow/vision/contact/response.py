@@ -15,9 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.compiled import helper, kernel
-
-Float = NDArray[np.float32]
 
 LARGEST_GAIN: Final = 2.0
 """By how much a weak answer is raised at most, since noise is raised with it. Chosen by hand; 3 gives the
@@ -44,14 +43,14 @@ class Response(NamedTuple):
     """
 
     gain: np.float32
-    strongest: Float
+    strongest: Floats32
 
 
 EVEN: Final = Response(np.float32(1), np.zeros(3, np.float32))
 """The response of light that answers evenly."""
 
 
-def light_response(change: Float, inside: NDArray[np.bool_]) -> Response:
+def light_response(change: Floats32, inside: NDArray[np.bool_]) -> Response:
     """Tell from the change in a contact's window how evenly the light answers.
 
     change : (n h, 3 n w) float32, channels side by side, standard deviations; n even. inside : (h, w) bool,
@@ -73,7 +72,7 @@ def light_response(change: Float, inside: NDArray[np.bool_]) -> Response:
 
 
 @kernel("void(float32[:, ::1], uint8[:, ::1], float32[::1])")
-def weigh_colours(change: Float, inside: NDArray[np.uint8], response: Float) -> None:
+def weigh_colours(change: Floats32, inside: NDArray[np.uint8], response: Floats32) -> None:
     """What `light_response` does; response : (4,), filled with the gain and the strongest colour."""
     each, zero = len(change) // (2 * len(inside)), np.float32(0)
     # Over every second pixel: moments of the change's length, in two pixels, and products of the channels.

@@ -19,10 +19,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.compiled import kernel
 
 Bytes = NDArray[np.uint8]
-Float = NDArray[np.float32]
 
 BAND: Final = 8
 """Rows that are computed over the same columns. Chosen by hand: the columns of each row alone would take four
@@ -60,10 +60,12 @@ class SlopeModel:
         wanted = (PLACE_TERMS, COLOUR_TERMS, 2)
         if coefficients.shape != wanted or not np.isfinite(coefficients).all():
             raise ValueError(f"slopes: required finite coefficients {wanted}, got {coefficients.shape}")
-        self.coefficients: Float = np.asarray(coefficients, np.float32)
+        self.coefficients: Floats32 = np.asarray(coefficients, np.float32)
         self._by_place = np.ascontiguousarray(self.coefficients.transpose(2, 1, 0))
 
-    def slopes(self, change: Float, x: Float, y: Float, near: Bytes, out: Float | None = None) -> Float:
+    def slopes(
+        self, change: Floats32, x: Floats32, y: Floats32, near: Bytes, out: Floats32 | None = None
+    ) -> Floats32:
         """(2, h, w) float32: how much the surface rises to the right, and down, towards the camera.
 
         change : (h, w, 3) float32, change of the light over the light at rest. x : (w,), y : (h,) float32,
@@ -81,7 +83,7 @@ class SlopeModel:
     "float32[:, :, ::1])"
 )
 def slopes_of_colour(
-    change: Float, coefficients: Float, x: Float, y: Float, near: Bytes, slope: Float
+    change: Floats32, coefficients: Floats32, x: Floats32, y: Floats32, near: Bytes, slope: Floats32
 ) -> None:
     """Add the slopes of the pixels near the contact to 0.
 
@@ -124,7 +126,7 @@ def slopes_of_colour(
             down[i] *= longer
 
 
-def colour_terms(change: Float) -> Float:
+def colour_terms(change: Floats32) -> Floats32:
     """(19, n) float32: all products of one to three channels of (..., 3), pixel by pixel.
 
     >>> float(colour_terms(np.full((1, 1, 3), 2, np.float32)).sum())
@@ -137,7 +139,7 @@ def colour_terms(change: Float) -> Float:
     return terms
 
 
-def coordinates(size: tuple[int, int]) -> tuple[Float, Float]:
+def coordinates(size: tuple[int, int]) -> tuple[Floats32, Floats32]:
     """(width,) and (height,) float32: x and y of the columns and rows, from -1 to 1 across the picture.
 
     size : (width, height), px.
@@ -146,7 +148,7 @@ def coordinates(size: tuple[int, int]) -> tuple[Float, Float]:
     return across, down
 
 
-def place_terms(size: tuple[int, int]) -> Float:
+def place_terms(size: tuple[int, int]) -> Floats32:
     """(6, h, w) float32: 1, x, y, x^2, x y, y^2 of every pixel, from -1 to 1 across the picture.
 
     size : (width, height), px.

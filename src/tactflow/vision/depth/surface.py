@@ -12,8 +12,9 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.depth.poisson import integrate
-from tactflow.vision.depth.slopes import Bytes, Float, SlopeModel, coordinates
+from tactflow.vision.depth.slopes import Bytes, SlopeModel, coordinates
 from tactflow.vision.depth.surroundings import Surroundings, Window, surroundings
 from tactflow.vision.types import Depth, Scale
 
@@ -56,13 +57,15 @@ class Rest:
     compared with it, so that both are rounded alike.
     """
 
-    def __init__(self, untouched: Bytes | Float) -> None:
+    def __init__(self, untouched: Bytes | Floats32) -> None:
         self.window = Window(0, untouched.shape[0] // 4 * 2, 0, untouched.shape[1] // 4 * 2)
         self.light = _halved(untouched, self.window)
-        self.weight: Float = np.reciprocal(self.light + np.float32(DIM), dtype=np.float32)
+        self.weight: Floats32 = np.reciprocal(self.light + np.float32(DIM), dtype=np.float32)
 
 
-def colour_change(image: Bytes | Float, rest: Rest, window: Window, out: Float | None = None) -> Float:
+def colour_change(
+    image: Bytes | Floats32, rest: Rest, window: Window, out: Floats32 | None = None
+) -> Floats32:
     """(h, w, 3) float32: change of the light at half resolution, relative to the light at rest.
 
     image : (H, W, 3) uint8 or float32, grey levels, BGR, without markers; means of 2 x 2 pixels of uint8 are
@@ -125,11 +128,11 @@ class Surface:
             volume_error = volume * math.hypot(balls.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
         return Depth(heights, greatest, depth_error, volume, volume_error, pressed)
 
-    def heights(self, image: Bytes, rest: Rest, around: Surroundings) -> Float:
+    def heights(self, image: Bytes, rest: Rest, around: Surroundings) -> Floats32:
         """(h, w) float32: how far the gel is pushed in, mm >= 0, in a window at half resolution."""
         return self._integrated(self._slopes(image, rest, around)[0])
 
-    def _slopes(self, image: Bytes, rest: Rest, around: Surroundings) -> tuple[Float, float]:
+    def _slopes(self, image: Bytes, rest: Rest, around: Surroundings) -> tuple[Floats32, float]:
         """(2, h, w) float32, and the part of all slope that is steeper than the ball has shown, 0 to 1."""
         memory = self._memory(rest.window)
         change, slope = memory.arrays(around.window)
@@ -143,7 +146,7 @@ class Surface:
             self._kept = _Memory(whole)
         return self._kept
 
-    def _integrated(self, slope: Float) -> Float:
+    def _integrated(self, slope: Floats32) -> Floats32:
         # Two processed pixels a step. Slopes rise towards the camera, where the gel is pushed to.
         heights = integrate(slope, (-2 * self._scale.x, -2 * self._scale.y))
         heights -= _median(_border(heights[..., None]))
@@ -162,14 +165,14 @@ class _Memory:
         self.x, self.y = coordinates((whole.right, whole.bottom))
         self._values = np.empty(5 * whole.height * whole.width, np.float32)
 
-    def arrays(self, window: Window) -> tuple[Float, Float]:
+    def arrays(self, window: Window) -> tuple[Floats32, Floats32]:
         """(h, w, 3) and (2, h, w) float32 of a window, to be written to."""
         pixels = window.height * window.width
         change, slope = self._values[: 3 * pixels], self._values[3 * pixels : 5 * pixels]
         return change.reshape(window.height, window.width, 3), slope.reshape(2, window.height, window.width)
 
 
-def _steep_part(slope: Float, steepest: float | None) -> float:
+def _steep_part(slope: Floats32, steepest: float | None) -> float:
     """Part of all slope (2, h, w) that is steep, 0 to 1; 0 where it is not known what is."""
     if steepest is None:
         return 0.0
@@ -180,17 +183,17 @@ def _steep_part(slope: Float, steepest: float | None) -> float:
     return float(length.sum()) / total if total else 0.0
 
 
-def _halved(image: Bytes | Float, window: Window) -> Bytes | Float:
+def _halved(image: Bytes | Floats32, window: Window) -> Bytes | Floats32:
     """(h, w, 3) of the picture's dtype: a window of it at half resolution."""
     return cv2.resize(image[window.whole], (window.width, window.height), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
-def _border(values: Float) -> Float:
+def _border(values: Floats32) -> Floats32:
     """(n, c): the outermost pixels of (h, w, c)."""
     return np.concatenate([values[0], values[-1], values[:, 0], values[:, -1]])
 
 
-def _median(values: Float) -> Float:
+def _median(values: Floats32) -> Floats32:
     """(c,): the middle ones of (n, c). `np.partition` takes up to five times as long, if many are equal."""
     ordered = np.sort(values, axis=0)
     return np.asarray(ordered[len(values) // 2], np.float32)

@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats
 from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.flow.in_mask import UNKNOWN
 from tactflow.vision.types import Slip
-
-FloatArray = NDArray[np.float64]
 
 EXCHANGED: Final = 0.1
 """Share of the gel in contact that was exchanged for other gel, from which on a contact slips. In simulated
@@ -51,8 +50,8 @@ _ROUNDS: Final = 4
 class _Touched(NamedTuple):
     """The gel in contact in one frame: (rows, columns) share of each cell; (rows, columns, 2) moved, px."""
 
-    share: FloatArray
-    moved: FloatArray
+    share: Floats
+    moved: Floats
     area: float
 
 
@@ -161,9 +160,7 @@ def _travelled(before: _Touched, now: _Touched, field: DisplacementField, mask: 
     return _Travel.SLID if along > DRAGGED * stderr else _Travel.ROLLED
 
 
-def stick_ratio(
-    before: FloatArray, now: FloatArray, points: FloatArray, moved: FloatArray, noise: float
-) -> float:
+def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, noise: float) -> float:
     """Share of a contact on which the gel moves as a rigid body does.
 
     before, now : (rows, columns), how much of each cell is in contact. points : (rows, columns, 2), px.
@@ -198,7 +195,7 @@ def stick_ratio(
     return float(share[sticks].sum() / share.sum())
 
 
-def _fitted(away: FloatArray, way: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _fitted(away: Floats, way: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """(n, 2): the affine motion, of points (n, 2), nearest to displacements (n, 2); its rigid part."""
     basis = np.column_stack([np.ones(len(away)), away])
     weighted = basis * weight[:, None]

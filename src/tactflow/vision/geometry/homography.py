@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from tactflow.vision.arrays import Floats
 
 _COLLINEAR: Final = 1e-6
 """Twice a triangle's area over the squared extent of the four points, 1: up to here its corners lie on a
@@ -17,7 +17,7 @@ _AT_HORIZON: Final = 1e-12
 finite one keeps every later number finite. Chosen by hand."""
 
 
-def find_homography(source: ArrayLike, destination: ArrayLike) -> FloatArray:
+def find_homography(source: ArrayLike, destination: ArrayLike) -> Floats:
     """The homography that takes four points to four points.
 
     source, destination : (4, 2), px, in the same order. Returns (3, 3) float64. Raises ValueError where three
@@ -47,7 +47,7 @@ def find_homography(source: ArrayLike, destination: ArrayLike) -> FloatArray:
     return matrix
 
 
-def project(matrix: FloatArray, points: FloatArray) -> FloatArray:
+def project(matrix: Floats, points: Floats) -> Floats:
     """Where a homography takes points: (3, 3), (N, 2) px -> (N, 2) float64 px.
 
     >>> project(np.diag([2.0, 2.0, 1.0]), np.array([[3.0, 4.0]]))
@@ -59,7 +59,7 @@ def project(matrix: FloatArray, points: FloatArray) -> FloatArray:
     return homogeneous[:, :2] / depth[:, None]
 
 
-def inverse(matrix: FloatArray) -> FloatArray:
+def inverse(matrix: Floats) -> Floats:
     """The homography back, (3, 3) float64.
 
     >>> inverse(np.diag([2.0, 2.0, 1.0]))
@@ -70,7 +70,7 @@ def inverse(matrix: FloatArray) -> FloatArray:
     return np.linalg.inv(matrix).astype(np.float64)
 
 
-def _corners(name: str, points: ArrayLike) -> FloatArray:
+def _corners(name: str, points: ArrayLike) -> Floats:
     """Four points (4, 2) of which no three lie on a line; ValueError otherwise."""
     corners = np.array(points, dtype=np.float64)
     if corners.shape != (4, 2) or not np.isfinite(corners).all():

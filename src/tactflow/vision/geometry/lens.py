@@ -7,9 +7,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from tactflow.vision.arrays import Floats
 
 _DISTORTION_LENGTHS: Final = (4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV's polynomial model knows."""
@@ -41,11 +41,11 @@ class Lens:
     array([[100., 100.]])
     """
 
-    camera_matrix: FloatArray
-    distortion: FloatArray
+    camera_matrix: Floats
+    distortion: Floats
     fisheye: bool = False
 
-    def distort(self, points: FloatArray) -> FloatArray:
+    def distort(self, points: Floats) -> Floats:
         """Where the lens puts points of the undistorted frame: (N, 2) float64 px -> (N, 2) float64 px."""
         if len(points) == 0:
             return points.copy()
@@ -62,7 +62,7 @@ class Lens:
         bent = np.asarray(projected, dtype=np.float64).reshape(-1, 2)
         return bent @ matrix[:2, :2].T + matrix[:2, 2]
 
-    def undistort(self, points: FloatArray) -> FloatArray:
+    def undistort(self, points: Floats) -> Floats:
         """Inverse of `distort`: (N, 2) float64 px -> (N, 2) float64 px.
 
         Damped Newton's method with a numerical Jacobian: `cv2.undistortPoints` stops after five fixed-point
@@ -90,7 +90,7 @@ class Lens:
             damping = np.where(better, np.minimum(1.0, 2 * damping), damping / 2)
         return guess
 
-    def _newton_step(self, guess: FloatArray, error: FloatArray) -> FloatArray:
+    def _newton_step(self, guess: Floats, error: Floats) -> Floats:
         """The inverse of the Jacobian of `distort` at (N, 2) `guess`, times (N, 2) `error`; px."""
         right_step, down_step = np.diag([_STEP, _STEP])
         right = (self.distort(guess + right_step) - self.distort(guess - right_step)) / (2 * _STEP)
@@ -105,14 +105,14 @@ class Lens:
         )
 
 
-def _equidistant(normalised: FloatArray, distortion: FloatArray) -> FloatArray:
+def _equidistant(normalised: Floats, distortion: Floats) -> Floats:
     """Kannala and Brandt's (2006) equidistant model with four coefficients, on normalised points."""
     radius = np.hypot(normalised[:, 0], normalised[:, 1])
     theta = np.arctan(radius)
     squared = theta * theta
     k1, k2, k3, k4 = distortion
     bent = theta * (1 + squared * (k1 + squared * (k2 + squared * (k3 + squared * k4))))
-    scale: FloatArray = np.divide(bent, radius, out=np.ones_like(radius), where=radius > _ON_AXIS)
+    scale: Floats = np.divide(bent, radius, out=np.ones_like(radius), where=radius > _ON_AXIS)
     return normalised * scale[:, None]
 
 

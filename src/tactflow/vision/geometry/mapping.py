@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactflow.vision.geometry.homography import FloatArray, inverse, project
+from tactflow.vision.arrays import Floats
+from tactflow.vision.geometry.homography import inverse, project
 from tactflow.vision.geometry.lens import Lens
 
 
@@ -35,7 +36,7 @@ class PixelMapping:
 
     raw_size: tuple[int, int]
     size: tuple[int, int]
-    matrix: FloatArray
+    matrix: Floats
     lens: Lens | None = None
 
     @classmethod
@@ -43,7 +44,7 @@ class PixelMapping:
         """The mapping of a frame of size (width, height) that is left as it is."""
         return cls(size, size, np.eye(3))
 
-    def to_processed(self, points: ArrayLike) -> FloatArray:
+    def to_processed(self, points: ArrayLike) -> Floats:
         """Where points of the raw frame lie in the processed frame.
 
         points : (N, 2) or (2,), raw pixels, x right, y down. Returns the same shape, float64, processed
@@ -55,14 +56,14 @@ class PixelMapping:
         straight = raw if self.lens is None else self.lens.undistort(raw)
         return project(self.matrix, straight).reshape(given.shape)
 
-    def to_raw(self, points: ArrayLike) -> FloatArray:
+    def to_raw(self, points: ArrayLike) -> Floats:
         """Where points of the processed frame lie in the raw frame: inverse of `to_processed`."""
         given = _points(points)
         straight = project(inverse(self.matrix), given.reshape(-1, 2))
         return (straight if self.lens is None else self.lens.distort(straight)).reshape(given.shape)
 
 
-def shift(x: float, y: float) -> FloatArray:
+def shift(x: float, y: float) -> Floats:
     """Homogeneous matrix (3, 3) of a shift, px.
 
     >>> shift(3, -2)[:2, 2]
@@ -71,7 +72,7 @@ def shift(x: float, y: float) -> FloatArray:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
-def rotation(rotate: int, size: tuple[int, int]) -> FloatArray:
+def rotation(rotate: int, size: tuple[int, int]) -> Floats:
     """Homogeneous matrix (3, 3) of `cv2.rotate` on a picture of size (width, height).
 
     rotate : 0, 90, 180 or 270 degrees clockwise.
@@ -89,7 +90,7 @@ def rotation(rotate: int, size: tuple[int, int]) -> FloatArray:
     return np.eye(3)
 
 
-def _points(points: ArrayLike) -> FloatArray:
+def _points(points: ArrayLike) -> Floats:
     given = np.asarray(points, dtype=np.float64)
     if given.ndim not in (1, 2) or given.shape[-1:] != (2,):
         raise ValueError(f"required points of shape (N, 2), got {given.shape}")

@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactflow.vision.arrays import Floats
 from tactflow.vision.geometry.downsample import halved
-from tactflow.vision.geometry.homography import FloatArray, find_homography
+from tactflow.vision.geometry.homography import find_homography
 from tactflow.vision.geometry.lens import check_lens
 from tactflow.vision.geometry.mapping import PixelMapping, rotation, shift
 from tactflow.vision.geometry.resample import Resampler
@@ -155,7 +156,7 @@ def _check(raw_size: Size, rotate: int, downsample: int, method: str) -> None:
 
 def _rectified(
     homography: tuple[ArrayLike, ArrayLike, Sequence[int]] | None, size: Size
-) -> tuple[FloatArray, Size]:
+) -> tuple[Floats, Size]:
     """Matrix of the homography, and the size of its result; without one, those of doing nothing."""
     if homography is None:
         return np.eye(3), size
@@ -186,7 +187,7 @@ def _whole_blocks(size: Size, downsample: int) -> Size:
     return (size[0] - size[0] % downsample, size[1] - size[1] % downsample)
 
 
-def _half(matrix: FloatArray, size: Size, method: Method) -> tuple[FloatArray, Size]:
+def _half(matrix: Floats, size: Size, method: Method) -> tuple[Floats, Size]:
     """Matrix and size of a picture, once more shrunk by two."""
     if method == "area":
         matrix = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ matrix

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.geometry.homography import FloatArray, inverse
+from tactflow.vision.arrays import Floats
+from tactflow.vision.geometry.homography import inverse
 from tactflow.vision.geometry.mapping import PixelMapping
 
 _LARGEST_FIXED_POINT: Final = 32000
@@ -68,7 +69,7 @@ class Resampler:
         )
 
 
-def _inside(raw: FloatArray, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
+def _inside(raw: Floats, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
     """(...,) bool: which of (..., 2) points lie on a pixel of a frame of size (width, height)."""
     inside: NDArray[np.bool_] = (
         (raw[..., 0] >= -0.5)
@@ -79,7 +80,7 @@ def _inside(raw: FloatArray, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
     return inside
 
 
-def _shrinkage(mapping: PixelMapping, raw: FloatArray, in_front: NDArray[np.bool_]) -> tuple[int, int]:
+def _shrinkage(mapping: PixelMapping, raw: Floats, in_front: NDArray[np.bool_]) -> tuple[int, int]:
     """How many raw pixels one processed pixel spans along raw x and raw y, rounded; median over the frame."""
     seen = in_front & _inside(raw, mapping.raw_size)
     if not seen.any():
@@ -95,7 +96,7 @@ def _shrinkage(mapping: PixelMapping, raw: FloatArray, in_front: NDArray[np.bool
     return int(fx), int(fy)
 
 
-def _in_front(mapping: PixelMapping, grid: FloatArray) -> NDArray[np.bool_]:
+def _in_front(mapping: PixelMapping, grid: Floats) -> NDArray[np.bool_]:
     """False for processed pixels beyond the horizon of the homography, where it folds over."""
     back = inverse(mapping.matrix)
     depth = grid @ back[2, :2] + back[2, 2]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Mask = NDArray[np.uint8]
+from tactflow.vision.arrays import Mask
 
 BLACK: Final = 24
 """Grey levels below which a pixel is black: video has its black at 16 (ITU-R BT.601), and compression and

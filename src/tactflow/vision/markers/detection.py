@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import family
 from tactflow.vision.markers.family import Family, Sign
 from tactflow.vision.markers.lattice import LONGEST_LINK, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
-FloatArray = NDArray[np.float64]
 
 LEAST_SHARE: Final = 0.4
 """Share of parallelograms of neighbours that close, at least, to be a lattice: random textures have up to
@@ -90,7 +90,7 @@ class Candidate(NamedTuple):
     picture. lattice : share of parallelograms of neighbours that close, 0 to 1.
     """
 
-    centers: FloatArray
+    centers: Floats
     radius: float
     polarity: Literal["dark", "bright"]
     score: float
@@ -120,12 +120,12 @@ class Detection:
     chosen : the spots that the marks grew from. rival : the next best spots elsewhere, if there are any.
     """
 
-    centers: FloatArray
+    centers: Floats
     dot_radius: float
     polarity: Literal["dark", "bright"]
     pitch: float
     edges: NDArray[np.int64]
-    radii: FloatArray | None = None
+    radii: Floats | None = None
     chosen: Candidate | None = None
     rival: Candidate | None = None
 
@@ -305,7 +305,7 @@ def _detection(gray: NDArray[np.float32], best: Family, marks: Spots, others: li
     return Detection(centers, radius, best.polarity, pitch, edges, sizes, _candidate(best), rival)
 
 
-def _same(other: Family, centers: FloatArray, radii: FloatArray) -> bool:
+def _same(other: Family, centers: Floats, radii: Floats) -> bool:
     """Whether another family lies where the marks are."""
     away = np.hypot(*(other.spots.points[:, None] - centers).transpose(2, 0, 1))
     return bool((away < radii).any(axis=1).mean() > SAME_MARKS)
@@ -324,7 +324,7 @@ def _require_options(
         raise ValueError(f"required valid to be {shape} uint8, got shape {valid.shape}, dtype {valid.dtype}")
 
 
-def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float) -> FloatArray:
+def refine_centers(gray: NDArray[np.float32], centers: Floats, radius: float) -> Floats:
     """Centroid of what is darker than its surroundings, in a window that follows it.
 
     The surroundings are a plane fitted to a ring around the mark, so a slope of the light does not pull.
@@ -382,7 +382,7 @@ def refine_centers(gray: NDArray[np.float32], centers: FloatArray, radius: float
     return result
 
 
-def _reading_order(centers: FloatArray, radius: float) -> NDArray[np.int64]:
+def _reading_order(centers: Floats, radius: float) -> NDArray[np.int64]:
     """Order by rows: a new row begins where the next centre lies a radius lower than the one before."""
     by_height = np.argsort(centers[:, 1], kind="stable")
     rows = np.concatenate([[0], np.cumsum(np.diff(centers[by_height, 1]) > radius)])

@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import lattice
 from tactflow.vision.markers.lattice import LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.likeness import likeness
 from tactflow.vision.markers.scale_space import OVERLAP, RADIUS_PER_SIGMA, Spots, joined
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Sign = Literal["dark", "bright"]
 
 FAMILY_STRENGTH: Final = 0.35
@@ -140,7 +139,7 @@ def _total(family: Family) -> float:
     return float(family.spots.strength.sum())
 
 
-def links(points: FloatArray) -> NDArray[np.int64]:
+def links(points: Floats) -> NDArray[np.int64]:
     """The neighbours (E, 2) among marks (N, 2)."""
     if len(points) < 2:
         return np.zeros((0, 2), np.int64)
@@ -150,7 +149,7 @@ def links(points: FloatArray) -> NDArray[np.int64]:
     return np.asarray(edges[length < LONG_LINK * usual[edges].min(axis=1)], np.int64)
 
 
-def _median_of_links(edges: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
+def _median_of_links(edges: NDArray[np.int64], values: Floats, count: int) -> Floats:
     """For each mark the (lower) median of the values (E,) of its links; infinity for a mark without."""
     mark, value = edges.T.ravel(), np.tile(values, 2)
     order = np.lexsort((value, mark))
@@ -218,7 +217,7 @@ def _with_best_clearance(spots: Spots, sigma: float, scales: Mapping[float, Spot
     return spots._replace(clear=best)
 
 
-def _nearest_of(spots: Spots, marks: Spots) -> tuple[FloatArray, NDArray[np.int64]]:
+def _nearest_of(spots: Spots, marks: Spots) -> tuple[Floats, NDArray[np.int64]]:
     """For each mark (N,) the distance, px, and the number of the nearest of the spots, of which there are."""
     here, there = (np.ascontiguousarray(part.points, np.float32) for part in (marks, spots))
     away, near = cv2.batchDistance(here, there, cv2.CV_32F, None, None, cv2.NORM_L2, 1)
@@ -291,7 +290,7 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     return _apart(wanted.at(fits & chosen), rank[fits & chosen])
 
 
-def _expected(points: FloatArray) -> Corners:
+def _expected(points: Floats) -> Corners:
     """Where the lattice wants marks: the corners of parallelograms, and the next place along each line."""
     edges = links(points)
     found = lattice.corners(points, edges)
@@ -335,7 +334,7 @@ def _free(spots: Spots, marks: Spots) -> Spots:
     return spots.at(np.flatnonzero(~touching.any(axis=1)))
 
 
-def _apart(spots: Spots, rank: FloatArray) -> Spots:
+def _apart(spots: Spots, rank: Floats) -> Spots:
     """Of spots that touch each other, the one of the highest rank."""
     left = np.ones(len(rank), bool)
     kept = []
@@ -347,7 +346,7 @@ def _apart(spots: Spots, rank: FloatArray) -> Spots:
     return spots.at(np.array(kept, np.int64))
 
 
-def _distances(points: FloatArray, others: FloatArray) -> FloatArray:
+def _distances(points: Floats, others: Floats) -> Floats:
     """(n, N) distances, px."""
     x = points[:, :1] - others[:, 0]
     y = points[:, 1:] - others[:, 1]

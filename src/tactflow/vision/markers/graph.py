@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from tactflow.vision.arrays import Flags, Floats, Indices
 
 LINKED_STRAIN: Final = 0.3
 """Strain of a link below which its two marks move together. Chosen by hand."""
@@ -47,7 +44,7 @@ class MarkerGraph:
     array([ True,  True, False])
     """
 
-    def __init__(self, origin: FloatArray, edges: IntArray) -> None:
+    def __init__(self, origin: Floats, edges: Indices) -> None:
         count = len(origin)
         self.edges = np.ascontiguousarray(edges, np.int64).reshape(-1, 2)
         if len(self.edges) and not 0 <= self.edges.min() <= self.edges.max() < count:
@@ -70,13 +67,13 @@ class MarkerGraph:
         self._grid = home.tolist()
         self._neighbours = neighbours
 
-    def strain(self, position: FloatArray) -> FloatArray:
+    def strain(self, position: Floats) -> Floats:
         """Strain of each link (E,), of positions (N, 2), px."""
         moved = position - self._origin
         x, y = (moved[self.edges[:, 0]] - moved[self.edges[:, 1]]).T
         return np.asarray(np.sqrt(x * x + y * y) / self.length)
 
-    def largest_component(self, seen: BoolArray, strain: FloatArray) -> BoolArray:
+    def largest_component(self, seen: Flags, strain: Floats) -> Flags:
         """The seen marks (N,) of the largest component whose links have little strain (E,).
 
         Marks at the border have more votes. Where the marks of the reference form several grids without

@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Flags, Floats32, Indices
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 
 Bytes = NDArray[np.uint8]
-Float = NDArray[np.float32]
 Sums = NDArray[np.uint16]
-Places = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 _METHODS: Final = get_args(InpaintMethod)
 
@@ -155,7 +153,7 @@ def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
 
 
 @lru_cache(maxsize=32)
-def _reflected(count: int, margin: int) -> Places:
+def _reflected(count: int, margin: int) -> Indices:
     """Which of `count` cells is seen at each place of a line, and at `margin` places before and after it."""
     return np.pad(np.arange(count), margin, mode="reflect")
 
@@ -170,7 +168,7 @@ _READ: Final = "Array(uint8, 2, 'C', readonly=True)"
 
 
 @kernel(f"void({_READ}, uint8[:, ::1], int64[::1], uint16[:, ::1], boolean[::1])")
-def sum_valid(mask: Bytes, half: Bytes, columns: Places, cells: Sums, masked: Flags) -> None:
+def sum_valid(mask: Bytes, half: Bytes, columns: Indices, cells: Sums, masked: Flags) -> None:
     """Sums over the valid ones of each cell's 2 x 2 values at half resolution, and 255 for each as weight.
 
     A value is valid where none of its 2 x 2 px is masked. mask : (4 h, 4 w). half : (2 h, 6 w), the picture.
@@ -221,12 +219,12 @@ def sum_valid(mask: Bytes, half: Bytes, columns: Places, cells: Sums, masked: Fl
 def sum_windows(
     cells: Sums,
     masked: Flags,
-    rows: Places,
+    rows: Indices,
     reach: int,
     width: int,
     far: float,
     least: float,
-    windows: Float,
+    windows: Floats32,
 ) -> bool:
     """Binomial windows of 3 x 3 cells plus `far` times windows of 2 reach + 1 cells each way.
 
@@ -271,7 +269,7 @@ def sum_windows(
 
 
 @kernel(f"void({_READ}, boolean[::1], float32[:, ::1], uint8[:, ::1])")
-def fill_masked(mask: Bytes, masked: Flags, windows: Float, picture: Bytes) -> None:
+def fill_masked(mask: Bytes, masked: Flags, windows: Floats32, picture: Bytes) -> None:
     """Masked px become the sums over their weight, interpolated between the centres of cells.
 
     mask : (4 h, 4 w). masked : (h,) and windows : (h, 4 sections), of `sum_windows`; these become the

@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from tactflow.vision.arrays import Flags, Floats, Indices
 
 NEIGHBOURS: Final = 24
 """Marks around a mark that a fit uses, at most: the two rings of a square grid, 8 + 16."""
@@ -47,11 +44,11 @@ class Interpolator:
     ([12], [3.0, 3.0])
     """
 
-    def __init__(self, origin: FloatArray, pitch: float) -> None:
+    def __init__(self, origin: Floats, pitch: float) -> None:
         self._origin, self._pitch = origin, pitch
         self._around, self._weight = _surroundings(origin, pitch)
 
-    def place(self, position: FloatArray, found: BoolArray) -> IntArray:
+    def place(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that are not found, where enough of those around them are.
 
         position : (N, 2) float64, px, finite, changed in place. found : (N,) bool.
@@ -74,7 +71,7 @@ class Interpolator:
         return placed
 
 
-def _surroundings(origin: FloatArray, pitch: float) -> tuple[IntArray, FloatArray]:
+def _surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
     """For each mark up to 24 nearest others, and their weights: two (N, n) arrays."""
     count = len(origin)
     reach = min(NEIGHBOURS, count - 1)

@@ -6,9 +6,8 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from tactflow.vision.arrays import Floats
 
 BIN: Final = 0.1
 """Side of the bins of votes, pitches. Chosen by hand."""
@@ -29,9 +28,7 @@ LEAST_LEAD_VOTES: Final = 2.0
 """Lead over the next peak, votes. Chosen by hand."""
 
 
-def common_displacement(
-    position: FloatArray, spots: FloatArray, *, pitch: float, farthest: float
-) -> FloatArray | None:
+def common_displacement(position: Floats, spots: Floats, *, pitch: float, farthest: float) -> Floats | None:
     """The displacement that nearly all marks share, if there is clearly one.
 
     Every pair of a mark and a spot votes for its displacement. Only this tells a jump of the whole grid by
@@ -83,7 +80,7 @@ def common_displacement(
     return np.asarray(votes[agree].mean(axis=0), np.float64)
 
 
-def _differences(points: FloatArray, others: FloatArray, reach: float) -> FloatArray:
+def _differences(points: Floats, others: Floats, reach: float) -> Floats:
     """All others - points (n, 2) whose y is within reach, so that not everything meets everything."""
     others = others[np.argsort(others[:, 1])]
     first = np.searchsorted(others[:, 1], points[:, 1] - reach)

@@ -6,11 +6,8 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from tactflow.vision.arrays import Flags, Floats, Indices
 
 BLOCKING: Final = 1.1
 """Sum of squares, over the squared distance of two marks, below which a third one between them blocks their
@@ -40,14 +37,14 @@ class Corners(NamedTuple):
     first, middle, last : (M,) int64, the marks that span it.
     """
 
-    points: FloatArray
-    reach: FloatArray
-    first: IntArray
-    middle: IntArray
-    last: IntArray
+    points: Floats
+    reach: Floats
+    first: Indices
+    middle: Indices
+    last: Indices
 
 
-def neighbour_graph(centers: FloatArray, longest: float) -> IntArray:
+def neighbour_graph(centers: Floats, longest: float) -> Indices:
     """Which marks are neighbours: a beta-skeleton, free of diagonals on square grids.
 
     Two marks are neighbours unless a third lies (nearly) inside the circle whose diameter they are.
@@ -88,7 +85,7 @@ def neighbour_graph(centers: FloatArray, longest: float) -> IntArray:
     return np.unique(pairs, axis=0).astype(np.int64)
 
 
-def nearest(points: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
+def nearest(points: Floats, count: int) -> tuple[Floats, Indices]:
     """Distances to and indices of the `count` nearest other points, nearest first: two (N, count) arrays."""
     count = min(count, len(points) - 1)
     if count < 1:
@@ -99,12 +96,12 @@ def nearest(points: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
     return np.asarray(distances[:, 1:], np.float64), np.asarray(near[:, 1:], np.int64)
 
 
-def pitch_of(points: FloatArray) -> float:
+def pitch_of(points: Floats) -> float:
     """Median distance of marks (N, 2), N >= 2, to their nearest neighbours, px."""
     return float(np.median(nearest(points, 1)[0]))
 
 
-def corners(centers: FloatArray, edges: IntArray) -> Corners:
+def corners(centers: Floats, edges: Indices) -> Corners:
     """Where parallelograms of neighbours (E, 2) would have their fourth corners.
 
     >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
@@ -128,7 +125,7 @@ def corners(centers: FloatArray, edges: IntArray) -> Corners:
     return Corners((centers[c] + one + other)[open_], reach, a[open_], c[open_], b[open_])
 
 
-def closed_share(centers: FloatArray, edges: IntArray) -> float:
+def closed_share(centers: Floats, edges: Indices) -> float:
     """How much of a lattice the marks form: the share of parallelograms of neighbours that a mark closes.
 
     Real grids, also painted ones, curved ones and ones in perspective, have 0.8 and more; marks that are
@@ -146,7 +143,7 @@ def closed_share(centers: FloatArray, edges: IntArray) -> float:
     return float(closed / (len(expected.points) + PRIOR_TESTS))
 
 
-def own_shares(centers: FloatArray, edges: IntArray) -> tuple[FloatArray, IntArray]:
+def own_shares(centers: Floats, edges: Indices) -> tuple[Floats, Indices]:
     """For each mark the share of closed ones among the parallelograms that it is part of, and how many marks
     hang together with it by closed parallelograms: two (N,) arrays; 0 and 1 for a mark that is in none."""
     count, expected = len(centers), corners(centers, edges)
@@ -162,7 +159,7 @@ def own_shares(centers: FloatArray, edges: IntArray) -> tuple[FloatArray, IntArr
     return own / np.maximum(tests, 1), _cluster_sizes(cells, count)
 
 
-def _cluster_sizes(cells: IntArray, count: int) -> IntArray:
+def _cluster_sizes(cells: Indices, count: int) -> Indices:
     """For each mark (count,) the number of marks that cells (C, 4), one after another, lead to."""
     name = np.arange(count)
     while True:
@@ -175,12 +172,12 @@ def _cluster_sizes(cells: IntArray, count: int) -> IntArray:
         name = least
 
 
-def support(points: FloatArray, expected: Corners) -> IntArray:
+def support(points: Floats, expected: Corners) -> Indices:
     """How many corners each point (n, 2) closes, (n,)."""
     return np.asarray(np.count_nonzero(_within(points, expected), axis=1), np.int64)
 
 
-def others_support(centers: FloatArray, expected: Corners) -> IntArray:
+def others_support(centers: Floats, expected: Corners) -> Indices:
     """How many of the corners of other marks each mark (N, 2) closes, (N,)."""
     closed = _within(centers, expected)
     column = np.arange(len(expected.points))
@@ -189,7 +186,7 @@ def others_support(centers: FloatArray, expected: Corners) -> IntArray:
     return np.asarray(np.count_nonzero(closed, axis=1), np.int64)
 
 
-def _within(points: FloatArray, expected: Corners) -> BoolArray:
+def _within(points: Floats, expected: Corners) -> Flags:
     """(n, M) which points close which corners."""
     if len(expected.points) == 0:
         return np.zeros((len(points), 0), bool)
@@ -200,7 +197,7 @@ def _within(points: FloatArray, expected: Corners) -> BoolArray:
     return np.asarray(squared < (expected.reach**2).astype(np.float32))
 
 
-def _closing(centers: FloatArray, expected: Corners) -> IntArray:
+def _closing(centers: Floats, expected: Corners) -> Indices:
     """(M,) which mark closes each parallelogram, -1 for none."""
     if len(expected.points) == 0:
         return np.zeros(0, np.int64)

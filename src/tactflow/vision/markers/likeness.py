@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from tactflow.vision.arrays import Floats
 
 WINDOW: Final = 2.6
 """Radius of the discs that are compared, in radii of the marks: they hold the gaps to the neighbours, too.
@@ -21,9 +21,7 @@ SAMPLES: Final = 4
 """Samples along the radius of a disc. Chosen by hand."""
 
 
-def likeness(
-    gray: NDArray[np.float32], points: FloatArray, others: FloatArray, radius: FloatArray
-) -> FloatArray:
+def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: Floats) -> Floats:
     """How much the discs around points look like those around others: mean correlation, -1 to 1.
 
     Brightness, contrast and the slope of the light play no part.
@@ -58,7 +56,7 @@ def likeness(
     return np.asarray(np.einsum("np,nkp->nk", own, theirs.reshape(count, compared, -1)).mean(axis=1))
 
 
-def _surroundings(gray: NDArray[np.float32], points: FloatArray, reach: FloatArray) -> FloatArray:
+def _surroundings(gray: NDArray[np.float32], points: Floats, reach: Floats) -> Floats:
     """The levels of the discs around points (n, 2) without their mean and slope, as unit vectors (n, P)."""
     axis = np.linspace(-1, 1, 2 * SAMPLES + 1)
     x, y = (part.ravel() for part in np.meshgrid(axis, axis))

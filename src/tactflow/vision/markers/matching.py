@@ -16,9 +16,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from tactflow.vision.arrays import Flags, Floats, Indices
+
 ComplexArray = NDArray[np.complex128]
 
 MISSING_COST: Final = 1.0
@@ -69,18 +68,18 @@ hand."""
 
 
 def choose_spots(
-    origin: FloatArray,
-    edges: IntArray,
-    free: IntArray,
-    inliers: BoolArray,
-    displacement: FloatArray,
-    expected: FloatArray,
-    spots: FloatArray,
-    strength: FloatArray,
+    origin: Floats,
+    edges: Indices,
+    free: Indices,
+    inliers: Flags,
+    displacement: Floats,
+    expected: Floats,
+    spots: Floats,
+    strength: Floats,
     *,
     pitch: float,
     farthest: float,
-) -> IntArray:
+) -> Indices:
     """Give each free mark one of the spots, or none.
 
     The choice minimises unary costs (distance from where a mark is expected, faint spots, marks without a
@@ -112,7 +111,7 @@ def choose_spots(
     named = np.concatenate([edges.ravel(), free])
     if named.min() < 0 or named.max() >= len(origin):
         raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
-    slot: IntArray = np.full(len(origin), -1, np.int64)
+    slot: Indices = np.full(len(origin), -1, np.int64)
     slot[free] = np.arange(count)
     known = np.asarray(inliers, np.bool_)
     links = _Links(_complex(origin), edges, free, slot, known, _complex(displacement))
@@ -132,21 +131,21 @@ class _Links(NamedTuple):
     """
 
     rest: ComplexArray
-    edges: IntArray
-    free: IntArray
-    slot: IntArray
-    inliers: BoolArray
+    edges: Indices
+    free: Indices
+    slot: Indices
+    inliers: Flags
     displacement: ComplexArray
 
 
-def _complex(points: FloatArray) -> ComplexArray:
+def _complex(points: Floats) -> ComplexArray:
     """x + i y, which makes lengths and inner products of many pairs cheap."""
     return np.asarray(points[..., 0] + 1j * points[..., 1], np.complex128)
 
 
 def _near_spots(
-    expected: ComplexArray, spots: ComplexArray, strength: FloatArray, pitch: float, farthest: float
-) -> tuple[IntArray, FloatArray]:
+    expected: ComplexArray, spots: ComplexArray, strength: Floats, pitch: float, farthest: float
+) -> tuple[Indices, Floats]:
     """The spots that each mark may choose, (n, L), the nearest first; and what they cost it, (n, L + 1), last
     that of no spot. L is how many are in reach of a mark at most, no more than `LABELS`."""
     away = np.abs(expected[:, :, None] - spots).min(axis=0)
@@ -160,7 +159,7 @@ def _near_spots(
     return label, unary
 
 
-def _own_best(links: _Links, spots: ComplexArray, label: IntArray, unary: FloatArray) -> IntArray | None:
+def _own_best(links: _Links, spots: ComplexArray, label: Indices, unary: Floats) -> Indices | None:
     """What each mark chooses alone, if that is a smooth choice or there is none; else None.
 
     label, unary : of `_near_spots`; the costs of links to inliers are added to `unary`.
@@ -173,11 +172,11 @@ def _own_best(links: _Links, spots: ComplexArray, label: IntArray, unary: FloatA
     best, rows = np.argmin(unary, axis=1), np.arange(count)
     if (best == labels).any():
         return None
-    own: IntArray = label[rows, best]
+    own: Indices = label[rows, best]
     return own if len(np.unique(own)) == count and _is_smooth(links, moved[rows, best]) else None
 
 
-def _add_links_to_inliers(links: _Links, moved: ComplexArray, unary: FloatArray) -> None:
+def _add_links_to_inliers(links: _Links, moved: ComplexArray, unary: Floats) -> None:
     """Add to `unary`, (n, L + 1), what the links to inliers cost, whose displacement is not a matter of
     choice. moved : (n, L), displacement of each mark to each of its spots."""
     slot, inliers = links.slot, links.inliers
@@ -205,7 +204,7 @@ def _is_smooth(links: _Links, moved: ComplexArray) -> bool:
     return bool((np.abs(now[other] - now[one]) < SMOOTH_STRAIN * np.abs(rest[other] - rest[one])).all())
 
 
-def _link_costs(links: _Links, spots: ComplexArray, label: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+def _link_costs(links: _Links, spots: ComplexArray, label: Indices) -> tuple[Indices, Indices, Floats]:
     """First and second mark of each link between free marks; and what their labels, (n, L), cost together.
 
     Returns (links,), (links,) and (links, L + 1, L + 1); the last label is that of no spot.
@@ -223,7 +222,7 @@ def _link_costs(links: _Links, spots: ComplexArray, label: IntArray) -> tuple[In
     return first, second, pair
 
 
-def _beliefs(unary: FloatArray, first: IntArray, second: IntArray, pair: FloatArray) -> FloatArray:
+def _beliefs(unary: Floats, first: Indices, second: Indices, pair: Floats) -> Floats:
     """Costs of each mark's labels, (n, L + 1), by min-sum belief propagation; of all links at once.
 
     unary : (n, L + 1). first, second, pair : of `_link_costs`.
@@ -247,11 +246,11 @@ def _beliefs(unary: FloatArray, first: IntArray, second: IntArray, pair: FloatAr
     return belief
 
 
-def _assign(belief: FloatArray, label: IntArray) -> IntArray:
+def _assign(belief: Floats, label: Indices) -> Indices:
     """The cheapest spot of each mark, (n,), -1 for none; of two that want one spot, the surer one gets it."""
     choice, labels = belief.argmin(axis=1), label.shape[1]
     rows = np.arange(len(choice))
-    chosen: IntArray = np.where(choice < labels, label[rows, np.minimum(choice, labels - 1)], -1)
+    chosen: Indices = np.where(choice < labels, label[rows, np.minimum(choice, labels - 1)], -1)
     surplus = belief[rows, choice] - belief[:, labels]
     taken: set[int] = set()
     for mark in np.argsort(surplus, kind="stable").tolist():

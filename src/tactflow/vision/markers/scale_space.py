@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from tactflow.vision.arrays import Floats
 
 SCALE_RATIO: Final = 1.6
 """Width of the wider Gaussian of a difference of Gaussians over that of the narrower: closest to the
@@ -67,10 +66,10 @@ class Spots(NamedTuple):
     1; 1 is a spot alone on even ground. round : (N,) bool, whether the response falls in all directions.
     """
 
-    points: FloatArray
-    radius: FloatArray
-    strength: FloatArray
-    clear: FloatArray
+    points: Floats
+    radius: Floats
+    strength: Floats
+    clear: Floats
     round: NDArray[np.bool_]
 
     def at(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> Spots:
@@ -145,7 +144,7 @@ def blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32
     return np.asarray(narrow, np.float32), np.asarray(wide, np.float32)
 
 
-def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, FloatArray]:
+def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[Floats, Floats]:
     """Local maxima, refined to sub-pixels by a parabola along each axis: positions (N, 2), strengths (N,)."""
     # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
     size = 2 * max(1, round(OVERLAP * RADIUS_PER_SIGMA * sigma)) + 1
@@ -165,7 +164,7 @@ def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[FloatArray, Flo
     return points, value
 
 
-def _is_round(response: NDArray[np.float32], peaks: FloatArray) -> NDArray[np.bool_]:
+def _is_round(response: NDArray[np.float32], peaks: Floats) -> NDArray[np.bool_]:
     """Whether the response falls from its peaks (N, 2), px, in all directions, not only across a line: (N,).
 
     The ratio of the eigenvalues of the matrix of second derivatives grows with its squared trace over its
@@ -174,7 +173,7 @@ def _is_round(response: NDArray[np.float32], peaks: FloatArray) -> NDArray[np.bo
     limits = np.array([response.shape[1] - 2, response.shape[0] - 2])
     columns, rows = np.clip(np.rint(peaks).astype(np.int64), 1, limits).T
 
-    def at(down: int, right: int) -> FloatArray:
+    def at(down: int, right: int) -> Floats:
         return np.asarray(response[rows + down, columns + right], np.float64)
 
     peak = 2 * at(0, 0)
@@ -184,7 +183,7 @@ def _is_round(response: NDArray[np.float32], peaks: FloatArray) -> NDArray[np.bo
     return np.asarray(LONGEST * (across + down) ** 2 < (LONGEST + 1) ** 2 * determinant, np.bool_)
 
 
-def _clearance(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) -> FloatArray:
+def _clearance(smooth: NDArray[np.float32], peaks: Floats, radius: float) -> Floats:
     """Contrast of dark peaks with all but `RING_MISSES` points of the ring around, over the median one."""
     if len(peaks) == 0:
         return np.zeros(0)
@@ -204,7 +203,7 @@ def _clearance(smooth: NDArray[np.float32], peaks: FloatArray, radius: float) ->
     return np.asarray(np.where(median > 0, above[:, RING_MISSES] / np.maximum(median, 1e-3), 0.0), np.float64)
 
 
-def _on_gel(valid: NDArray[np.uint8], points: FloatArray, radius: float) -> NDArray[np.bool_]:
+def _on_gel(valid: NDArray[np.uint8], points: Floats, radius: float) -> NDArray[np.bool_]:
     """Which points have gel in at least half of the square around them."""
     side = 2 * round(RING * radius) + 1
     share = cv2.boxFilter((valid > 0).astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE)

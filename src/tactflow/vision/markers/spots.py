@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Flags, Floats, Floats32
 from tactflow.vision.markers.detection import Detection
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, blurred, shrunk
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 LARGEST_RADIUS: Final = 2.3
@@ -59,8 +57,8 @@ class SpotFinder:
         self._typical = max(float(np.median(response[row, column])), 1.0)
 
     def find(
-        self, image: NDArray[np.uint8], least: float, low: FloatArray, high: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+        self, image: NDArray[np.uint8], least: float, low: Floats, high: Floats
+    ) -> tuple[Floats, Floats]:
         """Spots between two corners.
 
         image : (H, W, 3) uint8 BGR or (H, W) uint8. least : strength of a spot. low, high : (2,), corners of
@@ -78,13 +76,13 @@ class SpotFinder:
         strength = np.asarray(value / self._typical, np.float64)
         return points * factor + ((factor - 1) / 2 + left, (factor - 1) / 2 + top), strength
 
-    def _response(self, gray: NDArray[np.uint8]) -> Float32Array:
+    def _response(self, gray: NDArray[np.uint8]) -> Floats32:
         """Difference of Gaussians at low resolution, positive on marks."""
         narrow, wide = blurred(shrunk(gray, self._factor).astype(np.float32), self._sigma)
         return np.asarray(wide - narrow if self._dark else narrow - wide, np.float32)
 
 
-def find_peaks(response: Float32Array, least: float, reach: int) -> tuple[FloatArray, Float32Array]:
+def find_peaks(response: Floats32, least: float, reach: int) -> tuple[Floats, Floats32]:
     """Pixels above `least` that are the highest in a square of side 2 reach + 1.
 
     Returns (M, 2) float64, each the vertex of a parabola along each axis, at most half a pixel away, and the
@@ -125,7 +123,7 @@ class NearPoints:
         size = 2 * round(distance * self._pitch / self._cell) + 1
         return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
 
-    def near(self, points: FloatArray, others: FloatArray, disc: NDArray[np.uint8]) -> BoolArray:
+    def near(self, points: Floats, others: Floats, disc: NDArray[np.uint8]) -> Flags:
         """(n,) bool, which points (n, 2) have one of the others (m, 2) in a disc, to a tenth of a pitch."""
         if len(points) == 0 or len(others) == 0:
             return np.zeros(len(points), bool)
@@ -134,7 +132,7 @@ class NearPoints:
         wide: NDArray[np.uint8] = np.asarray(cv2.dilate(raster, disc), np.uint8)
         return np.asarray(wide[self._cells(points)], np.bool_)
 
-    def _cells(self, points: FloatArray) -> tuple[IntArray, IntArray]:
+    def _cells(self, points: Floats) -> tuple[IntArray, IntArray]:
         """Row and column of the cells that points (n, 2) lie in; those outside count to the border."""
         limits = np.array(self._shape[::-1]) - 1
         column, row = np.clip((points * (1 / self._cell) + 0.5).astype(np.intp), 0, limits).T

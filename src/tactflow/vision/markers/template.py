@@ -8,11 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Floats, Floats32, Indices
 from tactflow.vision.compiled import helper, kernel
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 Levels = NDArray[np.int16]
 
@@ -72,10 +70,10 @@ class Alignment(NamedTuple):
     error of each coordinate, px.
     """
 
-    position: FloatArray
-    gain: Float32Array
-    r_squared: Float32Array
-    stderr: Float32Array
+    position: Floats
+    gain: Floats32
+    r_squared: Floats32
+    stderr: Floats32
 
 
 class MarkerTemplates:
@@ -110,7 +108,7 @@ class MarkerTemplates:
     array([[21., 20.]])
     """
 
-    def __init__(self, reference: Float32Array, origin: FloatArray, radius: float, dark: bool = True) -> None:
+    def __init__(self, reference: Floats32, origin: Floats, radius: float, dark: bool = True) -> None:
         extent = PATCH_SCALE * radius + PATCH_MARGIN
         reach = int(np.ceil(extent))
         axis = np.arange(-reach, reach + 1)
@@ -137,7 +135,7 @@ class MarkerTemplates:
         self._widths = disc.sum(axis=1)
         self._radius = float(radius)
 
-    def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
+    def align(self, image: NDArray[np.uint8], start: Floats, marks: Indices | None = None) -> Alignment:
         """Find marks from starting points that are right to about a radius.
 
         image : (H, W, 3) uint8 BGR or (H, W) uint8. start : (n, 2) float64, px. marks : (n,) int64, which
@@ -157,9 +155,7 @@ class SizedTemplates:
     As `MarkerTemplates`, but radii : (N,) float64, px.
     """
 
-    def __init__(
-        self, reference: Float32Array, origin: FloatArray, radii: FloatArray, dark: bool = True
-    ) -> None:
+    def __init__(self, reference: Floats32, origin: Floats, radii: Floats, dark: bool = True) -> None:
         step = np.floor(np.log(radii / radii.min()) / np.log(ONE_TEMPLATE) + 1e-6)
         sizes, self._size = np.unique(step, return_inverse=True)
         self._place = np.empty(len(radii), np.int64)
@@ -170,7 +166,7 @@ class SizedTemplates:
             radius = float(np.max(radii[marks]))
             self._templates.append(MarkerTemplates(reference, origin[marks], radius, dark))
 
-    def align(self, image: NDArray[np.uint8], start: FloatArray, marks: IntArray | None = None) -> Alignment:
+    def align(self, image: NDArray[np.uint8], start: Floats, marks: Indices | None = None) -> Alignment:
         """As `MarkerTemplates.align`."""
         marks = np.arange(len(self._size)) if marks is None else marks
         found = np.empty((len(marks), 2)), *np.empty((3, len(marks)), np.float32)
@@ -187,20 +183,18 @@ class _Sampler:
     """Templates at sub-pixel shifts, each interpolated once. Shifts are binary fractions, so most serve as
     the template of one phase and as neighbours, for the slope, of others."""
 
-    def __init__(
-        self, reference: Float32Array, origin: FloatArray, reach: int, disc: NDArray[np.bool_]
-    ) -> None:
+    def __init__(self, reference: Floats32, origin: Floats, reach: int, disc: NDArray[np.bool_]) -> None:
         self._reference, self._origin, self._reach, self._disc = reference, origin, reach, disc
-        self._known: dict[tuple[float, float], FloatArray] = {}
+        self._known: dict[tuple[float, float], Floats] = {}
 
-    def at(self, right: float, down: float) -> FloatArray:
+    def at(self, right: float, down: float) -> Floats:
         """(N, p) float64, templates of marks that lie so far right of and below a pixel's centre, px."""
         if (right, down) not in self._known:
             patches = _interpolate(self._reference, self._origin - (right, down), self._reach)
             self._known[right, down] = patches[:, self._disc]
         return self._known[right, down]
 
-    def with_slopes(self, right: float, down: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def with_slopes(self, right: float, down: float) -> tuple[Floats, Floats, Floats]:
         """The template, and its central differences along x and y over the phases on either side."""
         half = 1 / PHASES
         slope_x = (self.at(right + half, down) - self.at(right - half, down)) / (2 * half)
@@ -209,8 +203,8 @@ class _Sampler:
 
 
 def _normal_equations(
-    template: FloatArray, slope_x: FloatArray, slope_y: FloatArray, disc: FloatArray, dark: bool
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    template: Floats, slope_x: Floats, slope_y: Floats, disc: Floats, dark: bool
+) -> tuple[Floats, Floats, Floats]:
     """What least squares need of templates (N, p) at one phase.
 
     disc : (2, p), x and y of the pixels, in radii.
@@ -229,7 +223,7 @@ def _normal_equations(
     return weights, gram, 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
 
 
-def _interpolate(image: Float32Array, points: FloatArray, reach: int) -> FloatArray:
+def _interpolate(image: Floats32, points: Floats, reach: int) -> Floats:
     """Patches (N, 2 reach + 1, 2 reach + 1) centred on sub-pixel points, by a windowed sinc of six taps."""
     pad = reach + 4
     padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
@@ -248,7 +242,7 @@ def _interpolate(image: Float32Array, points: FloatArray, reach: int) -> FloatAr
     )
 
 
-def _lanczos(fraction: FloatArray) -> FloatArray:
+def _lanczos(fraction: Floats) -> Floats:
     """Weights (N, 6) of the pixels at -2 .. 3 for points between 0 and 1 (Lanczos; Duchon 1979)."""
     distance = fraction[:, None] - np.arange(-2, 4)
     weights = np.sinc(distance) * np.sinc(distance / 3)
@@ -265,7 +259,7 @@ def nearest_phase(x: float, y: float, width: int, height: int) -> Any:
 
 
 @helper
-def read_patch(image: Bytes, left: int, top: int, widths: IntArray, patch: Float32Array) -> float:
+def read_patch(image: Bytes, left: int, top: int, widths: Indices, patch: Floats32) -> float:
     """Fill `patch` with the grey levels of a disc around a pixel; beyond the border those of the border.
 
     widths : of the disc's rows, px. Returns the sum of squares about the mean.
@@ -291,7 +285,7 @@ def read_patch(image: Bytes, left: int, top: int, widths: IntArray, patch: Float
 
 
 @helper
-def to_gray(pixels: Bytes, channels: int, levels: Float32Array) -> None:
+def to_gray(pixels: Bytes, channels: int, levels: Floats32) -> None:
     """Fill `levels` with grey levels as OpenCV makes them of BGR, or of grey pixels themselves; less 128."""
     blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
     if channels == 1:
@@ -310,14 +304,14 @@ def to_gray(pixels: Bytes, channels: int, levels: Float32Array) -> None:
 )
 def align_marks(
     image: Bytes,
-    start: FloatArray,
-    marks: IntArray,
+    start: Floats,
+    marks: Indices,
     weights: Levels,
-    terms: Float32Array,
-    widths: IntArray,
+    terms: Floats32,
+    widths: Indices,
     radius: float,
-    position: FloatArray,
-    found: Float32Array,
+    position: Floats,
+    found: Floats32,
 ) -> None:
     """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
 
@@ -357,7 +351,7 @@ def align_marks(
 
 
 @helper
-def fit_template(weight: Levels, term: Float32Array, patch: Float32Array, varies: float) -> Any:
+def fit_template(weight: Levels, term: Floats32, patch: Floats32, varies: float) -> Any:
     """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained.
 
     varies : the patch's sum of squares about its mean.

@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Flags, Floats, Indices
 from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.detection import (
     Detection,
@@ -23,10 +24,6 @@ from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.markers.spots import NearPoints, SpotFinder
 from tactflow.vision.markers.template import Alignment, MarkerTemplates, SizedTemplates
 from tactflow.vision.types import Markers, MarkerStatus
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 LEAST_GAIN: Final = np.float32(0.2)
 """Contrast of a mark that is seen, over that of its template, at least. Chosen by hand."""
@@ -235,7 +232,7 @@ class MarkerTracker:
         self._position, self._seen = position, seen
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius)
 
-    def _check(self, found: Alignment) -> tuple[BoolArray, FloatArray, int]:
+    def _check(self, found: Alignment) -> tuple[Flags, Floats, int]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
         may have missed or mistaken one."""
         seen, strain = np.empty(self._count, np.bool_), np.empty(len(self._graph.edges))
@@ -256,9 +253,7 @@ class MarkerTracker:
         )
         return seen, strain, doubt
 
-    def _search(
-        self, image: NDArray[np.uint8], found: Alignment, seen: BoolArray, strain: FloatArray
-    ) -> _Result:
+    def _search(self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats) -> _Result:
         """Joint choice among the spots, for marks outside the largest smooth component."""
         jumped = self._jumps(image, seen)
         if jumped is not None:
@@ -286,7 +281,7 @@ class MarkerTracker:
             self._take_left_over(image, spots[unused], result)
         return result
 
-    def _jumps(self, image: NDArray[np.uint8], seen: BoolArray) -> FloatArray | None:
+    def _jumps(self, image: NDArray[np.uint8], seen: Flags) -> Floats | None:
         """Where the marks (N, 2) are, px, if a whole grid jumped or is a pitch off; None if none.
 
         A grid apart from the others that is off by a pitch is as smooth as before. What tells is its border,
@@ -308,7 +303,7 @@ class MarkerTracker:
                     jumped[grid] += jump
         return jumped if (jumped != self._position).any() else None
 
-    def _is_at_rest(self, image: NDArray[np.uint8], grid: IntArray, seen: BoolArray) -> bool:
+    def _is_at_rest(self, image: NDArray[np.uint8], grid: Indices, seen: Flags) -> bool:
         """Whether a grid that was half a pitch away or farther is seen whole, and better, where it rests."""
         moved = _median(self._position[grid] - self._origin[grid])
         if np.hypot(*moved) < HALF_PITCH * self._pitch:
@@ -321,11 +316,11 @@ class MarkerTracker:
     def _candidates(
         self,
         image: NDArray[np.uint8],
-        position: FloatArray,
-        inliers: BoolArray,
-        outliers: IntArray,
-        expected: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
+        position: Floats,
+        inliers: Flags,
+        outliers: Indices,
+        expected: Floats,
+    ) -> tuple[Floats, Floats]:
         """Spots (M, 2), px, that no inlier is at, and their strengths (M,).
 
         expected : (k, n, 2), px, around which spots are searched. outliers : marks that are seen without
@@ -339,7 +334,7 @@ class MarkerTracker:
         strengths = np.concatenate([strength[unclaimed], np.full(len(own), OWN_STRENGTH)])
         return np.concatenate([spots[unclaimed], own]), strengths
 
-    def _take(self, image: NDArray[np.uint8], marks: IntArray, spots: FloatArray, result: _Result) -> None:
+    def _take(self, image: NDArray[np.uint8], marks: Indices, spots: Floats, result: _Result) -> None:
         """Align marks from their spots and enter what is found."""
         if len(marks) == 0:
             return
@@ -352,7 +347,7 @@ class MarkerTracker:
         faint = (gain > LEAST_SPOT_GAIN) & (gain < MOST_GAIN) & (r_squared > LEAST_SPOT_R_SQUARED)
         result.found[marks] = sharp | faint
 
-    def _take_left_over(self, image: NDArray[np.uint8], spots: FloatArray, result: _Result) -> None:
+    def _take_left_over(self, image: NDArray[np.uint8], spots: Floats, result: _Result) -> None:
         """Give spots that nobody chose to missing marks that the field puts next to them.
 
         Where the field is steep, a fit to the marks around predicts better than their motions do.
@@ -365,7 +360,7 @@ class MarkerTracker:
         mutual &= away.min(axis=1) < LEFT_OVER_SPOT * self._pitch
         self._take(image, missing[mutual], spots[spot[mutual]], result)
 
-    def _infer(self, position: FloatArray, found: BoolArray) -> IntArray:
+    def _infer(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that were not found, in place, and return those; others stay where they were."""
         position[~found] = self._position[~found]
         return self._interpolator.place(position, found)
@@ -374,12 +369,12 @@ class MarkerTracker:
 class _Result(NamedTuple):
     """What a search finds of each mark: (N, 2) position, (N,) found, (N,) stderr; filled as it goes on."""
 
-    position: FloatArray
-    found: BoolArray
+    position: Floats
+    found: Flags
     stderr: NDArray[Any]
 
 
-def _median(vectors: FloatArray) -> FloatArray:
+def _median(vectors: Floats) -> Floats:
     """Of each coordinate, (2,); zero for none. A fifth of the time of `np.median` for a hundred vectors."""
     if len(vectors) == 0:
         return np.zeros(2)
@@ -387,7 +382,7 @@ def _median(vectors: FloatArray) -> FloatArray:
     return np.asarray((ordered[(len(vectors) - 1) // 2] + ordered[len(vectors) // 2]) / 2, np.float64)
 
 
-def _lengths(vectors: FloatArray) -> FloatArray:
+def _lengths(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)), np.float64)
 
 
@@ -401,19 +396,19 @@ def trusted(gain: Any, r_squared: Any) -> Any:
     "float64[::1], float64[::1], boolean[::1], float64, float64, boolean[::1], float64[::1])"
 )
 def check_marks(
-    position: FloatArray,
-    before: FloatArray,
-    origin: FloatArray,
+    position: Floats,
+    before: Floats,
+    origin: Floats,
     gain: NDArray[np.float32],
     r_squared: NDArray[np.float32],
-    edges: IntArray,
-    length: FloatArray,
-    steepest: FloatArray,
-    seen_before: BoolArray,
+    edges: Indices,
+    length: Floats,
+    steepest: Floats,
+    seen_before: Flags,
     longest: float,
     restless: float,
-    seen: BoolArray,
-    strain: FloatArray,
+    seen: Flags,
+    strain: Floats,
 ) -> int:
     """Fill `seen`, (N,), and `strain`, (E,), of each link; returns SURE, INCOMPLETE or DOUBTFUL.
 
