@@ -486,6 +486,7 @@ def test_nothing_but_the_page_is_served(view: Views) -> None:
         "/hub.py",
         "/live",
         "/app.js/",
+        "//[",
     ):
         assert get(sink, path).status == 404, path
 

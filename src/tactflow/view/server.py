@@ -130,7 +130,7 @@ class Server:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The response to a request for a file; None admits a WebSocket."""
         host = "".join(request.headers.get_all("Host"))
-        path = urlsplit(request.path).path
+        path = request.path.partition("?")[0]
         upgrade = path == "/live" and "Upgrade" in request.headers
         # The header is copied into the policy below, so it must be a plain name and port.
         parts = HOST_HEADER.fullmatch(host)
@@ -171,7 +171,7 @@ class Server:
     def _admits(self, connection: ServerConnection) -> bool:
         if self.token is None or connection.request is None:
             return self.token is None
-        token = parse_qs(urlsplit(connection.request.path).query).get("token", [""])[0]
+        token = parse_qs(connection.request.path.partition("?")[2]).get("token", [""])[0]
         return hmac.compare_digest(token.encode(), self.token.encode())
 
 
