@@ -19,6 +19,7 @@ setup(
         (f"share/{NAME}/config", ["config/tactflow.yaml"]),
     ],
     install_requires=["setuptools", "numpy", "pyzmq"],
+    extras_require={"test": ["pytest"]},
     zip_safe=True,
     entry_points={"console_scripts": [f"bridge = {NAME}.__main__:main"]},
 )

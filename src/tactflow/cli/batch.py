@@ -25,8 +25,6 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.report import Section, write_report
 from tactflow.system.signals import INTERRUPTED, ending_handled
 
-_FAILED_SHOWN = 20
-"""Recordings that failed, named at the end: they fit on a screen."""
 _LONGEST = 200
 """Letters of a message in a list of many: two lines of a terminal."""
 
@@ -226,9 +224,6 @@ def _closing(result: Result, done_before: int) -> Iterator[str]:
     yield f"{now} done now, {done_before} done before, {len(failed)} failed{undone}"
     if result.ended is not None:
         yield f"ended early: {result.ended}"
-    yield from (f"  failed: {outcome.name}: {_in_short(outcome)}" for outcome in failed[:_FAILED_SHOWN])
-    if len(failed) > _FAILED_SHOWN:
-        yield f"  and {len(failed) - _FAILED_SHOWN} more; the table of runs has all"
     warnings = [o.warnings.partition("\n")[0] for o in outcomes if o.warnings and o.status == "done"]
     if warnings:
         yield f"{len(warnings)} done with warnings: {warnings[0]}; the table of runs has all"
