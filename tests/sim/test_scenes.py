@@ -9,37 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.sim import Scene, gel, open_scene, scene_descriptions
+from tactflow.sim import Scene, gel, open_scene, recipes, scene_descriptions
 from tactflow.vision.geometry import Preprocessor
 
 SCENES = [*scene_descriptions()]
 MOVING = [
-    "press",
-    "ball",
-    "cable",
-    "bent_cable",
-    "slide",
-    "stick_slip",
-    "twist",
-    "edge",
-    "box",
-    "ring",
-    "screw",
-    "two",
-    "border",
-    "tap",
-    "creep",
-    "jumps",
-    "worn",
-    "dense",
-    "tilted",
-    "strong_shear",
-    "block",
-    "coin",
-    "key",
-    "finger",
-    "painted",
-    "stutter",
+    *{
+        recipe.programme: name for name, recipe in reversed(recipes.SCENES.items()) if recipe.programme
+    }.values(),
+    *("bent_cable", "worn", "dense", "tilted", "painted", "stutter"),
 ]
 """Scenes that differ in their contacts or in where their markers are, not in the picture alone."""
 
