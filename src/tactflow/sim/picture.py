@@ -61,7 +61,9 @@ class Painter:
         scale = self._gain(moment) / FIXED_POINT
         if shown is None:
             return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), np.uint8)
-        noise = optics.sensor_noise(settings.seed, moment, canvas.shape)
+        # Drawing the noise of a seed takes 0.3 s; without any, the canvas takes its place with weight 0.
+        noisy_camera = settings.noise or settings.shot
+        noise = optics.sensor_noise(settings.seed, moment, canvas.shape) if noisy_camera else canvas
         if settings.shot:
             noisy = np.asarray(canvas, np.float32) * np.float32(scale)
             spread = np.sqrt(settings.noise**2 + settings.shot**2 * np.maximum(noisy, 0) / np.float32(128.0))
