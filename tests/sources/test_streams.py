@@ -17,6 +17,8 @@ from tactflow.sources import Watch, Watched, open_source
 from tests.clock import PATIENCE, until
 from tests.sources.flaky import Reading
 
+Opens = Callable[..., Reading]
+
 
 class Server:
     """A stream at `address`. does : good or silent. count : of frames that tell their index; None: noise."""
@@ -83,7 +85,7 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture
-def watched(server: Server) -> Iterator[Callable[..., Reading]]:
+def watched(server: Server) -> Iterator[Opens]:
     """Opens the stream, watched, and reads it in another thread."""
     opened: list[Reading] = []
 
@@ -129,11 +131,7 @@ def test_an_address_without_a_stream_is_an_error_without_the_password(
 
 @pytest.mark.parametrize(("does", "says"), [("gone", "is gone since"), ("silent", "no frames since")])
 def test_a_stream_that_fails_is_reported_and_comes_back(
-    does: str,
-    says: str,
-    server: Server,
-    watched: Callable[..., Reading],
-    caplog: pytest.LogCaptureFixture,
+    does: str, says: str, server: Server, watched: Opens, caplog: pytest.LogCaptureFixture
 ) -> None:
     reading = watched()
     arrivals = reading.arrivals
@@ -152,21 +150,10 @@ def test_a_stream_that_fails_is_reported_and_comes_back(
     assert [arrival.seq for arrival in arrivals] == sorted({arrival.seq for arrival in arrivals})
 
 
-def test_a_server_that_stays_away_ends_the_run_with_what_to_try(
-    server: Server, watched: Callable[..., Reading]
-) -> None:
+def test_a_server_that_stays_away_ends_the_run_with_what_to_try(server: Server, watched: Opens) -> None:
     reading = watched(no_frame_timeout=0.5)
     until(lambda: reading.arrivals)
     server.stop()
     reading.join()
     assert "gone, no good frame for" in reading.error
     assert "no stream can be opened there" in reading.error
-
-
-def test_without_reconnection_a_server_that_goes_away_is_the_end(
-    server: Server, watched: Callable[..., Reading]
-) -> None:
-    reading = watched(reconnect=False)
-    server.stop()
-    reading.join()
-    assert reading.error == ""
