@@ -12,7 +12,7 @@ from pathlib import Path
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.sources import recording_suffixes
 from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
-from tactflow.sources.paths import find_path, split_prefix
+from tactflow.sources.paths import find_path, locate, split_prefix
 from tactflow.system.files import expanded, is_utf8
 
 LISTS = frozenset([".txt", ".list"])
@@ -104,7 +104,7 @@ def _sources(word: str, directory: Path | None) -> Iterator[str]:
     if word.isdecimal() or word.startswith("/dev/") or re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", word):
         raise SourceError(f"{word}: is a live source; a batch needs recordings: see `tactflow record`")
     scheme, word = split_prefix(word, directory)
-    exists = any((base / expanded(word)).exists() for base in (Path(), directory or Path()))
+    exists = locate(word, directory) is not None
     # The name of an existing file may contain wildcards or a question mark.
     plain, mark, options = (word, "", "") if exists else word.partition("?")
     if glob.has_magic(plain) and not exists:
