@@ -140,12 +140,8 @@ class _Wiring:
             message = "a source cannot be gated; gate the stages behind it"
             self._document.report(place, message, at_key=True)
             return
-        gates = (
-            [((*place, i), gate) for i, gate in enumerate(when)]
-            if isinstance(when, list)
-            else [(place, when)]
-        )
-        for keys, gate in gates:
+        for index, gate in enumerate(when if isinstance(when, list) else [when]):
+            keys = (*place, index) if isinstance(when, list) else place
             if isinstance(gate, dict):
                 self._gate(gate.get("signal"), (*keys, "signal"), draft)
             else:
@@ -184,17 +180,15 @@ class _Wiring:
     def _unknown(self, text: str, user: Draft, by_port: bool) -> str:
         stage, dot, _ = text.partition(".")
         ids = [draft.id for draft in self._stages if draft is not user]
-        if dot:
-            return f"there is no stage {stage!r}{did_you_mean(stage, ids, 'stages: ')}"
         ports = {name: Ref(draft.id, name) for draft in self._stages for name in draft.outputs}
-        if by_port:
-            signals = [name for name, ref in ports.items() if self._signal(ref) is not None]
-            if text in ports:
-                return f"no stage above gives {text}; {ports[text].node} stands below: write {ports[text]}"
-            return f"there is no signal {text!r}{did_you_mean(text, signals, 'signals: ')}"
+        if text in ports and by_port:
+            return f"no stage above gives {text}; {ports[text].node} stands below: write {ports[text]}"
         if text in ports:
             return f"{text!r} is a port, not a stage; write {ports[text]}"
-        return f"there is no stage {text!r}{did_you_mean(text, ids, 'stages: ')}"
+        if by_port and not dot:
+            signals = [name for name, ref in ports.items() if self._signal(ref) is not None]
+            return f"there is no signal {text!r}{did_you_mean(text, signals, 'signals: ')}"
+        return f"there is no stage {stage!r}{did_you_mean(stage, ids, 'stages: ')}"
 
     def _above(self, user: Draft) -> list[Draft]:
         """The stages an input may take from by name, nearest first."""
@@ -250,9 +244,8 @@ class _Wiring:
     def _meaning(self, ref: Ref, signal: SignalPort, visited: Sequence[str] = ()) -> SignalPort:
         """The signal that defines what a closed gate means: behind a stage that holds one, the held one."""
         producer = self._by_id[ref.node]
-        for source in (
-            producer.inputs.values() if signal.closed is None and producer.id not in visited else ()
-        ):
+        only_holds = signal.closed is None and producer.id not in visited
+        for source in producer.inputs.values() if only_holds else ():
             held = self._signal(source) if source else None
             if source and held:
                 return self._meaning(source, held, [*visited, producer.id])
