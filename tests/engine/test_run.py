@@ -390,30 +390,6 @@ def test_a_failing_source_is_told_apart(toy_runner: MakeRunner, capture: dict[st
         assert [row[0] for row in rows(runner)] == list(range(5))
 
 
-def test_an_error_while_closing_is_reported_and_the_others_are_closed(toy_runner: MakeRunner) -> None:
-    runner = toy_runner(sinks={"bad": {"use": "BadClose"}, "out": {"use": "Collect"}})
-    result = runner.run()
-    assert result.exit_code == 3
-    assert "bad: closing failed: disk full" in str(result.error)
-    assert runner.nodes["out"].instance.closed == runner.source.closed == 1
-
-
-def test_what_cannot_be_opened_stops_the_run_and_what_was_opened_is_closed(toy_runner: MakeRunner) -> None:
-    runner = toy_runner()
-    cls: Any = runner.pipeline.nodes["join"].component.cls
-
-    def refuse(_: Any) -> None:
-        raise OSError("no licence")
-
-    cls.open = refuse
-    result = runner.run()
-    assert result.exit_code == 3
-    assert "join" in str(result.error)
-    assert "no licence" in str(result.error)
-    assert runner.nodes["level"].instance.closed == 1
-    assert runner.source.closed == 1
-
-
 # -- checks -----------------------------------------------------------------------------------------------
 
 

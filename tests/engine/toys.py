@@ -326,9 +326,3 @@ class OnlyLevel(Counted, Sink):
 
     def write(self, tick: Tick, level: Number) -> None:  # noqa: ARG002 (the port must be asked for)
         self.saw(tick.frame.seq)
-
-
-class BadClose(OnlyLevel):
-    def close(self) -> None:
-        super().close()
-        raise OSError("disk full")
