@@ -80,7 +80,7 @@ def test_a_broken_class_in_an_own_file_is_reported(
 ) -> None:
     shutil.copy(PARTS, tmp_path / "parts.py")
     monkeypatch.chdir(tmp_path)
-    assert main(["stages", "./parts.py:Forgetful"]) == 2
-    assert "must declare memory" in capsys.readouterr().err
+    assert main(["stages", "./parts.py:Bare"]) == 2
+    assert "parameter image has no annotation" in capsys.readouterr().err
     assert main(["stages", "./parts.py"]) == 2
     assert "has several classes" in capsys.readouterr().err
