@@ -62,7 +62,7 @@ def test_what_was_found_as_json(capsys: pytest.CaptureFixture[str]) -> None:
         ([GEL, "--dot", "900"], 2, "--dot: required dot_radius 1 to 150 px, got 900"),
         ([GEL, "--dot", "nan"], 2, "--dot: required dot_radius"),
         ([GEL, "--picture", "found.txt"], 2, "ends in .png or .jpg, got found.txt"),
-        ([GEL, "--picture", "missing/found.png"], 2, "there is no folder"),
+        ([GEL, "--picture", "here.png/found.png"], 2, "is not a folder"),
         ([GEL, "--picture", "here.png"], 2, "here.png is already there; give --overwrite"),
     ],
 )

@@ -14,7 +14,7 @@ from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import load_errors, regressions
 from tactflow.bench.run import DEFAULT, MARKERLESS, WEDGE, Plan, run_bench
 from tactflow.bench.tables import print_sections, sections, write_markdown
-from tactflow.cli.options import refuse_output
+from tactflow.cli.options import refuse_output, writing
 from tactflow.cli.terminal import notes, progress_bar, say
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -128,8 +128,7 @@ def _files(given: list[str]) -> dict[str, Path]:
 def _write(path: Path | None, write: Callable[[Path], object]) -> None:
     if path is None:
         return
-    try:
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         write(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
     say(f"tactflow: wrote {path}")

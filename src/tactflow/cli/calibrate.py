@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,7 @@ from tactflow.calibration.presses import PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
 from tactflow.cli.guide import Guide, typed_lines
-from tactflow.cli.options import add_overwrite, positive
+from tactflow.cli.options import add_overwrite, number, positive, refuse_output
 from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError
@@ -49,9 +48,8 @@ WORSE: Final = 1.5
 LOOSE: Final = 0.02
 """Relative error of a scale by pitch above which a better method is advised. Chosen by hand: grids of the
 simulator have less than 0.01, the rings of a TacTip 0.1 to 0.15."""
-SHORTEST: Final = 1e-3
-LONGEST: Final = 1e4
-"""Lengths that are accepted, mm. Chosen by hand: gels and balls have 1 to 100."""
+# Chosen by hand: gels and balls have 1 to 100.
+_millimetres = number(float, 1e-3, 1e4, "millimetres from 0.001 to 10000")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -156,10 +154,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
-    if out.suffix != ".yaml":
-        raise ConfigError(f"--out: required a file whose name ends in .yaml, got {out}")
-    if out.exists() and not args.overwrite:
-        raise ConfigError(f"--out: {out} is already there; give --overwrite to replace it")
+    refuse_output("--out", out, overwrite=args.overwrite, suffixes=(".yaml",))
     _instruct(args, args.ball_radius, "; what was pressed is kept")
     kept = KeptPresses(out.with_suffix(".presses"))
     if args.fresh:
@@ -530,18 +525,6 @@ def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[
                 component = replace(node.component, cls=node.component.cls.through(guide))
                 return {id_: replace(node, component=component)}
     raise AssertionError("the sink view guides")
-
-
-def _millimetres(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not SHORTEST <= value <= LONGEST:
-        raise argparse.ArgumentTypeError(
-            f"required millimetres from {SHORTEST:g} to {LONGEST:g}, got {text!r}"
-        )
-    return value
 
 
 def _photometric_words(errors: dict[str, float]) -> str:

@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from tactflow.cli.options import add_endpoint, seconds
+from tactflow.cli.options import add_endpoint, seconds, writing
 from tactflow.cli.terminal import printable, typed
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
@@ -78,11 +78,10 @@ def add_arguments_keys(parser: argparse.ArgumentParser) -> None:
 def run_keys(args: argparse.Namespace) -> int:
     """Make keys, and print what goes where."""
     try:
-        publisher, subscriber = make_keys(args.folder, args.name)
+        with writing(args.folder):
+            publisher, subscriber = make_keys(args.folder, args.name)
     except WrongKeysError as error:
         raise ConfigError(f"keys: {error}") from None
-    except OSError as error:
-        raise StageError(f"{args.folder}: keys cannot be written: {error.strerror or error}") from None
     print(f"{publisher} stays here, for the run: {typed('--set', f'sinks.zmq.keys={publisher}')}")
     print(
         f"{subscriber} goes to the subscriber, over a safe way (scp), and to nobody else: "

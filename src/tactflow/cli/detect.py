@@ -12,17 +12,16 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from tactflow.cli.options import add_json, add_overwrite, refuse_output
+from tactflow.cli.options import add_json, add_overwrite, refuse_output, writing
 from tactflow.cli.terminal import printable
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
+from tactflow.system.files import completed
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
 
-PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
-"""File extensions of pictures that can be written."""
 SHOWN: Final = 0.25
 """Score of the runner-up, relative to that of the marks, above which it is shown. Chosen by hand."""
 
@@ -60,9 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if args.frame < 0:
         raise ConfigError(f"--frame: required 0 or more, got {args.frame}")
     if args.picture is not None:
-        if args.picture.suffix.lower() not in PICTURES:
-            raise ConfigError(f"--picture: required a name that ends in .png or .jpg, got {args.picture}")
-        refuse_output("--picture", args.picture, overwrite=args.overwrite)
+        refuse_output("--picture", args.picture, overwrite=args.overwrite, suffixes=(".png", ".jpg"))
     image = _frame(source, args.frame)
     image = Preprocessor(image.shape[1::-1], rotate=args.rotate, downsample=args.downsample)(image)
     valid = None if args.all else valid_area(image)
@@ -82,7 +79,9 @@ def run(args: argparse.Namespace) -> int:
     text = "\n".join(map(printable, [title, *lines]))
     print(orjson.dumps(_as_json(marks, lines)).decode() if args.json else text)
     if args.picture is not None:
-        _write(args.picture, draw_detection(image, marks, text, rival=rival, valid=valid))
+        picture = draw_detection(image, marks, text, rival=rival, valid=valid)
+        with writing(f"--picture {args.picture}"), completed(args.picture) as partial:
+            partial.write_bytes(cv2.imencode(args.picture.suffix.lower(), picture)[1].tobytes())
     return 0 if marks is not None else StageError.exit_code
 
 
@@ -136,11 +135,3 @@ def _frame(source: str, number: int) -> NDArray[np.uint8]:
         raise SourceError(f"{source}: --frame {number} is beyond its {count} frames, counted from 0")
     finally:
         reader.close()
-
-
-def _write(path: Path, picture: NDArray[np.uint8]) -> None:
-    _, encoded = cv2.imencode(path.suffix.lower(), picture)
-    try:
-        path.write_bytes(encoded.tobytes())
-    except OSError as error:
-        raise StageError(f"--picture {path}: {error.strerror or error}") from error

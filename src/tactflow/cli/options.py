@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from tactflow.cli.terminal import say
@@ -13,6 +16,7 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan, make_plan
+from tactflow.system.outputs import cannot_write
 
 UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
 """Unit -> seconds."""
@@ -81,12 +85,22 @@ def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipe
     return pipeline, plan
 
 
-def positive(text: str) -> int:
-    """A type of argparse: a whole number from 1."""
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"required a whole number from 1, got {text!r}")
-    return value
+def number(kind: type[float], least: float, most: float, required: str) -> Callable[[str], float]:
+    """A type of argparse: an `int` or `float` within limits. required : what the complaint asks for."""
+
+    def parse(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"required {required}, got {text!r}")
+        return value
+
+    return parse
+
+
+positive = number(int, 1, math.inf, "a whole number from 1")
 
 
 def seconds(text: str) -> float:
@@ -106,22 +120,34 @@ def seconds(text: str) -> float:
     return float(match[1]) * UNITS[match[2]]
 
 
-def refuse_output(option: str, path: Path, *, overwrite: bool) -> None:
-    """Find out before the work, not after it, that a file cannot be written.
+def refuse_output(option: str, path: Path, *, overwrite: bool, suffixes: Sequence[str] = ()) -> None:
+    """Find out before the work, not after it, that a file cannot be written. Missing folders will be made.
 
-    option : the option that names the file.
+    option : the option that names the file. suffixes : how its name may end; empty for any.
 
     Raises
     ------
-    ConfigError : its folder does not exist or is read-only; it is a folder; it exists and `overwrite` is
-        false.
+    ConfigError : its name ends otherwise; its folder is not a folder or read-only; it is a folder; it exists
+        and `overwrite` is false.
     """
-    folder = path.absolute().parent
+    if suffixes and path.suffix.lower() not in suffixes:
+        ends = " or ".join(suffixes)
+        raise ConfigError(f"{option}: required a file whose name ends in {ends}, got {path}")
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
     if not folder.is_dir():
-        raise ConfigError(f"{option}: there is no folder {folder}")
+        raise ConfigError(f"{option}: {path} cannot be made, because {folder} is not a folder")
     if not os.access(folder, os.W_OK):
         raise ConfigError(f"{option}: {folder} cannot be written into")
     if path.is_dir():
         raise ConfigError(f"{option}: {path} is a folder; required a file")
     if path.exists() and not overwrite:
         raise ConfigError(f"{option}: {path} is already there; give --overwrite to replace it")
+
+
+@contextmanager
+def writing(name: Path | str) -> Iterator[None]:
+    """Turn an OSError into a StageError. name : of what cannot be written, as the user gave it."""
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(name, error) from error

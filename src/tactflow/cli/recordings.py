@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from tactflow.cli.options import add_overwrite, add_quiet
+from tactflow.cli.options import add_overwrite, add_quiet, refuse_output, writing
 from tactflow.cli.terminal import notes, progress_bar, say
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.recording import missing_packages
@@ -69,13 +69,11 @@ def run_export(args: argparse.Namespace) -> int:
         raise ConfigError(f"--fps: required 1 to {FASTEST}, got {fps}")
     started: list[str] = []
     try:
-        with notes(), completed(args.out) as folder:
+        with notes(), writing(args.out), completed(args.out) as folder:
             episodes = _episodes(args.recordings, args.pipeline, started)
             exporter(folder, episodes, fps=fps, task=args.task, pictures=args.pictures)
     except StageError as error:
         raise StageError(f"{started[-1]}: {error}" if started else str(error)) from error
-    except OSError as error:
-        raise StageError(f"{args.out}: cannot be written: {error.strerror or error}") from error
     count = len(args.recordings)
     say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'} at {fps} fps")
     return 0
@@ -149,17 +147,11 @@ def run_repair(args: argparse.Namespace) -> int:
     if not path.is_file():
         raise SourceError(f"{path}: no such file")
     out: Path = args.out or path.with_name(f"{path.stem}-repaired{path.suffix}")
-    if out.is_dir():
-        raise ConfigError(f"--out: {out} is a folder; name a file in it, as in {out / path.name}")
     if out.exists() and out.samefile(path):
         raise ConfigError(f"--out: {out} is the file to repair; name another one")
-    if out.exists() and not args.overwrite:
-        raise ConfigError(f"{out} is already there; give --overwrite to replace it, or --out FILE")
-    try:
+    refuse_output("--out", out, overwrite=args.overwrite)
+    with writing(f"--out {out}"):
         summary = _repair(path, out, shown=not args.quiet)
-    except OSError as error:
-        reason = error.strerror or error
-        raise StageError(f"{out}: cannot be written: {reason}; --out puts it on another disk") from error
     if not args.quiet:
         say(summary)
     return 0

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tactflow.api import ended_by_signals, make_runner
-from tactflow.cli.options import add_overwrite, add_pipeline, add_quiet, positive, seconds
+from tactflow.cli.options import add_overwrite, add_pipeline, add_quiet, positive, refuse_output, seconds
 from tactflow.cli.pipelines import warn_of_opencv
 from tactflow.cli.progress import run_progress, summary
 from tactflow.cli.terminal import notes, say
@@ -291,8 +291,7 @@ def run_record(args: argparse.Namespace) -> int:
     problem = missing_packages()
     if problem is not None:
         raise ConfigError(problem)
-    if args.out.suffix != ".mcap":
-        raise ConfigError(f"--out: required a file whose name ends in .mcap, got {args.out}")
+    refuse_output("--out", args.out, overwrite=True, suffixes=(".mcap",))
     return run(args, lambda sensor: _recording_sink(args, sensor))
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
+from tactflow.cli.options import refuse_output, writing
 from tactflow.cli.terminal import progress_bar, say, table
-from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.errors import ConfigError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,45 +57,31 @@ def run(args: argparse.Namespace) -> int:
             frames_kind(args.out)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    if args.truth is not None and args.truth.suffix.lower() not in TRUTH_SUFFIXES:
-        raise ConfigError(f"--truth: required a {', '.join(TRUTH_SUFFIXES)} file, got {args.truth}")
+    if args.out is not None and not _replaces_pictures(args.out, args.overwrite):
+        refuse_output("--out", args.out, overwrite=args.overwrite)
+    if args.truth is not None:
+        refuse_output("--truth", args.truth, overwrite=args.overwrite, suffixes=TRUTH_SUFFIXES)
     jobs = [("--out", args.out, write_frames), ("--truth", args.truth, write_truth)]
-    for option, path, _write in jobs:
-        if path is not None:
-            _check_place(option, path, args.overwrite)
     if args.out is not None and args.truth is not None and args.out.absolute() == args.truth.absolute():
         raise ConfigError(f"--out and --truth are the same file: {args.out}")
     for option, path, write in jobs:
         if path is None:
             continue
-        try:
-            with progress_bar(path.name, len(scene), shown=not args.quiet) as update:
-                write(scene, path, partial(_show, update))
-        except OSError as error:
-            # Its text names the unfinished file.
-            raise StageError(f"{option} {path}: cannot be written: {error.strerror or error}") from error
+        with writing(f"{option} {path}"), progress_bar(path.name, len(scene), shown=not args.quiet) as update:
+            write(scene, path, lambda done, update=update: update(completed=done))
         if not args.quiet:
             say(f"{path}: {len(scene)} frames of {scene.name}")
     return 0
 
 
-def _show(update: Callable[..., None], done: int) -> None:
-    update(completed=done)
-
-
-def _check_place(option: str, path: Path, overwrite: bool) -> None:
-    if path.is_dir() and option == "--truth":
-        raise ConfigError(f"{option}: {path} is a folder; required a file")
-    if path.exists() and not overwrite:
-        raise ConfigError(f"{option}: {path} is already there; give --overwrite to replace it")
-    # Replacing a folder deletes it: only one that holds nothing but images of ours may go.
-    if path.is_dir() and any(item.suffix != ".png" or not item.stem.isdecimal() for item in path.iterdir()):
-        raise ConfigError(f"{option}: {path} holds other files than numbered PNG images; name another folder")
-    parent = path.absolute().parent
-    while not parent.exists():
-        parent = parent.parent
-    if not parent.is_dir():
-        raise ConfigError(f"{option}: {path} cannot be made, because {parent} is not a folder")
+def _replaces_pictures(path: Path, overwrite: bool) -> bool:
+    """Whether a folder of numbered pictures, and nothing else, may be replaced; other folders are refused."""
+    if not (path.is_dir() and overwrite):
+        return False
+    # Replacing a folder deletes it.
+    if any(item.suffix != ".png" or not item.stem.isdecimal() for item in path.iterdir()):
+        raise ConfigError(f"--out: {path} holds other files than numbered PNG images; name another folder")
+    return True
 
 
 def _list() -> None:

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import math
+import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Final
 
 import orjson
 
-from tactflow.cli.options import add_json, refuse_output, seconds
+from tactflow.cli.options import add_json, add_overwrite, number, refuse_output, seconds, writing
 from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
-LARGEST_SEED: Final = 1_000_000
-"""The simulator takes seeds up to 2**31 - 1, and a search uses some hundreds from the given one on."""
+_above_0 = number(float, sys.float_info.min, sys.float_info.max, "a number above 0")
+# The simulator takes seeds up to 2**31 - 1, and a search uses some hundreds from this one on.
+_seed = number(int, 0, 1_000_000, "a whole number from 0 to 1000000")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RECORDING",
         help="of the sensor: untouched at first, then some presses; as 'tactflow run --source', not live",
     )
-    parser.add_argument("--max-error", type=_positive, metavar="PX", help="of the camera's picture")
-    parser.add_argument("--max-ms", type=_positive, metavar="MS", help="CPU time of a frame with contact")
+    parser.add_argument("--max-error", type=_above_0, metavar="PX", help="of the camera's picture")
+    parser.add_argument("--max-ms", type=_above_0, metavar="MS", help="CPU time of a frame with contact")
     parser.add_argument(
         "--error",
         default="any",
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
     )
     parser.add_argument("--html", type=Path, metavar="FILE", help="default: beside --out, ending in .html")
-    parser.add_argument("--overwrite", action="store_true", help="replace these files if they are there")
+    add_overwrite(parser, "these files")
     add_json(parser)
 
 
@@ -102,11 +102,8 @@ def run(args: argparse.Namespace) -> int:
         return StageError.exit_code
     # YAML takes no control characters, which a name in a comment may have.
     text = "\n".join(map(printable, report.pipeline_text(tuned, file, args.out).split("\n")))
-    try:
-        with completed(args.out) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StageError(f"{args.out}: {error.strerror or error}") from error
+    with writing(args.out), completed(args.out) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
     written = f"{args.out} is" if page is None else f"{args.out} and {page} are"
     say(f"{written} written; try: {typed('tactflow', 'run', str(args.out), '--source', args.source)}")
     return 0
@@ -114,9 +111,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _page(args: argparse.Namespace) -> Path | None:
     """Where the page goes; None without matplotlib, unless the page was asked for. Refuses wrong files."""
-    if args.out.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"--out: required a file whose name ends in .yaml, got {args.out}")
-    refuse_output("--out", args.out, overwrite=args.overwrite)
+    refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
     problem = missing("plots", "plot", ["matplotlib"])
     if problem and args.html is None:
         say(f"no page: {problem}")
@@ -126,20 +121,3 @@ def _page(args: argparse.Namespace) -> Path | None:
     page: Path = args.html or args.out.with_suffix(".html")
     refuse_output("--html", page, overwrite=args.overwrite)
     return page
-
-
-def _seed(text: str) -> int:
-    value = int(text) if text.isdecimal() else -1
-    if not 0 <= value <= LARGEST_SEED:
-        raise argparse.ArgumentTypeError(f"required a whole number from 0 to {LARGEST_SEED}, got {text!r}")
-    return value
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"required a number above 0, got {text!r}")
-    return value
