@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from tactflow.cli.options import refuse_output, writing
@@ -68,10 +70,14 @@ def run(args: argparse.Namespace) -> int:
         if path is None:
             continue
         with writing(f"{option} {path}"), progress_bar(path.name, len(scene), shown=not args.quiet) as update:
-            write(scene, path, lambda done, update=update: update(completed=done))
+            write(scene, path, partial(_show, update))
         if not args.quiet:
             say(f"{path}: {len(scene)} frames of {scene.name}")
     return 0
+
+
+def _show(update: Callable[..., None], done: int) -> None:
+    update(completed=done)
 
 
 def _replaces_pictures(path: Path, overwrite: bool) -> bool:
