@@ -244,4 +244,6 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _processors() -> int:
     """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
