@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -13,17 +13,13 @@ from tactflow.vision.arrays import Floats
 
 _DISTORTION_LENGTHS: Final = (4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV's polynomial model knows."""
-_STEP: Final = 1e-3
-"""Half step of the central differences in `Lens.undistort`, px. Derived: float64 rounds a coordinate of
-1e3 px by 1e-13 px, so a slope over 2e-3 px is good to 1e-10."""
-_CONVERGED: Final = 1e-10
-"""Largest error at which Newton's method ends, px. Chosen by hand, a thousand roundings of a coordinate."""
-_MOST_STEPS: Final = 60
-"""Steps after which Newton's method ends in any case. Chosen by hand."""
-_SINGULAR: Final = 1e-9
-"""Smallest determinant of a Jacobian that is divided by, 1. Chosen by hand."""
+_CONVERGED: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-14)
+"""Where the iterations of `Lens.undistort` end: after so many steps, or at so small an error."""
 _ON_AXIS: Final = 1e-12
 """Distance from the optical axis, normalised, below which a fisheye lens bends nothing. Chosen by hand."""
+
+# OpenCV 4 has a name of its own for the function that takes a stopping rule.
+_undistort: Final[Any] = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -65,44 +61,19 @@ class Lens:
     def undistort(self, points: Floats) -> Floats:
         """Inverse of `distort`: (N, 2) float64 px -> (N, 2) float64 px.
 
-        Damped Newton's method with a numerical Jacobian: `cv2.undistortPoints` stops after five fixed-point
-        steps, which leaves tenths of a pixel for strong distortion. A point that no undistorted point maps to
-        ends at the nearest place the iteration came to.
+        A point that no undistorted point maps to ends wherever OpenCV's iteration came to.
         """
-        guess = points.copy()
         if len(points) == 0:
-            return guess
-        error = self.distort(guess) - points
-        size = np.hypot(error[:, 0], error[:, 1])
-        damping = np.ones(len(points))
-        for _ in range(_MOST_STEPS):
-            if float(size.max()) < _CONVERGED:
-                break
-            trial = guess - damping[:, None] * self._newton_step(guess, error)
-            trial_error = self.distort(trial) - points
-            trial_size = np.hypot(trial_error[:, 0], trial_error[:, 1])
-            better = trial_size < size
-            guess[better], error[better], size[better] = (
-                trial[better],
-                trial_error[better],
-                trial_size[better],
-            )
-            damping = np.where(better, np.minimum(1.0, 2 * damping), damping / 2)
-        return guess
-
-    def _newton_step(self, guess: Floats, error: Floats) -> Floats:
-        """The inverse of the Jacobian of `distort` at (N, 2) `guess`, times (N, 2) `error`; px."""
-        right_step, down_step = np.diag([_STEP, _STEP])
-        right = (self.distort(guess + right_step) - self.distort(guess - right_step)) / (2 * _STEP)
-        down = (self.distort(guess + down_step) - self.distort(guess - down_step)) / (2 * _STEP)
-        determinant = right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0]
-        determinant = np.where(np.abs(determinant) < _SINGULAR, _SINGULAR, determinant)
-        return np.column_stack(
-            [
-                (down[:, 1] * error[:, 0] - down[:, 0] * error[:, 1]) / determinant,
-                (right[:, 0] * error[:, 1] - right[:, 1] * error[:, 0]) / determinant,
-            ]
-        )
+            return points.copy()
+        # OpenCV ignores a camera matrix's skew: it gets the identity, and the matrix is applied here.
+        inverse = np.linalg.inv(self.camera_matrix)
+        bent = (points @ inverse[:2, :2].T + inverse[:2, 2]).reshape(-1, 1, 2)
+        if self.fisheye:
+            rays = cv2.fisheye.undistortPoints(bent, np.eye(3), self.distortion, criteria=_CONVERGED)
+        else:
+            rays = _undistort(bent, np.eye(3), self.distortion, criteria=_CONVERGED)
+        straight = np.asarray(rays, np.float64).reshape(-1, 2)
+        return straight @ self.camera_matrix[:2, :2].T + self.camera_matrix[:2, 2]
 
 
 def _equidistant(normalised: Floats, distortion: Floats) -> Floats:
