@@ -118,6 +118,13 @@ def test_an_array_ends_where_nothing_more_is_stored(
             open_source(f"{path}?dataset={array}")
 
 
+def test_times_that_are_damaged_are_an_error_of_the_source(tmp_path: Path) -> None:
+    path = write_zarr(tmp_path / "press.zarr", frames=IMAGES, t=np.arange(5.0))
+    (path / "gel/t/c/0").write_bytes(b"damaged")
+    with pytest.raises(SourceError, match="gel/frames: is damaged or cut off"):
+        open_source(f"{path}?dataset=/gel/frames&times=/gel/t")
+
+
 def test_pixels_in_another_file_are_not_read(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra hdf5 is not installed")
     (tmp_path / "secret").write_bytes(bytes(IMAGES.nbytes))

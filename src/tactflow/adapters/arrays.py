@@ -59,9 +59,9 @@ class ArrayDataset(FrameReader):
                 self.fps = fps or DEFAULT_FPS
                 self._times = np.arange(self.total) / self.fps
             self._read_first()
-        except BaseException:
+        except Exception as error:
             self.close()
-            raise
+            raise error if isinstance(error, SourceError) else damaged(self.name, error) from error
         self.description = f"{spec}, {self.total} frames"
 
     def close(self) -> None:
