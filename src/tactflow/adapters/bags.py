@@ -100,25 +100,26 @@ class Bag(FrameReader):
 
 def _choose(spec: str, topic: str | None, topics: Topics) -> str:
     """The requested topic, if it is there and has pictures; without a request, the only one that has some."""
-    names: dict[bool, list[str]] = {True: [], False: []}
-    for name, (kind, count) in sorted(topics.items()):
-        has_pictures = _decoder(kind) is not None
-        if name == topic and has_pictures:
-            return name
-        names[has_pictures].append(f"{name} ({kind}{'' if count is None else f', {count}'})")
-    with_pictures = [name for name, (kind, _) in topics.items() if _decoder(kind) is not None]
-    if topic is None and len(with_pictures) == 1:
-        return with_pictures[0]
+    pictures = [name for name, (kind, _) in sorted(topics.items()) if _decoder(kind) is not None]
+    if topic in pictures:
+        return topic
+    if topic is None and len(pictures) == 1:
+        return pictures[0]
+    texts = {
+        name: f"{name} ({kind}{'' if count is None else f', {count}'})"
+        for name, (kind, count) in sorted(topics.items())
+    }
+    others = listed([text for name, text in texts.items() if name not in pictures])
+    if topic is None and not pictures:
+        raise SourceError(f"{spec}: no topic holds pictures; there are {others}")
     if topic is None:
         problem = "add ?topic="
     elif topic in topics:
         problem = f"{topic} has messages of type {topics[topic][0]}, which hold no picture; required"
     else:
         problem = f"there is no topic {topic}; required"
-    if topic is None and not with_pictures:
-        raise SourceError(f"{spec}: no topic holds pictures; there are {listed(names[False])}")
-    found, rest = map(listed, names.values())
-    raise SourceError(f"{spec}: {problem} one of: {found}; topics without pictures: {rest}")
+    found = listed([texts[name] for name in pictures])
+    raise SourceError(f"{spec}: {problem} one of: {found}; topics without pictures: {others}")
 
 
 # -- files with messages ------------------------------------------------------------------------------------
