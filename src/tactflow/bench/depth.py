@@ -47,12 +47,12 @@ def measure_simulated(bench: Bench) -> None:
     """Calibrate on each light, and compare height maps with the surface that the simulator knows."""
     for light in LIGHTS:
         photometry = fit_photometry(session_of(open_scene(f"ball?frames=600&light={light}")), scale(), BALL)
-        honest = Tally()
+        coverage = Tally()
         for name in SCENES:
             tally = Tally()
-            times = list(_compare(photometry, open_scene(f"{name}?seed=11&light={light}"), tally, honest))
+            times = list(_compare(photometry, open_scene(f"{name}?seed=11&light={light}"), tally, coverage))
             bench.result.add(DEPTH, light, name, tally.errors(), times={"contact": times}, frames=len(times))
-        bench.result.add(DEPTH, light, "all", honest.errors())
+        bench.result.add(DEPTH, light, "all", coverage.errors())
 
 
 def scale() -> Scale:
@@ -93,10 +93,10 @@ def noisy(image: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
     return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
 
 
-def _compare(photometry: Photometry, scene: Scene, tally: Tally, honest: Tally) -> Iterator[float]:
+def _compare(photometry: Photometry, scene: Scene, tally: Tally, coverage: Tally) -> Iterator[float]:
     """Compare the height map of each press; gives the CPU time of each, s.
 
-    honest : gets the errors of the greatest depth against their standard errors.
+    coverage : gets the errors of the greatest depth against their standard errors.
     """
     preprocess = _preprocessor()
     rest = Rest(preprocess(scene.clean(0)))
@@ -112,7 +112,7 @@ def _compare(photometry: Photometry, scene: Scene, tally: Tally, honest: Tally) 
         volume = float(sunk.sum()) * scale().area(1.0)
         tally.add(depth_rms=100 * rms / sunk.max(), volume_error=100 * abs(depth.volume / volume - 1))
         assert depth.greatest_stderr is not None
-        honest.within("depth", depth.greatest - float(sunk.max()), depth.greatest_stderr)
+        coverage.within("depth", depth.greatest - float(sunk.max()), depth.greatest_stderr)
         yield cpu_s
 
 

@@ -56,7 +56,7 @@ def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Nod
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
+class _Inputs:
     """What the stages of the default pipeline hand to each other in one frame, and the truth about it.
 
     clean : (H, W, 3) uint8, the processed frame without markers.
@@ -76,7 +76,7 @@ class _Given:
         return "contact" if self.truth.touching else "idle"
 
 
-def _run_chain(pipeline: Pipeline, rendered: Rendered) -> Iterator[_Given]:
+def _run_chain(pipeline: Pipeline, rendered: Rendered) -> Iterator[_Inputs]:
     """Run the default pipeline's stages by hand."""
     process = {
         node.id: node.component.cls(node.params).process
@@ -102,7 +102,7 @@ def _run_chain(pipeline: Pipeline, rendered: Rendered) -> Iterator[_Given]:
             "field": None if isinstance(field, Absent) else field.field,
             "contact_mask": np.where(truth.contact_mask, 255, 0).astype(np.uint8),
         }
-        yield _Given(frame, clean, truth, rendered.deep(index), ports)
+        yield _Inputs(frame, clean, truth, rendered.deep(index), ports)
 
 
 class _Judge:
@@ -112,29 +112,29 @@ class _Judge:
         self.tally = Tally()
         self._markers = score.MarkerScore(self.tally)
 
-    def marker_mask(self, given: _Given, found: Any) -> None:
-        score.add_detection(self.tally, metrics.mask_centroids(found), given.truth)
+    def marker_mask(self, inputs: _Inputs, found: Any) -> None:
+        score.add_detection(self.tally, metrics.mask_centroids(found), inputs.truth)
 
-    def inpaint(self, given: _Given, found: Any) -> None:
-        mask = given.ports["marker_mask"]
+    def inpaint(self, inputs: _Inputs, found: Any) -> None:
+        mask = inputs.ports["marker_mask"]
         if mask.any():
-            self.tally.add(inpaint_mae=metrics.masked_mae(found, given.clean, mask))
+            self.tally.add(inpaint_mae=metrics.masked_mae(found, inputs.clean, mask))
 
-    def difference(self, given: _Given, found: Any) -> None:
-        if score.add_decision(self.tally, bool(found.touching), given.truth, given.deep):
-            score.add_mask(self.tally, found.contact_mask, given.truth)
-            score.add_centroid(self.tally, found.contact_mask, given.truth)
+    def difference(self, inputs: _Inputs, found: Any) -> None:
+        if score.add_decision(self.tally, bool(found.touching), inputs.truth, inputs.deep):
+            score.add_mask(self.tally, found.contact_mask, inputs.truth)
+            score.add_centroid(self.tally, found.contact_mask, inputs.truth)
 
-    def hull(self, given: _Given, found: Any) -> None:
-        if score.add_decision(self.tally, found is not None, given.truth, given.deep):
-            score.add_geometry(self.tally, found, given.truth)
+    def hull(self, inputs: _Inputs, found: Any) -> None:
+        if score.add_decision(self.tally, found is not None, inputs.truth, inputs.deep):
+            score.add_geometry(self.tally, found, inputs.truth)
 
-    def tracker(self, given: _Given, found: Any) -> None:
+    def tracker(self, inputs: _Inputs, found: Any) -> None:
         if found is not None:
-            self._markers.add(found, given.truth)
+            self._markers.add(found, inputs.truth)
 
-    def flow_in_mask(self, given: _Given, found: Any) -> None:
-        score.add_flow(self.tally, found, given.truth)
+    def flow_in_mask(self, inputs: _Inputs, found: Any) -> None:
+        score.add_flow(self.tally, found, inputs.truth)
 
 
 STAGES: Mapping[str, frozenset[str]] = {
@@ -154,27 +154,27 @@ def measure_methods(bench: Bench, pipelines: Mapping[str, Pipeline], rendered: R
 
     pipelines : name -> pipeline; the first is the default one and provides the inputs.
     """
-    given = list(_run_chain(next(iter(pipelines.values())), rendered))
+    frames = list(_run_chain(next(iter(pipelines.values())), rendered))
     for stage, ports in STAGES.items():
         ways = alternatives(pipelines, stage)
-        shown = [item for item in given if item.truth.touching or "contact_mask" not in ports]
+        shown = [item for item in frames if item.truth.touching or "contact_mask" not in ports]
         if len(ways) > 1:
             _measure_stage(bench, stage, ways, shown, rendered.case.label)
 
 
 def _measure_stage(
-    bench: Bench, stage: str, ways: Mapping[str, Node], given: Sequence[_Given], scene: str
+    bench: Bench, stage: str, ways: Mapping[str, Node], frames: Sequence[_Inputs], scene: str
 ) -> None:
     judges = {name: _Judge() for name in ways}
     failures: dict[str, str] = {}
 
-    def call(name: str) -> Callable[[_Given], Any]:
+    def call(name: str) -> Callable[[_Inputs], Any]:
         component = ways[name].component
         process = component.cls(ways[name].params).process
         # A class of another kind may need other ports than the stage whose place it takes.
         ports = [p.name for p in component.ports.inputs if p.name in STAGES[stage] or not p.optional]
 
-        def run(item: _Given) -> Any:
+        def run(item: _Inputs) -> Any:
             if name in failures:
                 return None
             try:
@@ -185,16 +185,16 @@ def _measure_stage(
 
         return run
 
-    def see(name: str, item: _Given, found: Any) -> None:
+    def see(name: str, item: _Inputs, found: Any) -> None:
         if name not in failures:
             getattr(judges[name], stage)(item, None if isinstance(found, Absent) else found)
 
     bench.unit.take()
     calls = {name: call(name) for name in ways}
-    times = interleaved(calls, [(item.kind, item) for item in given], see=see)
+    times = interleaved(calls, [(item.kind, item) for item in frames], see=see)
     for name in ways:
         if name in failures:
             bench.result.failures[f"{stage}/{name}/{scene}"] = failures[name]
         else:
             errors = judges[name].tally.errors()
-            bench.result.add(stage, name, scene, errors, times=times[name], frames=len(given))
+            bench.result.add(stage, name, scene, errors, times=times[name], frames=len(frames))

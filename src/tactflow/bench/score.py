@@ -136,10 +136,10 @@ class MarkerScore:
         """
         self._pitch = metrics.dot_pitch(truth.origin)
         index = metrics.match_points(markers.origin, truth.origin, self._pitch / 2)
-        seen = np.flatnonzero(markers.status == MarkerStatus.TRACKED)
+        tracked = np.flatnonzero(markers.status == MarkerStatus.TRACKED)
         self._tally.add(
             markers_missed=np.count_nonzero(truth.visible & (index < 0)),
-            markers_false=len(np.setdiff1d(seen, index)),
+            markers_false=len(np.setdiff1d(tracked, index)),
         )
         self._index = index
         return index

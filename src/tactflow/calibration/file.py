@@ -194,14 +194,14 @@ class Calibration(_Entry):
         Raises ConfigError if it or its arrays are missing, damaged, or not a calibration.
         """
         try:
-            said = yaml.safe_load(stored_text(path).decode("utf-8"))
-            if not isinstance(said, dict) or "format" not in said:
+            document = yaml.safe_load(stored_text(path).decode("utf-8"))
+            if not isinstance(document, dict) or "format" not in document:
                 raise ValueError("is not a calibration file")
             arrays = _arrays(stored_arrays(path))
             if arrays["look"].shape != (LOOK[1], LOOK[0], 3) or not np.isfinite(arrays["look"]).all():
                 raise ValueError("its .npz is of another file")
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
-            loaded = cls(**said, look=arrays["look"].astype(np.float32), slopes=slopes)
+            loaded = cls(**document, look=arrays["look"].astype(np.float32), slopes=slopes)
             if (slopes is None) != (loaded.photometric is None):
                 raise ValueError("its .npz is of another file")
             return loaded
@@ -217,16 +217,14 @@ class Calibration(_Entry):
 
     def misfit(self, mapping: PixelMapping) -> str | None:
         """Why it cannot be used for frames of this geometry; None if it can."""
-        made = f"the calibration was made {self.made} from {self.made_from}"
+        origin = f"the calibration was made {self.made} from {self.made_from}"
         if mapping.raw_size != self.raw_size:
-            return f"{made}, with frames of {_by(self.raw_size)}; these have {_by(mapping.raw_size)}"
+            return f"{origin}, with frames of {_by(self.raw_size)}; these have {_by(mapping.raw_size)}"
         if mapping.size != self.size:
-            return f"{made}, where preprocess gave {_by(self.size)}; here it gives {_by(mapping.size)}"
+            return f"{origin}, where preprocess gave {_by(self.size)}; here it gives {_by(mapping.size)}"
         moved = float(np.linalg.norm(np.subtract(raw_corners(mapping), self.corners), axis=1).max())
         if moved > MOVED:
-            return (
-                f"{made}, with another preprocess: a corner of the picture lies {moved:.1f} raw px elsewhere"
-            )
+            return f"{origin}, with another preprocess: a corner lies {moved:.1f} raw px elsewhere"
         return None
 
     def unlikeness(self, untouched: NDArray[np.uint8]) -> float:

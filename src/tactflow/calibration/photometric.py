@@ -338,14 +338,14 @@ def _held_out(
 ) -> dict[str, float]:
     """Errors of presses that the fit has not seen, for `PhotometricEntry`."""
     rest = Rest(session.untouched)
-    tried = []
+    errors = []
     for learned, others in ((good[::2], good[1::2]), (good[1::2], good[::2])):
         weights, _ = _fit(samples, learned)
         surface = Surface(SlopeModel(_shaped(weights)), scale)
         for i in others:
             heights = _heights(surface, session.presses[i], rest, samples[i].window)
-            tried.append(_errors(samples[i], weights, heights))
-    return _summary(tried)
+            errors.append(_errors(samples[i], weights, heights))
+    return _summary(errors)
 
 
 def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDArray[np.float32]:
@@ -381,9 +381,9 @@ def _errors(sample: _Sample, weights: Floats, heights: NDArray[np.float32]) -> l
     return [angle, radius / ball_radius - 1, rms, depth, volume]
 
 
-def _summary(tried: Sequence[Sequence[float]]) -> dict[str, float]:
+def _summary(errors: Sequence[Sequence[float]]) -> dict[str, float]:
     """Numbers of `PhotometricEntry` from the errors of each press."""
-    angle, radius, rms, depth, volume = np.transpose(tried)
+    angle, radius, rms, depth, volume = np.transpose(errors)
     return {
         "normal_error": float(np.mean(angle)),
         "radius_error": float(np.nanmedian(radius)),

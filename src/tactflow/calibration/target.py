@@ -134,10 +134,10 @@ def fit_lens(views: Sequence[Points], target: Target, size: tuple[int, int]) -> 
             f"found {len(views)}"
         )
     solid = np.column_stack([target.places, np.zeros(len(target.places))]).astype(np.float32)
-    seen = [view.astype(np.float32) for view in views]
+    pixels = [view.astype(np.float32) for view in views]
     # The sixth power of the radius is told apart from the fourth only by lenses that see very wide.
     rms, matrix, distortion, _, _, spread, _, _ = cv2.calibrateCameraExtended(
-        [solid] * len(seen), seen, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+        [solid] * len(pixels), pixels, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
     )
     lens = Lens(np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).ravel())
     corners, places, rectified = _rectified(lens.undistort(views[0]), target, size)
