@@ -59,6 +59,8 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["schema", "sensor"], "invalid choice"),
         (["stages", "hul"], "there is no stage or sink 'hul'; did you mean hull?"),
         (["stages", "./nowhere.py:A"], "cannot read ./nowhere.py"),
+        (["warmup", "nowhere.yaml"], "there is no file nowhere.yaml"),
+        (["run", "--max-frames", "none"], "required a whole number"),
         (["explain", "--stats", "nowhere.json"], "nowhere.json: cannot be read"),
     ],
 )
@@ -74,11 +76,13 @@ def test_a_wrong_command_line_gives_a_message_and_exit_code_2(
 @pytest.mark.parametrize(
     ("imports", "without"),
     [
+        ("import tactflow", {"cv2", "numba", "zmq", "pydantic"}),
+        ("import tactflow.network.subscriber", {"cv2"}),
         ("from tactflow.cli.main import main; main(['--help'])", {"cv2", "numpy", "pydantic"}),
         ("import tactflow.cli.run", {"asyncio", "numba", "pyarrow", "rich", "scipy", "ssl", "websockets"}),
     ],
 )
-def test_what_a_command_does_not_need_at_its_start_is_not_imported(imports: str, without: set[str]) -> None:
+def test_what_is_not_needed_at_the_start_is_not_imported(imports: str, without: set[str]) -> None:
     code = f"import sys; {imports}; print({without} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=True

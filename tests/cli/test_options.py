@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
+from collections.abc import Callable
 
 import pytest
 
-from tactflow.cli.options import positive, seconds
+from tactflow.cli.options import number, positive, seconds
+
+LENGTH = number(float, 0.1, 100.0, "a length")
 
 
-@pytest.mark.parametrize("word", ["0", "-5", "1e5", "many", ""])
-def test_a_count_that_is_none_is_refused(word: str) -> None:
-    with pytest.raises(ArgumentTypeError, match="required a whole number from 1"):
-        positive(word)
+@pytest.mark.parametrize(
+    ("parse", "words", "required"),
+    [
+        (positive, ["0", "-5", "1e5", "many", ""], "a whole number from 1"),
+        (seconds, ["0", "-5", "nan", "inf", "2 days", ""], "a time such as 90s"),
+        (LENGTH, ["0", "101", "nan", "inf", "-inf", "1e300", "1 mm", ""], "a length"),
+    ],
+)
+def test_invalid_values_are_refused(parse: Callable[[str], float], words: list[str], required: str) -> None:
+    for word in words:
+        with pytest.raises(ArgumentTypeError, match=f"required {required}.*got {word!r}"):
+            parse(word)
 
 
-def test_a_count_is_read() -> None:
-    assert positive("100000") == 100_000
-
-
-@pytest.mark.parametrize("word", ["0", "-5", "nan", "inf", "2 days", ""])
-def test_a_time_that_is_none_is_refused(word: str) -> None:
-    with pytest.raises(ArgumentTypeError, match="required a time such as 90s"):
-        seconds(word)
-
-
-@pytest.mark.parametrize(("word", "time"), [("0.05", 0.05), ("90s", 90.0), ("2min", 120.0), ("1h", 3600.0)])
-def test_a_time_is_read_in_its_unit(word: str, time: float) -> None:
-    assert seconds(word) == time
+@pytest.mark.parametrize(
+    ("parse", "word", "value"),
+    [
+        (positive, "100000", 100_000),
+        (LENGTH, "0.1", 0.1),
+        (seconds, "0.05", 0.05),
+        (seconds, "90s", 90.0),
+        (seconds, "2min", 120.0),
+        (seconds, "1h", 3600.0),
+    ],
+)
+def test_valid_values_are_read(parse: Callable[[str], float], word: str, value: float) -> None:
+    assert parse(word) == value

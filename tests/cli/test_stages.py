@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactflow.cli.main import main
-from tactflow.cli.stages import details
-from tactflow.config.registry import available, resolve
+from tactflow.config.registry import available
 
 PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 
@@ -54,15 +53,6 @@ def test_one_stage_is_explained_with_ports_and_parameters(
     assert "size: [whole number, whole number] or null = null" in lines
     assert "lens.focal: number, > 0 (required)" in lines
     assert "lens.fisheye: true | false = false" in lines
-
-
-def test_a_sink_is_explained_like_a_stage(tmp_path: Path) -> None:
-    shutil.copy(PARTS, tmp_path / "parts.py")
-    lines = [line.strip() for line in details(resolve("./parts.py:Publish", "sinks", tmp_path))]
-    assert lines[0] == "./parts.py:Publish: sink, ./parts.py"
-    assert "contact  Contact (may be absent)" in lines
-    assert "path: text = 'out'" in lines
-    assert "parameters: none" in details(resolve("./parts.py:Viewer", "sinks", tmp_path))
 
 
 @pytest.mark.parametrize("component", available(), ids=lambda component: component.name)
