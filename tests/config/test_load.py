@@ -348,55 +348,29 @@ def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Lo
         assert len(load(text).sinks) == 2
 
 
-@pytest.mark.parametrize("link", ["", "symbolic", "hard"])
-@pytest.mark.parametrize("name", ["press.npy", "press[1].npy"])
-def test_a_sink_never_writes_over_what_a_stage_reads(tmp_path: Path, link: str, name: str) -> None:
-    source = tmp_path / name
-    np.save(source, np.zeros((2, 60, 80, 3), np.uint8))
-    target = source
+@pytest.mark.parametrize("link", [None, os.symlink, os.link])
+@pytest.mark.parametrize(
+    ("read", "what"),
+    [
+        ("press[1].npy", "what stages.capture reads"),
+        ("p.yaml", "the pipeline file"),
+        ("parts.py", "the code of out"),
+    ],
+)
+def test_a_sink_never_writes_over_what_the_run_reads(
+    read: str, what: str, link: Callable[[Path, Path], None] | None, load: Load, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "press[1].npy", np.zeros((2, 60, 80, 3), np.uint8))
+    (tmp_path / "p.yaml").touch()
+    target = tmp_path / read
     if link:
         target = tmp_path / "results.jsonl"
-        (os.symlink if link == "symbolic" else os.link)(source, target)
-    text = f"""
-stages:
-  capture: {{source: "{name}?start=0"}}
-sinks:
-  jsonl: {{path: "{target}", overwrite: true}}
-"""
-    (tmp_path / "pipeline.yaml").write_text(text)
-    with pytest.raises(
-        ConfigError, match=r"pipeline\.yaml:5:3  sinks\.jsonl: .*is what stages\.capture reads"
-    ):
-        load_pipeline(tmp_path / "pipeline.yaml")
-
-
-@pytest.mark.parametrize(
-    ("written", "what"), [("pipeline.yaml", "the pipeline file"), ("mine.py", "the code of mine")]
-)
-def test_a_sink_never_writes_over_the_pipeline_or_its_code(tmp_path: Path, written: str, what: str) -> None:
-    (tmp_path / "mine.py").write_text(
-        """
-from tactflow import Stage
-from tactflow.ports import Image
-
-class Mine(Stage):
-    memory = "pure"
-
-    def process(self, image: Image) -> Image:
-        return image
-"""
-    )
-    text = f"""
-stages:
-  capture: {{source: "sim:press"}}
-  mine: {{use: ./mine.py, in: {{image: capture.image}}}}
-sinks:
-  jsonl: {{path: "{tmp_path / written}", overwrite: true}}
-"""
-    (tmp_path / "pipeline.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=f"{written} is {what}; choose another path"):
-        load_pipeline(tmp_path / "pipeline.yaml")
-    assert (tmp_path / "pipeline.yaml").read_text() == text
+        link(tmp_path / read, target)
+    source = "'./parts.py:Source', source: 'press[1].npy?start=0'"
+    text = BODY.replace("'./parts.py:Source'", source) + f"  jsonl: {{path: '{target}', overwrite: true}}\n"
+    with pytest.raises(ConfigError, match=rf"p\.yaml:12:3  sinks\.jsonl: .* is {what}; choose another path"):
+        load(text)
+    assert (tmp_path / "p.yaml").read_text() == text
 
 
 @pytest.mark.parametrize("file", ["/dev/zero", "./large.py"])
