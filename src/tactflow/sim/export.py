@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from tactflow.sim.scenes import Scene
+from tactflow.sim.truth import Truth
 from tactflow.system.files import completed
 
 VIDEO_SUFFIXES = (".avi", ".mkv")
@@ -114,10 +115,15 @@ def _write_folder(scene: Scene, path: Path, report: Report) -> None:
         report(index + 1)
 
 
+def _truths(scene: Scene, report: Report) -> Iterator[tuple[int, Truth]]:
+    for index in range(len(scene)):
+        yield index, scene.truth(index)
+        report(index + 1)
+
+
 def _write_jsonl(scene: Scene, path: Path, report: Report) -> None:
     with path.open("w", encoding="utf-8") as file:
-        for index in range(len(scene)):
-            truth = scene.truth(index)
+        for index, truth in _truths(scene, report):
             line = {
                 "frame": index,
                 "t": index / scene.fps,
@@ -133,23 +139,18 @@ def _write_jsonl(scene: Scene, path: Path, report: Report) -> None:
                 "mean_flow": truth.mean_flow,
             }
             file.write(json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n")
-            report(index + 1)
 
 
 def _write_forces(scene: Scene, path: Path, report: Report) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(["t", "fx", "fy", "fz"])
-        for index in range(len(scene)):
-            table.writerow([index / scene.fps, *scene.truth(index).force])
-            report(index + 1)
+        for index, truth in _truths(scene, report):
+            table.writerow([index / scene.fps, *truth.force])
 
 
 def _write_npz(scene: Scene, path: Path, report: Report) -> None:
-    truths = []
-    for index in range(len(scene)):
-        truths.append(scene.truth(index))
-        report(index + 1)
+    truths = [truth for _, truth in _truths(scene, report)]
     arrays: dict[str, Any] = {name: [getattr(truth, name) for truth in truths] for name in _ARRAYS}
     with path.open("wb") as file:
         np.savez_compressed(
