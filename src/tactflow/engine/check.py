@@ -8,30 +8,26 @@ from typing import Any
 import numpy as np
 
 from tactflow.engine.frame import Absent
-from tactflow.engine.graph import Node
-from tactflow.engine.ports import ArrayPort, Port, SignalPort, port_type
+from tactflow.engine.ports import ArrayPort, Port, Ports, SignalPort, port_type
 
 
-class PortCheck:
-    """Checks one node's values. Named dimensions must agree among all its inputs and outputs of a tick."""
+def read_only(value: Any) -> Any:
+    """The value; of an array a view that cannot be written through."""
+    if isinstance(value, np.ndarray):
+        value = value.view()
+        value.flags.writeable = False
+    return value
 
-    def __init__(self, node: Node) -> None:
-        self._ports = node.component.ports
 
-    def read_only(self, value: Any) -> Any:
-        """The value; of an array a view that cannot be written through."""
-        if isinstance(value, np.ndarray):
-            value = value.view()
-            value.flags.writeable = False
-        return value
+def check_values(ports: Ports, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+    """Raise TypeError or ValueError, naming the port, unless every value is what its port promises.
 
-    def values(self, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-        """Raise TypeError or ValueError, naming the port, unless every value is what its port promises."""
-        sizes: dict[str, int] = {}
-        ports = [*self._ports.inputs, *self._ports.outputs]
-        for port, value in zip(ports, [*inputs, *outputs], strict=True):
-            if value is not None and not isinstance(value, Absent):
-                _check_value(port, value, sizes)
+    Named dimensions must agree among all inputs and outputs of a tick.
+    """
+    sizes: dict[str, int] = {}
+    for port, value in zip([*ports.inputs, *ports.outputs], [*inputs, *outputs], strict=True):
+        if value is not None and not isinstance(value, Absent):
+            _check_value(port, value, sizes)
 
 
 def _check_value(port: Port, value: Any, sizes: dict[str, int]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import is_
 from typing import Any
 
-from tactflow.engine.check import PortCheck
+from tactflow.engine.check import check_values, read_only
 from tactflow.engine.conformance import METHODS
 from tactflow.engine.contract import Part, Sink, Stage
 from tactflow.engine.frame import Absent, Frame, Tick
@@ -68,7 +68,7 @@ class RunningNode:
         self.sink = instance if isinstance(instance, Sink) else None
         self.stage = instance if isinstance(instance, Stage) else None
         ports = node.component.ports
-        self._inputs = ports.inputs
+        self._ports = ports
         refs = {port.name: node.inputs.get(port.name) for port in ports.inputs}
         self._input_slots = [slots[ref.node, ref.port] if ref else UNCONNECTED for ref in refs.values()]
         self._connected_slots = [slot for slot in self._input_slots if slot != UNCONNECTED]
@@ -88,9 +88,8 @@ class RunningNode:
         self.disabled = False
         self.rate_limit = RateLimit(node.max_rate)
         self.stats = NodeStats()
-        self._check = PortCheck(node) if check else None
+        self._check = check
         self._function: Callable[..., Any] = getattr(instance, METHODS[node.component.kind])
-        self._result = ports.result
         self._is_pure = (
             skipping
             and node.component.memory == "pure"
@@ -131,7 +130,7 @@ class RunningNode:
         if tick.reasons:
             for number, value in enumerate(values):
                 if isinstance(value, Absent):
-                    if not self._inputs[number].optional:
+                    if not self._ports.inputs[number].optional:
                         return value
                     values[number] = None
         return values
@@ -142,14 +141,13 @@ class RunningNode:
 
     def __call__(self, inputs: Sequence[Any], tick: TickState) -> Sequence[Any]:
         """Run it; one value per output port, `Absent` where there is none."""
-        check = self._check
-        arguments = inputs if check is None else [check.read_only(value) for value in inputs]
-        if self._result is not None:
-            place, end = self._result.place, self._result.place + self._result.count
-            arguments = [*arguments[:place], self._tick(self._result.kind, tick), *arguments[end:]]
+        arguments = [read_only(value) for value in inputs] if self._check else inputs
+        if (result := self._ports.result) is not None:
+            end = result.place + result.count
+            arguments = [*arguments[: result.place], self._tick(result.kind, tick), *arguments[end:]]
         outputs = _outputs(self._function(*arguments), len(self.slots))
-        if check is not None:
-            check.values(inputs, outputs)
+        if self._check:
+            check_values(self._ports, inputs, outputs)
         self.last = outputs
         if self._is_pure:
             self._last_inputs = inputs
@@ -162,8 +160,8 @@ class RunningNode:
         skipped = {name: reasons[slot] for name, slot in self._shown if slot in reasons}
         if tick.renewed is not None:
             skipped["reference"] = tick.renewed
-        if self._check is not None:
-            values = {name: self._check.read_only(value) for name, value in values.items()}
+        if self._check:
+            values = {name: read_only(value) for name, value in values.items()}
         return kind(tick.frame, values, skipped)
 
     def publish(self, tick: TickState, outputs: Sequence[Any]) -> None:
