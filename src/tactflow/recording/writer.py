@@ -111,8 +111,9 @@ class RecordingWriter:
         self._file.raw.close()
 
     def _flush(self) -> None:
-        self._refuse_interference()
         self._writer.flush()  # type: ignore[no-untyped-call]
+        # Afterwards: what is cut between a check and the write would go unnoticed.
+        self._refuse_interference()
         self.bytes = self._file.tell()
 
     def _refuse_interference(self) -> None:
