@@ -65,7 +65,10 @@ class Region(NamedTuple):
 
     def moments(self) -> Moments:
         """Its moments; there is at least one pixel."""
-        sums = cv2.moments(self.window, binaryImage=True)
+        # Floats take a third of the time of `binaryImage`, and add up as doubles. Those of a picture two
+        # pixels wide would be taken for points.
+        kind = np.float64 if self.width == 2 else np.float32
+        sums = cv2.moments((self.window != 0).astype(kind))
         # Whole numbers: no cancellation, a vertical bar is exactly vertical.
         count, x, y, xx, xy, yy = (int(sums[name]) for name in ("m00", "m10", "m01", "m20", "m11", "m02"))
         square = count * count
