@@ -25,7 +25,13 @@ from tactflow.tune.sensor import Fitted, Look, fit
 from tactflow.tune.space import Candidate, candidates
 
 SMALL = Look((320, 240), "markers=10x8", noise=2.0)
-FUSION = {"fusion": {"fusion": {}, "no fusion": {"stages.fusion": None}, "without": {}}}
+FUSION = {
+    "fusion": {
+        "fusion": {},
+        "no fusion": {"stages.fusion": None},
+        "colour": {"stages.difference.method": "colour"},
+    }
+}
 FIELD = {"field": {"field": {}, "mean": {"stages.field": None, "stages.flow_in_mask.method": "mean"}}}
 
 
@@ -98,7 +104,7 @@ def test_a_budget_that_is_over_ends_the_search_after_a_group_of_candidates(
     assert tuned.rounds == [(2, 24)]
     assert tuned.chosen is not None
     assert tuned.notes == [
-        "out of time after 2 of 4 candidates",
+        "out of time after 2 of 3 candidates",
         "out of time after the first round",
         "no time left for the recording: times are of simulated frames",
     ]
@@ -208,3 +214,20 @@ def test_what_cannot_be_tuned_is_said(
             cv2.imwrite(str(tmp_path / name / f"{index:02}.png"), gel)
     assert main(["tune", "markerless", *arguments]) == code
     assert says in capsys.readouterr().err
+
+
+def test_the_original_is_one_row_and_stays_where_flow_cannot_be_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(space, "AXES", FIELD)
+    monkeypatch.setattr(search, "LAST", search.FIRST)
+    # So large a pitch that no dot lies within the contact.
+    look = Look((320, 240), "markers=3x2&pitch=260", noise=2.0)
+    monkeypatch.setattr(search, "fit", lambda _: look)
+    recording = take(
+        str(Fitted(look, Case("press", 30), tmp_path, 3).path), tactflow.load("default"), tmp_path
+    )
+    tuned = Search(find_pipeline("default"), Goal(), seconds=3600).run(recording, tmp_path)
+    assert sorted(trial.name for trial in tuned.trials) == [DEFAULT, "mean"]
+    assert tuned.chosen is not None
+    assert tuned.chosen.name == DEFAULT

@@ -34,6 +34,8 @@ MARGIN: Final = 0.5
 """Fraction of the distance from an error to the upper end of its 90 % interval that must be within the
 budget, so that four of five draws stay within. The full distance is expensive: 2.3 times the CPU time on a
 gel without dots."""
+FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask.method"})
+"""Settings that change nothing but the mean flow."""
 DEFAULT: Final = "as given"
 """Name of the user's original pipeline."""
 
@@ -124,11 +126,8 @@ class Search:
         self._began, self._folder = time.monotonic(), folder
         look = fit(recording)
         self.say(f"fitted simulator: {look}")
-        base = Candidate(DEFAULT).load(self.file, self.sensor)
-        dots = recording.observation.dots
-        known = [Candidate(DEFAULT), *candidates(base, recording.size, None if dots is None else dots.pitch)]
+        known = self._known(recording)
         tuned = Tuned(recording, look, self.goal, [], [], None)
-        # The original and the most expensive candidate, the baseline of comparisons, come first.
         order = [0, 1, *(2 + np.random.default_rng(self.seed).permutation(len(known) - 2))]
         tuned.trials = self._round([known[index] for index in order], FIRST, tuned, self.seed, GROUP)
         finalists = self._finalists(known, tuned.trials)
@@ -149,12 +148,30 @@ class Search:
         tuned.trials = self.goal.order(tuned.trials)
         return tuned
 
+    def _known(self, recording: Recording) -> list[Candidate]:
+        """The most expensive candidate, which is the baseline of comparisons, and all others.
+
+        The original is the first or the second of them; a candidate that is the same pipeline is left out.
+        """
+        original = Candidate(DEFAULT)
+        base, dots = original.load(self.file, self.sensor), recording.observation.dots
+        found = candidates(base, recording.size, None if dots is None else dots.pitch)
+        others = [candidate for candidate in found if not self._is_pipeline(candidate, base)]
+        most_expensive = [candidate for candidate in found[:1] if candidate in others]
+        return [*most_expensive, original, *others[len(most_expensive) :]]
+
+    def _is_pipeline(self, candidate: Candidate, pipeline: Pipeline) -> bool:
+        try:
+            return candidate.load(self.file, self.sensor).nodes == pipeline.nodes
+        except ConfigError:
+            return False
+
     def _is_over(self, share: float = 1.0) -> bool:
         """Whether a fraction of the time budget has passed."""
         return time.monotonic() - self._began > share * self.seconds
 
     def _finalists(self, known: Sequence[Candidate], trials: Sequence[Trial]) -> list[Candidate]:
-        """Select the original, the most expensive, the best and the front."""
+        """Select the most expensive, the original, the best and the front."""
         runs = {trial.name for trial in trials if trial.failure is None}
         best = [trial.name for trial in self.goal.order(trials) if trial.usable][:FINALISTS]
         chosen = {*(candidate.name for candidate in known[:2]), *best, *front(trials, self.goal.kind)}
@@ -183,6 +200,11 @@ class Search:
         for recording in rendered:
             recording.path.unlink(missing_ok=True)
         mark_unsound(trials)
+        if not any("flow" in trial.errors for trial in trials):
+            changed = {candidate.name for candidate in known if dict(candidate.settings).keys() & FLOW}
+            for trial in trials:
+                if trial.name in changed and trial.usable:
+                    trial.unsound = "its mean flow could not be judged: too few dots in the contact"
         tuned.rounds.append((len(trials), frames))
         return trials
 
@@ -193,8 +215,7 @@ class Search:
             tuned.notes.append("no time left for the recording: times are of simulated frames")
             return
         by_name = {trial.name: trial for trial in tuned.trials if trial.failure is None}
-        # The baseline of the comparison comes first.
-        good = [candidate for candidate in (*finalists[1:], finalists[0]) if candidate.name in by_name]
+        good = [candidate for candidate in finalists if candidate.name in by_name]
         self.say(f"the recording: {len(good)} candidates, {tuned.recording.frames} frames")
         pipelines = {candidate.name: candidate.load(self.file, self.sensor) for candidate in good}
         times, checks, failures = show_recording(pipelines, tuned.recording, self._is_over)
