@@ -400,6 +400,11 @@ def test_mypy_is_content_with_a_users_program(tmp_path: Path) -> None:
     env = os.environ | {"MYPYPATH": str(REPOSITORY / "src")}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+    (tmp_path / "wrong.py").write_text('import tactflow\n\ntactflow.stage("hull").proces\n')
+    done = subprocess.run(
+        [*command, "wrong.py"], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
+    assert 'wrong.py:3: error: "Stage" has no attribute "proces"' in done.stdout
 
 
 # -- settings ---------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ part whose `open()` was started, also after an error.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -143,6 +143,9 @@ class Stage(Part):
     """Why a new reference is needed, a short snake_case word, or None. `process` sets it on `self`; the
     engine clears it and makes the next frame a reference in a new epoch, so that all stages are reset. With
     all stages in one segment, the default, it is the very next frame; else the source is asked to retake."""
+
+    process: Callable[..., Any]
+    """Computes the outputs of one frame; see above."""
 
     def reset(self) -> None:
         """Forget everything: a new reference follows (`Frame.epoch` has grown)."""
