@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
 
-OPENCV = "opencv-contrib-python-headless"
+OPENCV = "opencv-python-headless"
 """The OpenCV package that tactflow depends on."""
 
 
@@ -29,7 +29,7 @@ def missing(what: str, extra: str, modules: Sequence[str]) -> str | None:
 def opencv_conflict() -> str | None:
     """What is wrong where several OpenCV packages are installed, and what to do, or None. Takes 20 ms."""
     found: dict[str, str] = {}
-    for name in ("opencv-python", "opencv-python-headless", "opencv-contrib-python", OPENCV):
+    for name in ("opencv-python", "opencv-contrib-python", "opencv-contrib-python-headless", OPENCV):
         with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     if len(found) < 2:
