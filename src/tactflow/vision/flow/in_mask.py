@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Mask
-from tactflow.vision.flow.displacement_field import DisplacementField
-from tactflow.vision.flow.gel_motion import GelMotion
+from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 

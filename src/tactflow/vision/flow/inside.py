@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Mask, Points, check_mask
+from tactflow.vision.flow.loops import look_up
 
 _ROUNDING: Final = 1e-9
 """Added to the squared reach, px^2, so that a pixel exactly at the reach counts. Chosen by hand."""
@@ -43,15 +44,13 @@ def inside_mask(points: Points, mask: Mask, dilate: float = 0.0) -> Flags:
     check_mask(mask)
     if not (dilate >= 0 and math.isfinite(dilate)):
         raise ValueError(f"required dilate >= 0 px, got {dilate}")
-    pixels, (height, width) = np.rint(points), mask.shape
-    inside = np.asarray(np.logical_and(pixels >= 0, pixels < (width, height)).all(axis=1))
-    x, y = pixels[inside].astype(int).T
-    inside[inside] = mask[y, x] != 0
+    inside = np.zeros(len(points), np.bool_)
+    look_up(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(mask), inside)
     contours = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0] if dilate else ()
     if contours:
         # The pixel of the mask that is nearest to a point outside is one of its border.
         border = np.concatenate(contours)[:, 0]
-        outside, (x, y) = np.flatnonzero(~inside), np.clip(pixels, -_FARTHEST, _FARTHEST).T
+        outside, (x, y) = np.flatnonzero(~inside), np.clip(np.rint(points), -_FARTHEST, _FARTHEST).T
         away_x, away_y = x[outside, None] - border[:, 0], y[outside, None] - border[:, 1]
         nearest = (away_x * away_x + away_y * away_y).min(axis=1)
         inside[outside] = nearest <= min(dilate, 1e150) ** 2 + _ROUNDING

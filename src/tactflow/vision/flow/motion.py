@@ -7,7 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats, Indices, Points
+from tactflow.vision.arrays import Flags, Floats, Points
+from tactflow.vision.flow.loops import rate_motion
 from tactflow.vision.markers.lattice import LONGEST_LINK, neighbour_graph, pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -117,14 +118,13 @@ class MotionTest:
         self._origin = np.array(origin, np.float64)
         count = len(self._origin)
         arms = self._origin - (self._origin.mean(axis=0) if count else 0.0)
-        self._arms = arms
-        self._levers = arms / np.maximum((arms * arms).sum(axis=1, keepdims=True), 1.0)
+        levers = arms / np.maximum((arms * arms).sum(axis=1, keepdims=True), 1.0)
+        self._rest = np.ascontiguousarray(np.hstack([self._origin, arms, levers]).T)
         self._variance = steadiness**2
         self._relaxation = relaxation
         self.pitch = pitch_of(self._origin) if count > 1 else 0.0
         """Median distance of a marker to its nearest neighbour, px; 0 for fewer than two."""
         self._links = neighbour_graph(self._origin, LONGEST_LINK * self.pitch)
-        self._neighbours = _neighbours(self._links, count)
         # A motion in a plane exceeds k standard deviations with exp(-k^2 / 2); three must at once.
         alone = (false_alarms / (TRIPLES * max(1, count))) ** (1 / TOGETHER)
         self._limit = math.sqrt(-2 * math.log(alone))
@@ -139,14 +139,18 @@ class MotionTest:
         """
         if len(markers.position) != len(self._origin):
             raise ValueError(f"required {len(self._origin)} markers, got {len(markers.position)}")
-        left = self._left(markers)
-        bound = self._limit * np.sqrt(markers.stderr**2 + self._variance)
-        # Nothing is larger than NaN.
-        moved = (left > self._relaxation * self._strongest) & (bound > 0)
-        ratio = np.append(np.divide(left, bound, out=np.zeros_like(left), where=moved), 0.0)
-        second = np.sort(ratio[self._neighbours], axis=1)[:, -2]
-        chain = float(np.minimum(ratio[:-1], second).max(initial=0.0))
-        largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
+        resting, rated = self._relaxation * self._strongest, np.empty((5, len(self._origin)))
+        largest, chain = rate_motion(
+            np.ascontiguousarray(markers.position, np.float64),
+            markers.status,
+            np.ascontiguousarray(markers.stderr, np.float64),
+            self._rest,
+            self._links,
+            self._limit,
+            self._variance,
+            resting,
+            rated,
+        )
         self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
         alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
         self._largest = largest
@@ -154,19 +158,7 @@ class MotionTest:
         self._clearly = chain > alone * (STAY if self._clearly else 1.0)
         self._moving = self._clearly or chain > (STAY if self._moving else 1.0)
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
-        return Motion(self._moving, self._clearly, largest, left, bound)
-
-    def _left(self, markers: Markers) -> Floats:
-        """`Motion.left` of one frame; all 0 with fewer than three tracked markers."""
-        tracked, moved = markers.status == _TRACKED, markers.position - self._origin
-        if np.count_nonzero(tracked) < TOGETHER:
-            return np.zeros(len(tracked))
-        moved = moved - _median(moved[tracked])
-        # Each marker's motion across its arm, over the arm's length.
-        turns = self._levers[:, 0] * moved[:, 1] - self._levers[:, 1] * moved[:, 0]
-        turn = _median(turns[tracked])
-        x, y = moved[:, 0] + turn * self._arms[:, 1], moved[:, 1] - turn * self._arms[:, 0]
-        return np.where(tracked, np.sqrt(x * x + y * y), 0.0)
+        return Motion(self._moving, self._clearly, largest, rated[0], rated[1])
 
     def stretched(self, markers: Markers) -> Points:
         """Positions (K, 2), px, of the markers at the most strained links between tracked ones.
@@ -181,21 +173,3 @@ class MotionTest:
         strain = np.hypot(*(moved[first] - moved[second]).T) * seen / length
         most = self._links[seen & (strain >= STRETCHED * strain.max(initial=0.0))]
         return np.asarray(markers.position[np.unique(most)], np.float64)
-
-
-def _neighbours(links: Indices, count: int) -> Indices:
-    """(count, K): the neighbours of each marker, two at least; `count` instead of those that are missing."""
-    linked = [[count, count] for _ in range(count)]
-    for one, other in links.tolist():
-        linked[one].append(other)
-        linked[other].append(one)
-    most = max(map(len, linked), default=2)
-    return np.array([others + [count] * (most - len(others)) for others in linked], np.int64).reshape(
-        count, most
-    )
-
-
-def _median(values: Floats) -> Floats:
-    """The median along the first axis. For so few numbers, `np.median` takes five times as long."""
-    ordered, count = np.sort(values, axis=0), len(values)
-    return np.asarray((ordered[(count - 1) // 2] + ordered[count // 2]) / 2)

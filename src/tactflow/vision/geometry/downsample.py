@@ -44,15 +44,18 @@ def halved(picture: Bytes, block: tuple[slice, slice] | None = None, *, into: By
 def _halve(picture: Bytes, top: int, left: int, half: Bytes) -> None:
     """Fill `half`, (h, 3 w), from `picture`, (H, 3 W), from row `top` and byte `left` on.
 
-    `cv2.resize` by `INTER_AREA` gives the same, in one thread in twice the time.
+    `cv2.resize` by `INTER_AREA` gives the same, in three times the time.
     """
-    count = 2 * half.shape[1] - 3
-    # The means around every pixel, also those that are then left out, for so the loop becomes whole vectors.
-    means = np.empty(count + 3, np.uint8)
-    for y in range(len(half)):
+    height, count = half.shape[0], 2 * half.shape[1] - 3
+    sums, means = np.empty(count, np.uint16), np.empty(count + 3, np.uint8)
+    for y in range(height):
+        # One line after the other, in the order of memory; each loop over all pixels, also those that are
+        # then left out, for it becomes whole vectors.
         upper, lower, line = picture[top + 2 * y, left:], picture[top + 2 * y + 1, left:], half[y]
         for i in range(count):
-            means[i] = (upper[i] + upper[i + 3] + lower[i] + lower[i + 3] + 2) >> 2
+            sums[i] = np.uint16(upper[i]) + np.uint16(upper[i + 3])
+        for i in range(count):
+            means[i] = np.uint8((sums[i] + np.uint16(lower[i]) + np.uint16(lower[i + 3]) + np.uint16(2)) >> 2)
         for x in range(half.shape[1] // 3):
             for c in range(3):
                 line[3 * x + c] = means[6 * x + c]
