@@ -122,9 +122,13 @@ class Preprocessor:
         if self._levels:
             # By halves: three times as fast as one step of four, for 1/8 grey level of bias. The first
             # result is as large as the processed frame, and costs less where it is in the caches.
-            block = self._half = halved(image, self._block, into=self._half)
+            turned = self._rotate == 90
+            block = self._half = halved(image, self._block, into=self._half, upside_down=turned)
             for _ in range(self._levels - 1):
                 block = halved(block)
+            if turned:
+                # To turn a picture that is upside down is to exchange rows and columns: 0.7 of the time.
+                return cv2.transpose(block)  # type: ignore[return-value]
             if block is self._half and not self._rotate:
                 return block.copy()
         if self._rotate:
