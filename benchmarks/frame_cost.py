@@ -134,7 +134,8 @@ def measure_scene(trees: dict[str, Path], recording: Path) -> Samples:
                 answer = children[name].stdout.readline()
                 if answer != "ready\n":
                     samples[name] = json.loads(answer)
-    return samples
+    # In the order of the header.
+    return {name: samples[name] for name in trees}
 
 
 def measure_start(trees: dict[str, Path]) -> Samples:

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal, Protocol
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
 
 from tactflow.vision.geometry.direction import VERTICAL
 from tactflow.vision.types import Contact
 
 Method = Literal["one_euro", "alpha_beta"]
-
-
-class Filter(Protocol):
-    """A filter of one number over time."""
-
-    def update(self, value: float, dt: float) -> float:
-        """Take the next value, dt seconds after the last one (dt > 0), and return the smoothed one."""
 
 
 class OneEuro:
@@ -56,15 +51,18 @@ class OneEuro:
         self._speed = 0.0
 
     def update(self, value: float, dt: float) -> float:
-        """See `Filter.update`. The first value is returned as it is, whatever dt."""
+        """The smoothed value, after the next one, dt seconds (> 0) after the last.
+
+        The first value is returned as it is, whatever dt.
+        """
         if self._value is None:
             self._value = self._last = value
             return value
-        speed = _difference(value, self._last, self._period) / dt
+        speed = _wrap(value - self._last, self._period) / dt
         self._last = value
         self._speed += _weight(self._speed_cutoff, dt) * (speed - self._speed)
         cutoff = self._min_cutoff + self._coefficient * abs(self._speed)
-        step = _weight(cutoff, dt) * _difference(value, self._value, self._period)
+        step = _weight(cutoff, dt) * _wrap(value - self._value, self._period)
         self._value = _wrap(self._value + step, self._period)
         return self._value
 
@@ -96,12 +94,12 @@ class AlphaBeta:
         self._velocity = 0.0
 
     def update(self, value: float, dt: float) -> float:
-        """See `Filter.update`. The first value is returned as it is, whatever dt."""
+        """As `OneEuro.update`."""
         if self._value is None:
             self._value = value
             return value
         predicted = self._value + self._velocity * dt
-        innovation = _difference(value, predicted, self._period)
+        innovation = _wrap(value - predicted, self._period)
         self._velocity += self._beta * innovation / dt
         self._value = _wrap(predicted + self._alpha * innovation, self._period)
         return self._value
@@ -137,19 +135,18 @@ class ContactSmoother:
     ) -> None:
         if method not in ("one_euro", "alpha_beta"):
             raise ValueError(f"required method to be 'one_euro' or 'alpha_beta', got {method!r}")
-        self._method = method
-        self._one_euro = (min_cutoff, speed_coefficient)
-        self._alpha_beta = (alpha, beta)
-        self._make(0.0)
-        self._t: float | None = None
-        self._center: tuple[Filter, Filter] | None = None
-        self._angle: Filter | None = None
+        self._make: Callable[..., OneEuro | AlphaBeta] = (
+            partial(OneEuro, min_cutoff, speed_coefficient)
+            if method == "one_euro"
+            else partial(AlphaBeta, alpha, beta)
+        )
+        self.reset()
 
     def reset(self) -> None:
         """Forget the past: contact has ended."""
-        self._t = None
-        self._center = None
-        self._angle = None
+        self._t: float | None = None
+        self._center = (self._make(), self._make())
+        self._angle: OneEuro | AlphaBeta | None = None
 
     def update(self, contact: Contact, t: float) -> Contact:
         """The contact with smoothed center, angle and slope; the rest is left as measured.
@@ -160,34 +157,21 @@ class ContactSmoother:
             self.reset()
         dt = t - self._t if self._t is not None else 0.0
         self._t = t
-        if self._center is None:
-            self._center = (self._make(0.0), self._make(0.0))
         x, y = (axis.update(value, dt) for axis, value in zip(self._center, contact.center, strict=True))
         if contact.angle is None:
             self._angle = None
             return dataclasses.replace(contact, center=(x, y))
         if self._angle is None:
-            self._angle = self._make(180.0)
+            self._angle = self._make(period=180.0)
         angle = self._angle.update(contact.angle, dt)
         slope = None if abs(angle) > 90 - VERTICAL else -math.tan(math.radians(angle)) + 0.0
         return dataclasses.replace(contact, center=(x, y), angle=angle, slope=slope)
-
-    def _make(self, period: float) -> Filter:
-        if self._method == "one_euro":
-            min_cutoff, speed_coefficient = self._one_euro
-            return OneEuro(min_cutoff, speed_coefficient, period=period)
-        alpha, beta = self._alpha_beta
-        return AlphaBeta(alpha, beta, period=period)
 
 
 def _weight(cutoff: float, dt: float) -> float:
     """Weight of the new value in a first-order low-pass of this cut-off, Hz."""
     turn = 2 * math.pi * cutoff * dt
     return turn / (turn + 1)
-
-
-def _difference(value: float, origin: float, period: float) -> float:
-    return _wrap(value - origin, period)
 
 
 def _wrap(value: float, period: float) -> float:

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Floats32
-from tactflow.vision.depth.poisson import integrate
 from tactflow.vision.depth.slopes import Bytes, SlopeModel, coordinates
 from tactflow.vision.depth.surroundings import Surroundings, Window, surroundings
 from tactflow.vision.types import Depth, Scale
@@ -100,6 +99,10 @@ class Surface:
     """
 
     def __init__(self, model: SlopeModel, scale: Scale, errors: SurfaceErrors | None = None) -> None:
+        # Only here: runs without a calibration need not wait 0.15 s for SciPy.
+        from tactflow.vision.depth.poisson import integrate
+
+        self._integrate = integrate
         self._model = model
         self._scale = scale
         self._errors = errors
@@ -148,7 +151,7 @@ class Surface:
 
     def _integrated(self, slope: Floats32) -> Floats32:
         # Two processed pixels a step. Slopes rise towards the camera, where the gel is pushed to.
-        heights = integrate(slope, (-2 * self._scale.x, -2 * self._scale.y))
+        heights = self._integrate(slope, (-2 * self._scale.x, -2 * self._scale.y))
         heights -= _median(_border(heights[..., None]))
         return np.maximum(heights, 0, out=heights)
 
