@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
-
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent, Frame
@@ -18,34 +16,17 @@ class Smooth(Stage):
     memory = "stateful"
 
     class Params(StageParams):
-        """Which filter, and how strong."""
+        """How strong the filter (One Euro) is."""
 
-        method: Literal["one_euro", "alpha_beta"] = Field(
-            "one_euro", description="one_euro adapts to speed; alpha_beta predicts constant velocity"
-        )
         min_cutoff: float = Field(
-            1.0, gt=0, le=1000, description="one_euro: cut-off at rest, Hz; lower is steadier and slower"
+            1.0, gt=0, le=1000, description="cut-off at rest, Hz; lower is steadier and slower"
         )
         speed_coefficient: float = Field(
-            0.02, ge=0, le=1000, description="one_euro: Hz of cut-off per px/s or degree/s; higher lags less"
+            0.02, ge=0, le=1000, description="Hz of cut-off per px/s or degree/s; higher lags less in motion"
         )
-        alpha: float = Field(
-            0.5, gt=0, le=1, description="alpha_beta: fraction of the innovation that corrects the value, 1"
-        )
-        beta: float | None = Field(
-            None,
-            ge=0,
-            lt=4,
-            description="alpha_beta: fraction that corrects the velocity, 1; null fits alpha",
-        )
-
-        @model_validator(mode="after")
-        def _usable(self) -> Self:
-            _smoother(self)
-            return self
 
     def __init__(self, params: Params) -> None:
-        self._smoother = _smoother(params)
+        self._smoother = ContactSmoother(params.min_cutoff, params.speed_coefficient)
 
     def reset(self) -> None:
         """Forget the past; a new reference follows."""
@@ -57,13 +38,3 @@ class Smooth(Stage):
             self._smoother.reset()
             return Absent("no_contact")
         return self._smoother.update(contact, frame.t)
-
-
-def _smoother(params: Smooth.Params) -> ContactSmoother:
-    return ContactSmoother(
-        params.method,
-        min_cutoff=params.min_cutoff,
-        speed_coefficient=params.speed_coefficient,
-        alpha=params.alpha,
-        beta=params.beta,
-    )

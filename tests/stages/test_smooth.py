@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import pytest
 
 from tactflow.engine.frame import Absent, Frame
 from tactflow.stages.smooth import Smooth
@@ -27,9 +24,8 @@ def centre(result: Contact | Absent) -> float:
     return result.center[0]
 
 
-@pytest.mark.parametrize("method", ["one_euro", "alpha_beta"])
-def test_a_jump_is_followed_gradually(method: Any) -> None:
-    stage = Smooth(Smooth.Params(method=method))
+def test_a_jump_is_followed_gradually() -> None:
+    stage = Smooth(Smooth.Params())
     assert centre(stage.process(contact(0), frame(0.0))) == 0
     assert 0 < centre(stage.process(contact(10), frame(0.02))) < 10
 

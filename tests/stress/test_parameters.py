@@ -26,7 +26,7 @@ from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, find_dot
 from tactflow.vision.markers.tracking import MarkerTracker
-from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
+from tactflow.vision.smooth import ContactSmoother, OneEuro
 from tactflow.vision.types import Markers
 from tests.stress.builders import gel
 
@@ -64,8 +64,6 @@ FUNCTIONS: dict[str, Callable[[float], Any]] = {
     "Annotator.arrow_scale": lambda v: Annotator(arrow_scale=v),
     "OneEuro.min_cutoff": lambda v: OneEuro(min_cutoff=v),
     "OneEuro.period": lambda v: OneEuro(period=v),
-    "AlphaBeta.alpha": lambda v: AlphaBeta(alpha=v),
-    "AlphaBeta.beta": lambda v: AlphaBeta(beta=v),
     "ContactSmoother.min_cutoff": lambda v: ContactSmoother(min_cutoff=v),
     "find_homography.source": lambda v: find_homography(spoiled(SQUARE, v), SQUARE),
     "check_lens.camera_matrix": lambda v: check_lens(spoiled(CAMERA, v), [0, 0, 0, 0], False),
@@ -129,4 +127,4 @@ def test_a_pipeline_file_refuses_nan_and_infinity_with_their_place(
 
 def test_the_table_of_numbers_is_not_empty() -> None:
     found = {parameter.id for parameter in NUMBERS}
-    assert {"hull.min_area", "tracker.dot", "smooth.alpha", "probe.false_alarms"} <= found
+    assert {"hull.min_area", "tracker.dot", "smooth.min_cutoff", "probe.false_alarms"} <= found

@@ -7,14 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tactflow.vision.smooth import AlphaBeta, ContactSmoother, OneEuro
+from tactflow.vision.smooth import ContactSmoother, OneEuro
 from tactflow.vision.types import Contact
 
 HULL = np.zeros((1, 2))
-METHODS: list[Any] = ["one_euro", "alpha_beta"]
 
 
 def contact(x: float = 0.0, y: float = 0.0, angle: float | None = 0.0) -> Contact:
@@ -26,16 +23,14 @@ def turned(first: float, second: float) -> float:
     return abs((first - second + 90) % 180 - 90)
 
 
-@pytest.mark.parametrize("make", [OneEuro, AlphaBeta])
-def test_a_constant_stays_what_it_is(make: Any) -> None:
-    smoother = make()
+def test_a_constant_stays_what_it_is() -> None:
+    smoother = OneEuro()
     assert [smoother.update(3.5, 0.1) for _ in range(20)] == [3.5] * 20
 
 
-@pytest.mark.parametrize("make", [OneEuro, AlphaBeta])
-def test_noise_about_a_constant_shrinks(make: Any) -> None:
+def test_noise_about_a_constant_shrinks() -> None:
     noise = np.random.default_rng(0).normal(0, 1, 2000)
-    smoother = make() if make is OneEuro else make(0.2)
+    smoother = OneEuro()
     smoothed = np.array([smoother.update(value, 1 / 60) for value in noise])[200:]
     assert smoothed.std() < 0.6
     # The mean of 1800 independent values scatters by 0.024.
@@ -69,26 +64,9 @@ def test_one_euro_lags_less_when_moving_fast_with_a_higher_coefficient() -> None
     assert lags[0] > lags[1] > lags[2] >= 0
 
 
-def test_alpha_beta_follows_a_ramp_without_lag() -> None:
-    smoother = AlphaBeta(0.5)
-    smoothed = [smoother.update(value, 0.02) for value in np.arange(200.0) * 3]
-    # The error of a step decays geometrically; after 200 frames nothing is left.
-    assert smoothed[-1] == pytest.approx(199 * 3, abs=1e-9)
-
-
-@given(st.floats(0.01, 1), st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50))
-def test_alpha_beta_never_leaves_the_finite_numbers(alpha: float, values: list[float]) -> None:
-    smoother = AlphaBeta(alpha)
-    smoothed = [smoother.update(value, 0.01) for value in values]
-    # A stable second-order filter; measured overshoot is below 3 times the range.
-    assert np.isfinite(smoothed).all()
-    assert np.abs(smoothed).max() <= 10 * np.abs(values).max() + 1e-9
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_an_axis_that_turns_through_the_vertical_is_smoothed_like_any_other(method: Any) -> None:
+def test_an_axis_that_turns_through_the_vertical_is_smoothed_like_any_other() -> None:
     steps = np.random.default_rng(2).normal(0.5, 2, 400).cumsum()
-    plain, seam = ContactSmoother(method), ContactSmoother(method)
+    plain, seam = ContactSmoother(), ContactSmoother()
     for k, step in enumerate(steps):
         first = plain.update(contact(angle=_axis(step)), k / 60)
         second = seam.update(contact(angle=_axis(step + 90)), k / 60)
@@ -104,31 +82,28 @@ def _axis(angle: float) -> float:
     return wrapped if wrapped > -90 else 90.0
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_plus_and_minus_89_meet_at_90_and_not_at_0(method: Any) -> None:
-    smoother = ContactSmoother(method)
+def test_plus_and_minus_89_meet_at_90_and_not_at_0() -> None:
+    smoother = ContactSmoother()
     for k in range(60):
         smoothed = smoother.update(contact(angle=89.0 if k % 2 else -89.0), k / 60)
         assert smoothed.angle is not None
         assert abs(smoothed.angle) >= 88.9
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_slope_follows_the_smoothed_angle(method: Any) -> None:
-    smoother = ContactSmoother(method)
+def test_slope_follows_the_smoothed_angle() -> None:
+    smoother = ContactSmoother()
     smoother.update(contact(angle=10), 0.0)
     smoothed = smoother.update(contact(angle=40), 0.1)
     assert smoothed.angle is not None
     assert 10 < smoothed.angle < 40
     assert smoothed.slope == pytest.approx(-math.tan(math.radians(smoothed.angle)))
-    vertical = ContactSmoother(method).update(contact(angle=90), 0.0)
+    vertical = ContactSmoother().update(contact(angle=90), 0.0)
     assert vertical.angle == 90
     assert vertical.slope is None
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_everything_else_is_left_as_measured_and_the_input_too(method: Any) -> None:
-    smoother = ContactSmoother(method)
+def test_everything_else_is_left_as_measured_and_the_input_too() -> None:
+    smoother = ContactSmoother()
     smoother.update(contact(), 0.0)
     given = contact(5.0, 6.0, 30.0)
     smoothed = smoother.update(given, 0.1)
@@ -139,26 +114,23 @@ def test_everything_else_is_left_as_measured_and_the_input_too(method: Any) -> N
     assert 0 < smoothed.center[1] < 6
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_after_a_pause_smoothing_starts_afresh(method: Any) -> None:
-    smoother = ContactSmoother(method)
+def test_after_a_pause_smoothing_starts_afresh() -> None:
+    smoother = ContactSmoother()
     smoother.update(contact(0, 0, 0), 0.0)
     smoother.reset()
     smoothed = smoother.update(contact(50, 60, 70), 0.1)
     assert (smoothed.center, smoothed.angle) == ((50, 60), 70)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_time_that_does_not_advance_starts_afresh(method: Any) -> None:
-    smoother = ContactSmoother(method)
+def test_time_that_does_not_advance_starts_afresh() -> None:
+    smoother = ContactSmoother()
     smoother.update(contact(0, 0, 0), 5.0)
     for t in (5.0, 1.0):
         assert smoother.update(contact(50, 60, 70), t).center == (50, 60)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_contact_without_direction_keeps_none_and_restarts_the_angle(method: Any) -> None:
-    smoother = ContactSmoother(method)
+def test_a_contact_without_direction_keeps_none_and_restarts_the_angle() -> None:
+    smoother = ContactSmoother()
     smoother.update(contact(0, 0, 0), 0.0)
     gap = smoother.update(contact(10, 0, None), 0.1)
     assert gap.angle is None
@@ -170,7 +142,7 @@ def test_a_contact_without_direction_keeps_none_and_restarts_the_angle(method: A
 def test_a_longer_pause_between_frames_trusts_the_new_value_more() -> None:
     results = []
     for dt in (0.01, 0.1, 10.0):
-        smoother = ContactSmoother("one_euro", speed_coefficient=0.0)
+        smoother = ContactSmoother(speed_coefficient=0.0)
         smoother.update(contact(0), 0.0)
         results.append(smoother.update(contact(10), dt).center[0])
     assert results == sorted(results)
@@ -180,13 +152,9 @@ def test_a_longer_pause_between_frames_trusts_the_new_value_more() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"method": "mean"}, "'one_euro' or 'alpha_beta'"),
         ({"min_cutoff": 0.0}, "min_cutoff"),
         ({"min_cutoff": math.nan}, "min_cutoff"),
         ({"speed_coefficient": -1.0}, "speed_coefficient"),
-        ({"method": "alpha_beta", "alpha": 0.0}, "alpha"),
-        ({"method": "alpha_beta", "alpha": 1.5}, "alpha"),
-        ({"method": "alpha_beta", "alpha": 0.5, "beta": 3.0}, "beta"),
     ],
 )
 def test_bad_options_are_refused_with_a_reason(kwargs: dict[str, Any], message: str) -> None:
