@@ -1,7 +1,7 @@
 """Live sources that fail and come back: faults are reported, and the source is opened again.
 
 A thread reads all the time and keeps only the newest frame, so that a driver's buffer never goes stale and
-waiting for a frame can be ended at once. A read that hangs is left behind, and another thread takes over.
+waiting for a frame can be ended at once.
 """
 
 from __future__ import annotations
@@ -30,10 +30,8 @@ SILENT_INTERVALS = 3.0
 """A gap shorter than so many usual times between frames is no stall. Chosen by hand."""
 INTERVAL_DECAY = 0.9
 """By this factor a long gap counts less with each frame after it. Chosen by hand."""
-OPEN_TIMEOUT = 15.0
-"""Opening that takes longer hangs, s: more than drivers and streams allow themselves. Chosen by hand."""
-MAX_HUNG = 4
-"""No new attempt while so many threads hang in a driver. Chosen by hand."""
+CLOSE_SECONDS = 3.0
+"""How long `close` waits for a read that is under way, s. Chosen by hand."""
 POLL_SECONDS = 0.1
 """How often a waiting reader looks for faults, s. Chosen by hand."""
 
@@ -48,7 +46,6 @@ class Watch:
     frozen_after : pictures that are identical for so long are a fault; None never.
     black_after : black pictures for so long are a fault; None never.
     silent_after : stall timeout: no picture for so long, and for three times the usual interval, is a fault.
-    hang_after : a read that takes longer is abandoned, and the source is opened again.
     first_retry, last_retry : back-off between attempts: doubles from the first to the last.
     """
 
@@ -57,7 +54,6 @@ class Watch:
     frozen_after: float | None = 3.0
     black_after: float | None = 1.0
     silent_after: float = 0.8
-    hang_after: float = 3.0
     first_retry: float = 0.25
     last_retry: float = 2.0
 
@@ -135,10 +131,11 @@ class Watched(FrameReader):
         self._arrived_at = self._good_at = self._lit_at = self._changed_at = clock.now()
         self._lit = False
         self._previous: BgrImage | None = None
-        self._hangs_at = math.inf
-        self._hung: list[threading.Thread] = []
-        self.reader = self._start(source)
-        """The thread that frames arrive in; another one after a read that hung."""
+        self.reader = threading.Thread(
+            target=self._work, args=(source,), name=f"tactflow-read-{name}", daemon=True
+        )
+        """The thread that frames arrive in."""
+        self.reader.start()
 
     @property
     def state(self) -> str:
@@ -176,8 +173,7 @@ class Watched(FrameReader):
         """Release the source. A read that hangs is given a moment; it releases it when it ends."""
         super().close()
         self.stop()
-        if self.reader is not threading.current_thread():
-            self.reader.join(self._watch.hang_after)
+        self.reader.join(CLOSE_SECONDS)
 
     def _frames(self) -> Iterator[tuple[BgrImage, float]]:
         while (arrival := self.read_arrival()) is not None:
@@ -186,20 +182,13 @@ class Watched(FrameReader):
     # -- faults; whoever calls these holds the lock -------------------------------------------------------
 
     def _check_time(self, now: float) -> None:
-        """Notice what no frame can show: a stall, the end of all patience, a read that hangs."""
+        """Notice what no frame can show: a stall, and the end of all patience."""
         watch = self._watch
         usual = FIRST_FRAME_SECONDS if self._seq < 0 else watch.silent_after
-        hangs = watch.reconnect and now >= self._hangs_at
-        stalls = now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval)
-        if self._fault is None and (stalls or hangs):
+        if self._fault is None and now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval):
             self._report("no frames", self._arrived_at, now)
         if watch.no_frame_timeout and now - self._good_at >= watch.no_frame_timeout:
             self._failure = self._timeout_error(now)
-        elif hangs:
-            self._hung = [thread for thread in self._hung if thread.is_alive()]
-            if len(self._hung) < MAX_HUNG:
-                self._hung.append(self.reader)
-                self.reader = self._start(None)
 
     def _timeout_error(self, now: float) -> SourceError:
         fault = self._fault
@@ -246,18 +235,12 @@ class Watched(FrameReader):
 
     # -- the thread that reads ----------------------------------------------------------------------------
 
-    def _start(self, source: FrameReader | None) -> threading.Thread:
-        name = f"tactflow-read-{self.name}"
-        thread = self.reader = threading.Thread(target=self._work, args=(source,), name=name, daemon=True)
-        thread.start()
-        return thread
-
     def _work(self, source: FrameReader | None) -> None:
-        """Read the source until it fails, and open it again, for as long as this thread is the reader."""
+        """Read the source until it fails, and open it again, until the end."""
         while source is not None or self._wait_to_retry():
             try:
                 with closing(source or self._reopen()) as opened:
-                    while self._enter(self._watch.hang_after + SILENT_INTERVALS * self._interval):
+                    while self._is_running():
                         item = opened.read()
                         if item is None:
                             self._fail(None)
@@ -268,30 +251,19 @@ class Watched(FrameReader):
                 self._fail(error)
             source = None
 
-    def _is_reader(self) -> bool:
-        ended = self._ended or self._failure is not None or self._stopped.is_set()
-        return self.reader is threading.current_thread() and not ended
-
-    def _enter(self, limit: float) -> bool:
-        """Begin something that hangs if it takes longer than `limit`, s; False if this thread is to end."""
-        with self._changed:
-            if self._is_reader():
-                self._hangs_at = self._clock.now() + limit
-                return True
-            return False
+    def _is_running(self) -> bool:
+        return not self._ended and self._failure is None and not self._stopped.is_set()
 
     def _wait_to_retry(self) -> bool:
         """Wait until the source may be opened again, with exponential back-off; False if there is no need."""
         fault, watch = self._fault, self._watch
-        if fault is None or not self._enter(math.inf):
+        if fault is None or not self._is_running():
             return False
-        stopped = self._clock.sleep(fault.retry_at - self._clock.now(), self._stopped)
-        if stopped or not self._enter(OPEN_TIMEOUT):
-            return False
+        self._clock.sleep(fault.retry_at - self._clock.now(), self._stopped)
         fault.attempts += 1
         delay = min(watch.first_retry * 2.0 ** min(fault.attempts, 30), watch.last_retry)
         fault.retry_at = self._clock.now() + delay
-        return True
+        return self._is_running()
 
     def _reopen(self) -> FrameReader:
         source = self._opener()
@@ -300,7 +272,7 @@ class Watched(FrameReader):
             sizes = ("{} x {}".format(*size) for size in (source.size, self.size))
             raise SourceError("it came back with {} pixels instead of {}".format(*sizes))
         with self._changed:
-            if self._is_reader() and self._fault is not None:
+            if self._fault is not None:
                 self._connection += 1
                 self._fault.detail = "it was opened, but gave no good frame"
         return source
@@ -309,8 +281,6 @@ class Watched(FrameReader):
         """A frame has arrived; True if the source is to be opened again."""
         now = self._clock.now()
         with self._changed:
-            if not self._is_reader():
-                return True
             gap, self._arrived_at = now - self._arrived_at, now
             self._seq += 1
             if self._seq and not (self._fault and self._fault.attempts):
@@ -337,8 +307,6 @@ class Watched(FrameReader):
         if error is not None and not isinstance(error, SourceError):
             detail = f"{type(error).__name__}: {detail}"
         with self._changed:
-            if not self._is_reader():
-                return
             if not self._watch.reconnect:
                 self._ended = True
                 if error is None:
