@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench.labels import (
+    FOLDER,
     Label,
     labels_of,
     outlines_by_eye,
@@ -25,9 +26,6 @@ from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import RECORDING
 from tactflow.engine.graph import Pipeline
-
-FOLDER = "gels"
-"""Where the recordings of gels are, in the folder of recordings."""
 
 _VIDEOS = (".avi", ".mp4", ".m4v", ".gif")
 _PICTURES = (".png", ".jpg")

@@ -7,17 +7,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import metrics
+from tactflow.bench.label_file import load_labels
 from tactflow.bench.quantities import Tally
 from tactflow.vision.types import Contact
 
-Polygons = Mapping[str, Mapping[int, tuple[int, NDArray[np.float64]]]]
-"""Recording -> frame -> (downsample, polygon (N, 2) px of the frame after it)."""
+OUTLINES: Final = Path(__file__).with_name("outlines.json")
+"""Outlines that were drawn for the package, see `label_file`, and frames at rest."""
+
+FOLDER: Final = "gels"
+"""Where the recordings of gels are, in the folder of recordings."""
+
+Polygons = Mapping[str, Mapping[int, tuple[NDArray[np.float64], ...]]]
+"""Recording -> frame -> polygons (N, 2), px of the raw frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +65,16 @@ def outlines_by_eye(gels: Path) -> Polygons:
 
     gels : folder of the recordings. Two people's outlines overlap by 0.9 to 0.95.
     """
-    own = files("tactflow.bench") / "gel_outlines.json"
-    drawn = json.loads(own.read_text(encoding="utf-8"))
+    outlines: dict[str, dict[int, tuple[NDArray[np.float64], ...]]] = {}
+    for label in load_labels(OUTLINES):
+        name = _name(Path(label.recording))
+        if label.round == 1 and label.outlines and name.startswith(f"{FOLDER}/"):
+            polygons = tuple(np.asarray(outline) for outline in label.outlines)
+            outlines.setdefault(name.removeprefix(f"{FOLDER}/"), {})[int(label.frame)] = polygons
     theirs = gels / "polygons.json"
-    if theirs.exists():
-        drawn += json.loads(theirs.read_text(encoding="utf-8"))
-    outlines: dict[str, dict[int, tuple[int, NDArray[np.float64]]]] = {}
-    for entry in drawn:
-        polygon = np.asarray(entry["polygon"], dtype=np.float64)
-        outlines.setdefault(entry["rec"], {})[int(entry["frame"])] = (int(entry["downsample"]), polygon)
+    for entry in json.loads(theirs.read_text(encoding="utf-8")) if theirs.exists() else ():
+        polygon = np.asarray(entry["polygon"], np.float64) * int(entry["downsample"])
+        outlines.setdefault(entry["rec"], {})[int(entry["frame"])] = (polygon,)
     return outlines
 
 
@@ -80,8 +88,11 @@ def labels_of(source: Path, gels: Path, downsample: int, drawn: Polygons) -> dic
     if path.exists():
         stored = json.loads(path.read_text(encoding="utf-8"))
         return {int(frame): _label(entry) for frame, entry in stored.items()}
-    outlines = drawn.get(_name(source, gels), {})
-    return {frame: Label((polygon * (of / downsample),)) for frame, (of, polygon) in outlines.items()}
+    outlines = drawn.get(_name(source.relative_to(gels)), {})
+    return {
+        frame: Label(tuple(polygon / downsample for polygon in polygons))
+        for frame, polygons in outlines.items()
+    }
 
 
 def touch_of(source: Path, gels: Path) -> NDArray[np.int8] | None:
@@ -90,12 +101,14 @@ def touch_of(source: Path, gels: Path) -> NDArray[np.int8] | None:
     From the displacement of its dots against a frame at rest, followed by Lucas and Kanade's method in
     grey levels without the light: 95th percentile up to 0.35 px at rest, from 1.5 px on touched.
     """
-    runs = json.loads((files("tactflow.bench") / "gel_touch.json").read_text()).get(_name(source, gels))
+    runs = json.loads((files("tactflow.bench") / "gel_touch.json").read_text()).get(
+        _name(source.relative_to(gels))
+    )
     return None if runs is None else np.repeat(*np.transpose(runs)).astype(np.int8)
 
 
-def _name(source: Path, gels: Path) -> str:
-    return str(source.relative_to(gels).with_suffix("")).removesuffix("/video")
+def _name(recording: Path) -> str:
+    return str(recording.with_suffix("")).removesuffix("/video")
 
 
 def _label(entry: Mapping[str, Any]) -> Label:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench import gels
+from tactflow.bench.labels import FOLDER
 from tactflow.bench.lockstep import TimedResult, with_params
 from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
@@ -52,7 +52,7 @@ def check(data: Path) -> None:
     ConfigError
         If the folder holds none of the known recordings.
     """
-    known = ("wedge_ball", gels.FOLDER)
+    known = ("wedge_ball", FOLDER)
     if not any((data / name).is_dir() for name in known):
         raise ConfigError(f"--data {data}: required a folder with one of {', '.join(known)} in it")
 

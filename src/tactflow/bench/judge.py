@@ -1,0 +1,348 @@
+"""How well pipelines find contacts on recordings of real sensors, lab by lab.
+
+    python -m tactflow.bench.judge --data RECORDINGS
+    python -m tactflow.bench.judge --data RECORDINGS --labels mine.json default mine.yaml
+
+Frames were outlined by a person (`python -m tactflow.bench.label`): `outlines.json` beside this file has
+those of recordings that anybody can have, of twenty sensors. A recording runs as a whole, as a user would run
+it; pictures of separate presses run one after the other, behind their reference.
+
+What is chosen with the help of labels cannot be judged on them. With several pipelines the table ends with
+one that is chosen for each lab by the labels of all *other* labs: the result that a new lab can expect of
+such a choice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.bench import metrics
+from tactflow.bench.label_file import FrameLabel, load_labels
+from tactflow.bench.labels import OUTLINES
+from tactflow.bench.score import DIRECTED
+from tactflow.engine.errors import ConfigError, TactflowError
+from tactflow.message.result import Result
+from tactflow.streaming import stream
+from tactflow.vision.geometry import PixelMapping
+from tactflow.vision.geometry.hull import contact_geometry
+
+PLAIN: Final = (
+    "gels/9dtact_1",
+    "gels/digit_fots",
+    "gels/jar_7_31_2",
+    "gels/jar_8_06_1",
+    "gels/thu_real",
+    "mini_ball_gelslam",
+    "wedge_grasp",
+    "wedge_grip",
+)
+"""Recordings of gels without dots among those of `OUTLINES`: `default` gives way to `markerless` there."""
+LARGE: Final = 500
+"""px: pictures with a longer side are halved, as the documentation advises."""
+RESAMPLES: Final = 1000
+"""For the intervals: as many as give their bounds two digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What a pipeline found in a frame, compared with its label.
+
+    lab, recording : of the label. touched, found : whether something touches, by label and by pipeline.
+    hull : overlap (IoU) of the convex hulls, 0..1; 0 for a missed contact. region : the same of the regions
+        themselves. Both, and all that follows, are NaN where the label has no outline.
+    center : distance of the regions' centroids, px of the processed frame. angle : between their axes,
+        degrees; NaN where the outline is less than twice as long as wide. area : of the region found over
+        that of the outline. These three are NaN for a missed contact.
+    """
+
+    lab: str
+    recording: str
+    touched: bool
+    found: bool
+    hull: float = np.nan
+    region: float = np.nan
+    center: float = np.nan
+    angle: float = np.nan
+    area: float = np.nan
+
+
+def compare(label: FrameLabel, result: Result) -> Judged:
+    """Compare what was found in a frame with its label, which says whether something touches."""
+    contact, mapping = result.contact, result["mapping"]
+    assert isinstance(mapping, PixelMapping)
+    judged = Judged(label.lab, label.recording, bool(label.contact), contact is not None)
+    if not label.outlines:
+        return judged
+    shape = mapping.size[::-1]
+    truth = metrics.filled_polygons([mapping.to_processed(outline) for outline in label.outlines], shape)
+    if contact is None or result.contact_mask is None:
+        return replace(judged, hull=0.0, region=0.0)
+    drawn = contact_geometry(truth)
+    assert drawn is not None
+    angle = np.nan
+    if metrics.aspect_ratio(truth) >= DIRECTED and drawn.angle is not None:
+        angle = 90.0 if contact.angle is None else metrics.angle_error(contact.angle, drawn.angle)
+    return replace(
+        judged,
+        hull=metrics.polygon_iou(drawn.hull, contact.hull, shape),
+        region=metrics.mask_iou(truth, result.contact_mask),
+        center=float(metrics.distance(contact.center, drawn.center)),
+        angle=angle,
+        area=contact.region_area / drawn.region_area,
+    )
+
+
+def judge(
+    pipeline: str, labels: Iterable[FrameLabel], data: Path, say: Callable[[str], None] = print
+) -> Iterator[Judged]:
+    """Run every recording that is there, and compare its labelled frames.
+
+    pipeline : a file or the name of a shipped pipeline. "default" is replaced by "markerless" for the
+        recordings in `PLAIN`.
+    labels : those with `contact` None are left out. data : folder that holds the recordings.
+    say : called with what could not be judged, and why. Frames that a failing pipeline did not reach count as
+        missed contacts.
+    """
+    known = sorted((label for label in labels if label.contact is not None), key=_run)
+    for (recording, reference), group in groupby(known, key=_run):
+        path, wanted = data / recording, list(group)
+        if not path.exists():
+            say(f"{recording}: not in {data}, left out")
+            continue
+        chosen = "markerless" if pipeline == "default" and recording.startswith(PLAIN) else pipeline
+        frames, places = _stills(path, reference, wanted) if path.is_dir() else (path, wanted)
+        missing = {_place(label): label for label in places}
+        try:
+            for result in _results(chosen, frames, last=max(missing)):
+                if result.seq in missing and not result.frame.reference:
+                    yield compare(missing.pop(result.seq), result)
+        except TactflowError as error:
+            say(f"{recording}: {str(error).splitlines()[0]}")
+        for label in missing.values():
+            yield Judged(label.lab, label.recording, bool(label.contact), False, hull=0.0, region=0.0)
+
+
+def _run(label: FrameLabel) -> tuple[str, str]:
+    """What is run at once: a video, or the pictures with the same reference."""
+    return label.recording, label.reference if isinstance(label.reference, str) else ""
+
+
+def _place(label: FrameLabel) -> int:
+    assert isinstance(label.frame, int)
+    return label.frame
+
+
+def _stills(
+    folder: Path, reference: str, labels: Sequence[FrameLabel]
+) -> tuple[list[NDArray[np.uint8]], list[FrameLabel]]:
+    """The reference and the labelled pictures, and the labels with the pictures' places in that list."""
+    names = [reference, *(str(label.frame) for label in labels)]
+    placed = [label.model_copy(update={"frame": place}) for place, label in enumerate(labels, 1)]
+    return [_picture(folder, name) for name in names], placed
+
+
+def _picture(folder: Path, name: str) -> NDArray[np.uint8]:
+    files = [file for file in (folder / name).parent.iterdir() if file.stem == Path(name).name]
+    image = cv2.imread(str(files[0]), cv2.IMREAD_COLOR) if files else None
+    if image is None:
+        raise ConfigError(f"{folder / name}: no picture of that name can be read")
+    return np.asarray(image, np.uint8)
+
+
+def _results(pipeline: str, source: Path | list[NDArray[np.uint8]], last: int) -> Iterator[Result]:
+    settings = {
+        "stages.preprocess.rotate": 0,
+        "stages.preprocess.downsample": 1 + (_longer_side(source) > LARGE),
+    }
+    with closing(stream(pipeline, source=source, settings=settings, max_frames=last + 1)) as results:
+        yield from results
+
+
+def _longer_side(source: Path | list[NDArray[np.uint8]]) -> int:
+    if not isinstance(source, Path):
+        return int(max(source[0].shape))
+    video = cv2.VideoCapture(str(source))
+    try:
+        return int(max(video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+    finally:
+        video.release()
+
+
+def table(judged: Sequence[Judged]) -> Iterator[str]:
+    """Lines of a table: a row for each lab, and one for all."""
+    heading = (
+        "lab",
+        "frames",
+        "hull IoU",
+        "10 %",
+        "region IoU",
+        "center px",
+        "angle deg",
+        "area",
+        "x2",
+        "missed",
+    )
+    yield ROW.format(*heading, "rest", "false")
+    for lab in sorted({one.lab for one in judged}):
+        yield _row(lab or "-", [one for one in judged if one.lab == lab])
+    yield _row("all", judged)
+
+
+ROW: Final = "{:18} {:>6} {:>17} {:>5} {:>10} {:>9} {:>11} {:>5} {:>5} {:>6} {:>5} {:>5}"
+
+
+def _row(name: str, judged: Sequence[Judged]) -> str:
+    touched, rest = [one for one in judged if one.touched], [one for one in judged if not one.touched]
+    hull, region, center, angle, area = (
+        np.array([value for one in touched if not np.isnan(value := getattr(one, key))])
+        for key in ("hull", "region", "center", "angle", "area")
+    )
+    outside = np.mean((area < 0.5) | (area > 2)) if len(area) else np.nan
+    low, high = interval(touched)
+    return ROW.format(
+        name,
+        len(touched),
+        f"{_median(hull):.2f} ({low:.2f}-{high:.2f})" if len(hull) else "-",
+        f"{np.quantile(hull, 0.1):.2f}" if len(hull) else "-",
+        f"{_median(region):.2f}" if len(region) else "-",
+        f"{_median(center):.1f}" if len(center) else "-",
+        f"{_median(angle):.1f} / {angle.max():.0f}" if len(angle) else "-",
+        f"{_median(area):.2f}" if len(area) else "-",
+        f"{outside:.0%}" if len(area) else "-",
+        f"{np.mean([not one.found for one in touched]):.1%}" if touched else "-",
+        len(rest),
+        f"{np.mean([one.found for one in rest]):.1%}" if rest else "-",
+    )
+
+
+def _median(values: Sequence[float] | NDArray[np.float64]) -> float:
+    return float(np.median(values)) if len(values) else np.nan
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else 0.0
+
+
+def interval(judged: Sequence[Judged], confidence: float = 0.95) -> tuple[float, float]:
+    """Bounds of the median overlap of hulls, by resampling whole recordings (bootstrap, Efron 1979).
+
+    Frames of a recording resemble each other, and do not count as so many. NaN without outlines.
+    """
+    groups: dict[str, list[float]] = {}
+    for one in judged:
+        if not np.isnan(one.hull):
+            groups.setdefault(one.recording, []).append(one.hull)
+    if not groups:
+        return np.nan, np.nan
+    overlaps, generator = list(groups.values()), np.random.default_rng(0)
+    medians = [
+        np.median(
+            np.concatenate(
+                [overlaps[index] for index in generator.integers(len(overlaps), size=len(overlaps))]
+            )
+        )
+        for _ in range(RESAMPLES)
+    ]
+    low, high = np.quantile(medians, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
+
+
+def chosen_elsewhere(candidates: Mapping[str, Sequence[Judged]]) -> list[Judged]:
+    """For each lab, the results of that candidate which is best at all other labs: leave one lab out.
+
+    The best has the highest mean of the labs' median overlaps of hulls.
+    """
+    scores = {
+        name: {
+            lab: _median([one.hull for one in group if not np.isnan(one.hull)])
+            for lab, group in _by_lab(judged)
+        }
+        for name, judged in candidates.items()
+    }
+    left_out: list[Judged] = []
+    for lab in sorted({lab for score in scores.values() for lab in score}):
+        others = {
+            name: _mean([value for other, value in score.items() if other != lab and not np.isnan(value)])
+            for name, score in scores.items()
+        }
+        best = max(others, key=lambda name: others[name])
+        left_out += [one for one in candidates[best] if one.lab == lab]
+    return left_out
+
+
+def _by_lab(judged: Sequence[Judged]) -> Iterator[tuple[str, list[Judged]]]:
+    for lab, group in groupby(sorted(judged, key=lambda one: one.lab), key=lambda one: one.lab):
+        yield lab, list(group)
+
+
+def scatter(labels: Iterable[FrameLabel]) -> list[float]:
+    """Overlap of each frame's outlines that were drawn in round 1 and again in round 2, 0..1."""
+    rounds = {(label.recording, label.frame, label.round): label for label in labels if label.outlines}
+    overlaps = []
+    for (recording, frame, number), label in rounds.items():
+        first = rounds.get((recording, frame, 1))
+        if number != 2 or first is None:
+            continue
+        corners = np.concatenate([np.asarray(outline) for outline in (*label.outlines, *first.outlines)])
+        width, height = np.ceil(corners.max(axis=0)).astype(int) + 1
+        masks = [
+            metrics.filled_polygons([np.asarray(outline) for outline in one.outlines], (height, width))
+            for one in (label, first)
+        ]
+        overlaps.append(metrics.mask_iou(*masks))
+    return overlaps
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tactflow.bench.judge", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("pipelines", nargs="*", default=["default"], metavar="PIPELINE", help="file or name")
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="recordings that the labels name"
+    )
+    parser.add_argument(
+        "--labels", type=Path, default=OUTLINES, metavar="FILE", help="default: those of the package"
+    )
+    parser.add_argument("--recording", metavar="START", default="", help="only those whose name starts so")
+    options = parser.parse_args(arguments)
+    try:
+        labels = [
+            label for label in load_labels(options.labels) if label.recording.startswith(options.recording)
+        ]
+        first = [label for label in labels if label.round == 1]
+        results = {name: list(judge(name, first, options.data, _to_stderr)) for name in options.pipelines}
+    except ConfigError as error:
+        _to_stderr(f"error: {error}")
+        return error.exit_code
+    if not any(results.values()):
+        _to_stderr(f"error: --data {options.data}: has none of the recordings of {options.labels}")
+        return ConfigError.exit_code
+    if len(results) > 1:
+        results["chosen on the labels of all other labs"] = chosen_elsewhere(results)
+    for name, judged in results.items():
+        print(name, *table(judged), sep="\n", end="\n\n")
+    if again := scatter(labels):
+        print(
+            f"Labels: {len(again)} frames that were outlined twice overlap by {_median(again):.2f} (median)"
+        )
+    return 0
+
+
+def _to_stderr(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
