@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
@@ -14,16 +16,22 @@ from pydantic import Field, field_validator
 from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.sources import KINDS, CameraRequest, FrameReader, Watch, Watched, open_source
-from tactflow.sources.captured import CapturedFrames
-from tactflow.sources.files import load_image
+from tactflow.sources import KINDS, CameraRequest, FrameReader, StampedReader, Watch, Watched, open_source
+from tactflow.sources.files import ImageFiles, load_image
+from tactflow.sources.first import FirstFrames
+from tactflow.sources.pace import paced
+from tactflow.sources.watch import Arrival
+
+logger = logging.getLogger("tactflow")
 
 
 class Capture(Source):
     """Reads frames and says which of them show the untouched gel.
 
     Recordings are handed over as fast as they are taken, or, with `realtime`, at their own pace and then
-    like a live camera. `retake` and `stop` may be called from another thread.
+    like a live camera. Their first frames are examined ahead: if one of them is a better reference than the
+    very first, it comes before all others, with number -1. Those of a live source are left out until it is
+    steady. A recording of tactflow's own brings its references, seq and epochs.
     """
 
     class Params(StageParams):
@@ -125,8 +133,12 @@ class Capture(Source):
         self._directory = directory
         self._opener = opener
         self._source: FrameReader | None = None
-        self._frames: CapturedFrames | None = None
         self._reference_image: NDArray[np.uint8] | None = None
+        self._count = params.reference if isinstance(params.reference, int) else 1
+        self._references_left = 0
+        self._epoch = 0
+        self._examined = 0
+        """Frames of a live source that were examined for the reference and left out."""
         self._stop = threading.Event()
         self._retake = threading.Event()
 
@@ -173,8 +185,7 @@ class Capture(Source):
     @property
     def missed(self) -> int:
         """Frames of a live source that a newer one overtook, or that were only examined: gaps in `seq`."""
-        examined = 0 if self._frames is None else self._frames.left_out
-        return self._source.missed + examined if isinstance(self._source, Watched) else 0
+        return self._source.missed + self._examined if isinstance(self._source, Watched) else 0
 
     @property
     def live_threads(self) -> Sequence[int]:
@@ -187,7 +198,7 @@ class Capture(Source):
         self._retake.set()
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame of the source, in order, until its end or `stop()`; see `CapturedFrames`.
+        """Every frame of the source, in order, until its end or `stop()`.
 
         Raises
         ------
@@ -196,18 +207,124 @@ class Capture(Source):
         """
         if self._source is None:
             raise SourceError(f"{self.description}: is not open")
+        if isinstance(self._source, StampedReader):
+            return self._replay(self._source)
+        if isinstance(self._source, Watched):
+            return self._watch(self._source)
+        return self._play(self._source)
+
+    def _play(self, source: FrameReader) -> Iterator[Frame]:
+        """Frames of a recording, after those that show the untouched gel if these are not the first ones."""
         p = self.params
-        self._frames = CapturedFrames(
-            source=self._source,
-            name=p.source,
-            sensor=self._sensor,
-            count=p.reference if isinstance(p.reference, int) else 1,
-            image=self._reference_image,
-            settle=p.settle,
-            skip=p.skip,
-            retake_on_reconnect=p.on_reconnect == "retake",
-            realtime=p.realtime,
-            stop=self._stop,
-            retake=self._retake,
-        )
-        yield from self._frames
+        for _ in range(p.skip):
+            if self._stop.is_set() or source.read() is None:
+                return
+        shown_before, self._references_left = self._choose(source)
+        realtime = p.realtime and not source.live
+        for seq, (image, t) in enumerate(paced(source.read, p.source, realtime, self._stop), p.skip):
+            for picture in shown_before:
+                yield self._shown_before(picture, image, t)
+            shown_before = []
+            yield self._frame(image, t, seq)
+
+    def _choose(self, source: FrameReader) -> tuple[list[NDArray[np.uint8]], int]:
+        """Pictures to show before the first frame, and how many of the first frames are references."""
+        if self._reference_image is not None:
+            return [self._reference_image], 0
+        first = self._first_frames()
+        if first is None or source.live:
+            return [], self._count
+        pictures: list[NDArray[np.uint8]] = []
+        while not self._stop.is_set() and (item := source.peek()) is not None:
+            pictures.append(item[0])
+            if first.look(*item):
+                break
+        chosen = first.references() if pictures else []
+        if isinstance(source, ImageFiles) and first.separate and chosen[0] == 0:
+            logger.info(
+                "%s: separate pictures; %s, the first by name, is taken for the untouched gel. "
+                "If another one shows that, name it: stages.capture.reference",
+                self.params.source,
+                source.first,
+            )
+        if chosen == list(range(len(chosen))):
+            return [], len(chosen)
+        return [pictures[index] for index in chosen], 0
+
+    def _replay(self, source: StampedReader) -> Iterator[Frame]:
+        """Frames as they were captured the first time; references that are retaken now come on top."""
+        p = self.params
+        for image, t, stamp in paced(source.read_stamped, p.source, p.realtime, self._stop):
+            again = self._is_reference(retake=stamp.seq >= 0)
+            reference, epoch = stamp.reference or again, stamp.epoch + self._epoch
+            captured = time.perf_counter()
+            yield Frame(self._sensor, stamp.seq, t, _read_only(image), captured, reference, epoch)
+
+    def _watch(self, source: Watched) -> Iterator[Frame]:
+        """Frames of a source that numbers them where they arrive, and that may go and come back."""
+        p, image = self.params, self._reference_image
+        self._references_left = self._count if image is None else 0
+        first = self._first_frames() if image is None else None
+        held: list[Arrival] = []
+        connection, begins = 0, p.skip
+        while not self._stop.is_set() and (arrival := source.read_arrival()) is not None:
+            if arrival.connection != connection:
+                connection, begins = arrival.connection, arrival.seq + p.skip
+                if p.on_reconnect == "retake":
+                    self._retake.set()
+                    first, held = self._first_frames(), []
+            if arrival.seq < begins:
+                continue
+            if image is not None:
+                yield self._shown_before(image, arrival.image, arrival.t)
+                image = None
+            held.append(arrival)
+            if first is not None:
+                if not first.look(arrival.image, arrival.t):
+                    continue
+                chosen = first.references()
+                self._examined += len(held) - len(chosen)
+                held = [held[index] for index in chosen]
+                # Whatever was requested before, these are the references.
+                self._is_reference()
+                self._references_left = len(chosen)
+                first = None
+            for arrived in held:
+                yield self._frame(arrived.image, arrived.t, arrived.seq, arrived.captured)
+            held = []
+
+    def _first_frames(self) -> FirstFrames | None:
+        """What examines the first frames; None if they are handed out at once."""
+        p = self.params
+        return FirstFrames(p.source, p.settle, self._count) if p.settle > 0 else None
+
+    def _is_reference(self, *, retake: bool = True) -> bool:
+        """Whether the next frame is a reference. retake : whether a new epoch may begin with it."""
+        if retake and self._retake.is_set():
+            self._retake.clear()
+            self._epoch += 1
+            self._references_left = self._count
+        reference = self._references_left > 0
+        self._references_left -= reference
+        return reference
+
+    def _frame(self, image: NDArray[np.uint8], t: float, seq: int, captured: float | None = None) -> Frame:
+        reference = self._is_reference()
+        captured = time.perf_counter() if captured is None else captured
+        return Frame(self._sensor, seq, t, _read_only(image), captured, reference, self._epoch)
+
+    def _shown_before(self, image: NDArray[np.uint8], first: NDArray[np.uint8], t: float) -> Frame:
+        """A reference that comes before the first frame, which was taken at t."""
+        if image.shape != first.shape:
+            raise SourceError(
+                f"stages.capture.reference is an image of {image.shape[1]} x {image.shape[0]} pixels, the "
+                f"frames of {self.params.source} have {first.shape[1]} x {first.shape[0]}; they must be "
+                "equally large"
+            )
+        return Frame(self._sensor, -1, t, _read_only(image), time.perf_counter(), reference=True)
+
+
+def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    image = image.view()
+    image.setflags(write=False)
+    return image

@@ -228,9 +228,7 @@ class _Stamped(FrameReader):
             yield np.zeros((8, 8, 3), np.uint8), t
 
 
-def test_times_that_run_back_are_counted_on_with_a_warning_and_a_count(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_times_that_run_back_are_counted_on_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     times = [0.0, 0.1, 0.05, 0.15, 9e8, 0.2, 0.3]
     stage = Capture(Capture.Params(source="stamped"), opener=lambda *_args, **_words: _Stamped(times))
     stage.open()
@@ -239,7 +237,6 @@ def test_times_that_run_back_are_counted_on_with_a_warning_and_a_count(
     np.testing.assert_allclose(counted, [0.0, 0.1, 0.1, 0.2, 9e8 + 0.05, 9e8 + 0.05, 9e8 + 0.15], atol=1e-6)
     assert [record.getMessage() for record in caplog.records] == [
         "stamped: its times run back by 0.05 s; they are counted on from there",
-        "stamped: its times ran back at 2 frames",
     ]
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from tactflow.system.clock import SYSTEM, Clock
 
@@ -12,11 +14,9 @@ REST = 0.5
 """The next frame is read after this fraction of the time between frames: what reads, unpacks or renders it
 earlier takes the processor from the work on the last one, which no camera does. Chosen by hand."""
 MAX_BACKLOG = 0.5
-"""A recording that falls further behind than this, s, continues from there: a laptop was asleep, or the
-process was halted, and rushing through what was missed would help nobody. Chosen by hand."""
+"""A recording that falls further behind, s, continues from there: a laptop was asleep. Chosen by hand."""
 LONGEST_GAP = 60.0
-"""A recording that pauses for longer, s, is continued at once: nobody waits for a wrong clock. Chosen by
-hand."""
+"""A recording that pauses for longer, s, is continued at once: a clock was wrong. Chosen by hand."""
 
 logger = logging.getLogger("tactflow")
 
@@ -64,3 +64,32 @@ class Pace:
             self._interval = min(self._interval, t - self._last)
         self._last = t
         return not self._clock.sleep(max(self._start + t - now, 0.0), self._stop)
+
+
+def paced(
+    read: Callable[[], tuple[Any, ...] | None], name: str, realtime: bool, stop: threading.Event
+) -> Iterator[Any]:
+    """What `read` returns, until None or `stop`: picture, time, s, and a `Stamp` where there is one.
+
+    Times that run back are counted on from the last one, with a warning in which the source is `name`.
+    realtime : each is returned when it is due; else as fast as it is taken.
+    """
+    pace = Pace(stop) if realtime else None
+    latest, ahead = -math.inf, 0.0
+    while not stop.is_set() and (pace is None or pace.wait_to_read()):
+        item = read()
+        if item is None:
+            return
+        image, t, *stamp = item
+        t += ahead
+        # A frame that is shown ahead of its time does not count.
+        if not stamp or stamp[0].paced:
+            if t < latest:
+                if ahead == 0:
+                    text = "%s: its times run back by %.3g s; they are counted on from there"
+                    logger.warning(text, name, latest - t)
+                ahead, t = ahead + latest - t, latest
+            latest = t
+            if pace is not None and not pace.wait_for(t):
+                return
+        yield image, t, *stamp
