@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
@@ -34,10 +34,13 @@ TABLES = {
     "frames": tuple(frame_columns()),
 }
 """In the order in which they are written: what belongs to a frame of `frames` is there before it."""
-PART_BYTES = 64_000_000
-"""A part is written early when a table takes so much memory, bytes."""
+PART_ROWS = 200_000
+"""A part is written early when a table has so many rows: with some 20 numbers each they take 100 MB."""
 BATCH_ROWS = 1000
 """Rows are converted to Arrow by so many: all those of a part at once would hold up the other threads."""
+
+Rows = dict[str, list[tuple[Any, ...]]]
+"""Name of a table -> its rows."""
 
 
 class Parquet(Sink):
@@ -81,9 +84,7 @@ class Parquet(Sink):
         self._sensor = sensor
         self._control = control
         self._schemas: dict[str, pa.Schema] = {}
-        self._rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in TABLES}
-        self._batches: dict[str, list[pa.RecordBatch]] = {name: [] for name in TABLES}
-        self._frames = 0
+        self._rows: Rows = {name: [] for name in TABLES}
         self._flushed = 0.0
         self._next = 0
         self._counts = {"frames": 0, "parts": 0}
@@ -102,11 +103,8 @@ class Parquet(Sink):
     def open(self) -> None:
         """Create the folders.
 
-        Raises
-        ------
-        StageError
-            If there are tables and neither `overwrite` nor `append` is set, the folder cannot be written, or
-            a package is missing.
+        Raises StageError if there are tables and neither `overwrite` nor `append` is set, the folder cannot
+        be written, or a package is missing.
         """
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
@@ -124,7 +122,7 @@ class Parquet(Sink):
         files = kept_files(self._control).items()
         texts = {name: data.decode() for name, data in files if name.endswith(".yaml")}
         about = {"schema": SCHEMA, **facts(self._sensor, self._control), **texts}
-        self._schemas = make_schemas(about)
+        self._schemas = _make_schemas(about)
         self._flushed = time.monotonic()
 
     def counters(self) -> Mapping[str, int]:
@@ -134,27 +132,18 @@ class Parquet(Sink):
     def write(self, result: Result) -> None:
         """Keep one frame, and write a part when it is time.
 
-        Raises
-        ------
-        StageError
-            If the part cannot be written, for instance because the disk is full. The parts before stay.
+        Raises StageError if the part cannot be written, as on a full disk. The parts before stay.
         """
         message = orjson.loads(encode_message(result, detail=True))
         for name, rows in _rows(message).items():
             self._rows[name].extend(rows)
-            if len(self._rows[name]) >= BATCH_ROWS:
-                self._convert(name)
-        self._frames += 1
-        size = sum(batch.nbytes for batches in self._batches.values() for batch in batches)
-        if time.monotonic() - self._flushed >= self.params.flush or size >= PART_BYTES:
+        is_due = time.monotonic() - self._flushed >= self.params.flush
+        if is_due or max(map(len, self._rows.values())) >= PART_ROWS:
             self._flush()
 
     def close(self) -> None:
         """Write the last part. Raises as `write`."""
-        try:
-            self._flush()
-        finally:
-            self._schemas = {}
+        self._flush()
 
     def _check_existing(self) -> None:
         """Refuse existing tables, remove them, or continue behind them."""
@@ -172,35 +161,22 @@ class Parquet(Sink):
         numbers = (part.stem.removeprefix("part-") for part in present)
         self._next = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
 
-    def _convert(self, table: str) -> None:
-        import pyarrow as pa
-
-        rows, schema = self._rows[table], self._schemas[table]
-        if rows:
-            columns = zip(zip(*rows, strict=True), schema, strict=True)
-            arrays = [pa.array(column, field.type) for column, field in columns]
-            self._batches[table].append(pa.record_batch(arrays, schema=schema))
-        self._rows[table] = []
-
     def _flush(self) -> None:
-        import pyarrow as pa
         import pyarrow.parquet as pq
 
-        count, self._frames = self._frames, 0
+        rows, self._rows = self._rows, {name: [] for name in TABLES}
         self._flushed = time.monotonic()
-        if not count or not self._schemas:
+        count = len(rows["frames"])
+        if not count:
             return
         try:
             for name, schema in self._schemas.items():
-                self._convert(name)
-                batches, self._batches[name] = self._batches[name], []
-                table = pa.Table.from_batches(batches, schema)
                 # Its name begins with a dot until it is complete: readers of folders leave such files out.
                 part = self._folder / name / f"part-{self._next:05d}.parquet"
                 # A folder that somebody removed is an error, not made anew.
                 part.parent.stat()
                 with completed(part) as unfinished, unfinished.open("wb") as file:
-                    pq.write_table(table, file, compression="zstd")
+                    pq.write_table(_table(rows[name], schema), file, compression="zstd")
                     file.flush()
                     # On the disk before it gets its name, so that a power cut leaves no empty part.
                     os.fsync(file.fileno())
@@ -214,12 +190,19 @@ class Parquet(Sink):
         self._counts = {"frames": self._counts["frames"] + count, "parts": self._counts["parts"] + 1}
 
 
-def make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
-    """The Arrow schema of each table. metadata : of every table.
+def _table(rows: Sequence[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
+    import pyarrow as pa
 
-    >>> make_schemas({})["markers"].names[:4]
-    ['seq', 'marker', 'x', 'y']
-    """
+    batches = []
+    for begin in range(0, len(rows), BATCH_ROWS):
+        columns = zip(zip(*rows[begin : begin + BATCH_ROWS], strict=True), schema, strict=True)
+        arrays = [pa.array(column, field.type) for column, field in columns]
+        batches.append(pa.record_batch(arrays, schema=schema))
+    return pa.Table.from_batches(batches, schema)
+
+
+def _make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
+    """The Arrow schema of each table. metadata : of every table."""
     import pyarrow as pa
 
     types = {
@@ -239,21 +222,18 @@ def make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
     }
 
 
-def _rows(message: Mapping[str, Any]) -> dict[str, list[tuple[Any, ...]]]:
+def _rows(message: Mapping[str, Any]) -> Rows:
     """The rows of each table that one parsed result message gives."""
-    seq = message["seq"]
+    seq, markers = message["seq"], message["markers"] or {"position": (), "origin": (), "status": ()}
     contacts = [
         (seq, index, *(column.value(contact) for column in contact_columns()))
         for index, contact in enumerate(message["contacts"])
     ]
-    frame = tuple(column.value(message) for column in frame_columns())
-    return {"markers": list(_markers(seq, message["markers"])), "contacts": contacts, "frames": [frame]}
-
-
-def _markers(seq: int, markers: Mapping[str, Any] | None) -> Iterator[tuple[Any, ...]]:
-    if markers is None:
-        return
     errors = markers.get("stderr") or repeat(None)
     dots = zip(markers["position"], markers["origin"], markers["status"], errors, strict=False)
-    for index, ((x, y), (origin_x, origin_y), status, error) in enumerate(dots):
-        yield (seq, index, x, y, x - origin_x, y - origin_y, origin_x, origin_y, status, error)
+    moved = [
+        (seq, index, x, y, x - origin_x, y - origin_y, origin_x, origin_y, status, error)
+        for index, ((x, y), (origin_x, origin_y), status, error) in enumerate(dots)
+    ]
+    frame = tuple(column.value(message) for column in frame_columns())
+    return {"markers": moved, "contacts": contacts, "frames": [frame]}
