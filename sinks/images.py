@@ -69,10 +69,7 @@ class Images(Sink):
     def open(self) -> None:
         """Create the folder.
 
-        Raises
-        ------
-        StageError
-            If it holds frames already and `overwrite` is not set, or it cannot be created.
+        Raises StageError if it holds frames already and `overwrite` is not set, or it cannot be created.
         """
         try:
             make_folder(self._folder)
@@ -92,10 +89,7 @@ class Images(Sink):
     def write(self, tick: Tick, annotated: Picture) -> None:
         """Write one file if it is this frame's turn.
 
-        Raises
-        ------
-        StageError
-            If it cannot be written.
+        Raises StageError if it cannot be written.
         """
         seq, every = tick.frame.seq, self.params.every
         if seq < self._next:

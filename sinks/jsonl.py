@@ -77,10 +77,8 @@ class Jsonl(Sink):
     def open(self) -> None:
         """Open or create the file, and its folder; of a pipe, wait for its reader.
 
-        Raises
-        ------
-        StageError
-            If the file exists and neither `overwrite` nor `append` is set, or it cannot be written.
+        Raises StageError if the file exists and neither `overwrite` nor `append` is set, or it cannot be
+        written.
         """
         path, p = expanded(self.params.path), self.params
         if p.path == "-" or is_device(p.path):
@@ -104,11 +102,8 @@ class Jsonl(Sink):
     def write(self, result: Result) -> None:
         """Add one line.
 
-        Raises
-        ------
-        StageError
-            If the file cannot be written, for instance because the disk is full. The file then ends with the
-            last line that fitted.
+        Raises StageError if the file cannot be written, for instance because the disk is full. The file then
+        ends with the last line that fitted.
         """
         if self._out is not None and self.wants():
             p = self.params
@@ -117,10 +112,8 @@ class Jsonl(Sink):
     def close(self) -> None:
         """Write what is left and close the file.
 
-        Raises
-        ------
-        StageError
-            If that is not possible, or the reader of a pipe did not take all lines of a recording.
+        Raises StageError if that is not possible, or the reader of a pipe did not take all lines of a
+        recording.
         """
         if self._out is not None and not self._closed:
             self._closed = True

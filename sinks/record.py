@@ -133,10 +133,8 @@ class Record(Recorder):
     def open(self) -> None:
         """Begin the file, if recording starts with the run.
 
-        Raises
-        ------
-        StageError
-            If the file exists and `overwrite` is not set, it cannot be written, or a package is missing.
+        Raises StageError if the file exists and `overwrite` is not set, it cannot be written, or a package is
+        missing.
         """
         problem = missing_packages()
         if problem is not None:
@@ -152,10 +150,7 @@ class Record(Recorder):
     def start_recording(self) -> None:
         """Begin a new, numbered file with what the ring holds, which then is all of it. Nothing if recording.
 
-        Raises
-        ------
-        StageError
-            If it cannot be written.
+        Raises StageError if it cannot be written.
         """
         with self._lock:
             if self.recording:
@@ -170,10 +165,7 @@ class Record(Recorder):
     def stop_recording(self) -> None:
         """Finish the file, with all that belongs to it. Nothing if not recording.
 
-        Raises
-        ------
-        StageError
-            If it cannot be written.
+        Raises StageError if it cannot be written.
         """
         with self._lock:
             while self._is_due():
@@ -191,10 +183,7 @@ class Record(Recorder):
     def write(self, result: Result) -> None:
         """Record one frame, or keep it for later.
 
-        Raises
-        ------
-        StageError
-            If it cannot be written. The file then ends with the frame before and can be played.
+        Raises StageError if it cannot be written. The file then ends with the frame before and can be played.
         """
         with self._lock:
             if not self.wants() and not result.frame.reference:

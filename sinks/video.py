@@ -70,10 +70,7 @@ class Video(Sink):
     def open(self) -> None:
         """Create the file and its folder.
 
-        Raises
-        ------
-        StageError
-            If the file exists, is a pipe or device, cannot be written, or cannot be lossless.
+        Raises StageError if the file exists, is a pipe or device, cannot be written, or cannot be lossless.
         """
         p = self.params
         self._film = Film(self._path, lossless=p.lossless, fps=p.fps, overwrite=p.overwrite)
@@ -85,11 +82,8 @@ class Video(Sink):
     def write(self, tick: Tick, annotated: Picture) -> None:
         """Add one frame.
 
-        Raises
-        ------
-        StageError
-            If the picture changes its size, or the disk is nearly full. The film then ends with the frame
-            before.
+        Raises StageError if the picture changes its size, or the disk is nearly full. The film then ends with
+        the frame before.
         """
         if self._film is not None:
             self._film.add(tick.frame.t, annotated)
@@ -97,11 +91,8 @@ class Video(Sink):
     def close(self) -> None:
         """Finish the file.
 
-        Raises
-        ------
-        StageError
-            If not all frames are in it: the disk, or a limit on the size of files, ended it early, or another
-            program has taken it away.
+        Raises StageError if not all frames are in it: the disk, or a limit on the size of files, ended it
+        early, or another program has taken it away.
         """
         if self._film is not None:
             self._film.close()

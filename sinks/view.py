@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import select
-import socket
 import threading
 import time
 import webbrowser
@@ -27,9 +25,6 @@ if TYPE_CHECKING:
     from tactflow.view.server import Server
 
 log = logging.getLogger("tactflow")
-
-LOOK_EVERY = 0.2
-"""Time between two looks whether the run has ended before anybody came, s. Chosen by hand."""
 
 
 class View(Guiding):
@@ -99,8 +94,6 @@ class View(Guiding):
         self._control = control
         self._hub: Hub | None = None
         self._server: Server | None = None
-        self._door: threading.Thread | None = None
-        self._closed = threading.Event()
         self._neighbours = None if params.neighbours is None else Neighbours(Path(params.neighbours), sensor)
         self._due = float("-inf")
         self._encoded = 0
@@ -125,34 +118,19 @@ class View(Guiding):
         port = listener.getsockname()[1]
         if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        self._door = threading.Thread(
-            target=self._answer, args=(listener,), name="tactflow-view-door", daemon=True
-        )
-        self._door.start()
+        # Not at the top: its packages take a tenth of a second, and most commands serve no page.
+        from tactflow.view.hub import Hub
+        from tactflow.view.server import Server
+
+        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, self.session)
+        self._server = Server(self._hub, listener, p.host, p.token)
+        self._server.start()
         self.description = address(p.host, port)
         with_token = self.description + (f"?token={p.token}" if p.token else "")
         log.info("view: %s", with_token)
         if p.open_browser:
             # It may take its time, or wait for the browser to end.
             threading.Thread(target=webbrowser.open, args=(with_token,), daemon=True).start()
-
-    def _answer(self, listener: socket.socket) -> None:
-        """Start the server at the first visit: its packages take a tenth of a run's start to import."""
-        while not select.select([listener], [], [], LOOK_EVERY)[0]:
-            if self._closed.is_set():
-                listener.close()
-                return
-        try:
-            from tactflow.view.hub import Hub
-            from tactflow.view.server import Server
-        except ImportError as error:
-            log.warning("view: not shown: %s", error)
-            listener.close()
-            return
-        hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, self.session)
-        self._server = Server(hub, listener, self.params.host, self.params.token)
-        self._server.start()
-        self._hub = hub
 
     def wants(self) -> bool:
         """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""
@@ -203,14 +181,11 @@ class View(Guiding):
 
     def close(self) -> None:
         """Tell the pages that the run has ended, and serve no more."""
-        door, self._door = self._door, None
-        if door is None:
+        server, self._server = self._server, None
+        if server is None:
             return
         if self._neighbours is not None:
             self._neighbours.leave()
-        self._closed.set()
-        door.join()
-        if self._server is not None:
-            self._server.close()
+        server.close()
         # A summary at the end of a run does not name a page that is gone.
         self.description = None

@@ -193,10 +193,7 @@ class Zmq(Sink):
     def open(self) -> None:
         """Bind the sockets; afterwards `endpoint` and `control_endpoint` are the real addresses.
 
-        Raises
-        ------
-        StageError
-            If an address is taken or cannot be bound, or the keys are wrong.
+        Raises StageError if an address is taken or cannot be bound, or the keys are wrong.
         """
         p = self.params
         self._publisher = Publisher(p.endpoint, p.backlog, p.send_buffer, p.keys)

@@ -145,10 +145,7 @@ class Capture(Source):
     def open(self) -> None:
         """Open the source; afterwards `live`, `total` and `description` are known.
 
-        Raises
-        ------
-        SourceError
-            If the source or the reference image cannot be opened.
+        Raises SourceError if the source or the reference image cannot be opened.
         """
         p = self.params
         request = CameraRequest(p.width, p.height, p.fps, p.format)
@@ -200,10 +197,7 @@ class Capture(Source):
     def frames(self) -> Iterator[Frame]:
         """Every frame of the source, in order, until its end or `stop()`.
 
-        Raises
-        ------
-        SourceError
-            If a frame cannot be read, or the reference image is not as large as the frames.
+        Raises SourceError if a frame cannot be read, or the reference image is not as large as the frames.
         """
         if self._source is None:
             raise SourceError(f"{self.description}: is not open")

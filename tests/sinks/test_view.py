@@ -7,7 +7,6 @@ import json
 import logging
 import socket
 import struct
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -578,17 +577,6 @@ def test_an_address_that_is_not_ours_disables_the_view_only(
     assert "not shown" in caplog.text
     assert not sink.wants()
     assert sink.description is None
-
-
-def test_a_package_that_cannot_be_imported_disables_the_view_only(
-    monkeypatch: pytest.MonkeyPatch, view: Views, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setitem(sys.modules, "tactflow.view.server", None)
-    sink = view()
-    assert sink.description is not None
-    socket.create_connection(("127.0.0.1", urlsplit(sink.description).port or 0)).close()
-    until(lambda: "not shown" in caplog.text)
-    assert not sink.wants()
 
 
 def test_at_the_end_pages_learn_how_it_ended(view: Views, page: Pages) -> None:

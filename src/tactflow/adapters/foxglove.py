@@ -91,10 +91,7 @@ class Foxglove(Sink):
     def open(self) -> None:
         """Begin to serve; afterwards `address` is the real one.
 
-        Raises
-        ------
-        StageError
-            If a package is missing, or the address is taken or not one of this machine.
+        Raises StageError if a package is missing, or the address is taken or not one of this machine.
         """
         needed = ["foxglove", "mcap_protobuf", "foxglove_schemas_protobuf"]
         problem = missing("live views in Foxglove", "foxglove", needed)
