@@ -91,6 +91,33 @@ def test_what_is_no_frames_is_refused(query: str, tmp_path: Path) -> None:
         open_source(f"{path}{query}")
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_an_array_ends_where_nothing_more_is_stored(
+    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = KINDS[name](tmp_path / name, frames=IMAGES)
+    options = {"shape": (10**12, 12, 16, 3), "chunks": (2, 12, 16, 3), "dtype": "u1"}
+    is_zarr = name.endswith(".zarr")
+    if is_zarr:
+        file = pytest.importorskip("zarr").open_group(path)
+    else:
+        file = pytest.importorskip("h5py").File(path, "a")
+        file.create_dataset("whole", IMAGES.shape, "u1")
+    create = file.create_array if is_zarr else file.create_dataset
+    long, late, _ = (create(key, **options) for key in ("long", "late", "never"))
+    # Zarr does not store the chunk of two black pictures.
+    long[:5] = np.concatenate([IMAGES[:2], 0 * IMAGES[:2], IMAGES[4:]])
+    late[10**6] = IMAGES[0]
+    if not is_zarr:
+        file.close()
+    found = played(f"{path}?dataset=long")
+    assert [int(image.max()) > 0 for image, _ in found] == [True, True, False, False, True, False]
+    assert "ended after 6 of 1000000000000 frames, the others were never written" in caplog.text
+    for array in ("late", "never", *([] if is_zarr else ["whole"])):
+        with pytest.raises(SourceError, match=f"{array}: only [01] of its chunks are stored; was it written"):
+            open_source(f"{path}?dataset={array}")
+
+
 def test_times_that_are_damaged_are_an_error_of_the_source(tmp_path: Path) -> None:
     path = write_zarr(tmp_path / "press.zarr", frames=IMAGES, t=np.arange(5.0))
     (path / "gel/t/c/0").write_bytes(b"damaged")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_array, damaged, require
+from tactflow.sources.base import FrameReader, check_array, damaged, log, require
 from tactflow.sources.files import DEFAULT_FPS, decode_image
 from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
@@ -24,9 +25,8 @@ BLOCK = 64 << 20
 """Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
 LARGEST_CHUNK = 1 << 30
 """Bytes of an uncompressed chunk at most, so that a damaged file does not take all memory. Chosen by hand."""
-
-Arrays = dict[str, Any]
-"""Path inside a file, such as `/frames`, -> array of h5py or zarr."""
+ZARR_CHUNK = re.compile(r"(?:c[./])?(\d+)(?:[./]\d+)*")
+"""Path of a chunk or shard in the folder of a Zarr array: its index along each axis."""
 
 
 class ArrayDataset(FrameReader):
@@ -48,16 +48,16 @@ class ArrayDataset(FrameReader):
         path = find_path(name, directory)
         super().__init__(f"{path}, {settings.get('dataset', '')}")
         self._swapped = settings.get("order") == "rgb"
-        arrays, self._close = _open(path)
+        self._file = file = _open(path)
         try:
-            self._array = _choose(spec, settings.get("dataset"), arrays, "dataset")
+            self._array = _choose(spec, settings.get("dataset"), file.arrays, "dataset")
             _check(self._array, self.name)
-            self.total = int(self._array.shape[0])
-            self.fps = fps or DEFAULT_FPS
-            self._times: NDArray[np.float64] | None = None
+            self.total = self._count_stored(*file.stored(self._array))
             if "times" in settings:
-                self.fps = None
-                self._times = self._seconds(_choose(spec, settings["times"], arrays, "times"))
+                self._times = self._seconds(_choose(spec, settings["times"], file.arrays, "times"))
+            else:
+                self.fps = fps or DEFAULT_FPS
+                self._times = np.arange(self.total) / self.fps
             self._read_first()
         except Exception as error:
             self.close()
@@ -67,24 +67,42 @@ class ArrayDataset(FrameReader):
     def close(self) -> None:
         """Close the file."""
         super().close()
-        self._close()
+        self._file.close()
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        for index, frame in enumerate(_read_chunks(self._array)):
+        for index, (frame, t) in enumerate(
+            zip(_read_chunks(self._array, len(self._times)), self._times, strict=True)
+        ):
             if frame.ndim == 1:
                 frame = decode_image(frame.tobytes(), f"{self.name}, frame {index}")
-            if self._swapped and frame.ndim == 3 and frame.shape[2] > 1:
-                frame = frame[..., [2, 1, 0, 3][: frame.shape[2]]]
-            t = index / (self.fps or DEFAULT_FPS) if self._times is None else float(self._times[index])
-            yield frame, t
+            if self._swapped and frame.ndim == 3:
+                frame = frame[..., [2, 1, 0, 3][: frame.shape[2]]] if frame.shape[2] > 1 else frame
+            yield frame, float(t)
+
+    def _count_stored(self, stored: Collection[int], length: int) -> int:
+        """Frames up to the last chunk that is stored: others read as the fill value, for any length.
+
+        stored : indices of chunks along the first axis. length : frames in each.
+        """
+        chunks, claimed = max(stored, default=-1) + 1, int(self._array.shape[0])
+        # Zarr leaves out chunks of black pictures. Where most are missing, it is no recording.
+        if 2 * len(stored) < max(chunks, 1):
+            raise SourceError(f"{self.name}: only {len(stored)} of its chunks are stored; was it written?")
+        if chunks * length < claimed:
+            log.warning(
+                "%s: ended after %d of %d frames, the others were never written",
+                *(self.name, chunks * length, claimed),
+            )
+        return min(chunks * length, claimed)
 
     def _seconds(self, array: Any) -> NDArray[np.float64]:
         """Times from 0 at the first frame, s."""
-        if array.shape != (self.total,) or array.dtype.kind not in "fiu":
+        length = self._array.shape[0]
+        if array.shape != (length,) or array.dtype.kind not in "fiu":
             raise SourceError(
-                f"{self.name}: times are {array.dtype} of shape {array.shape}; required {self.total} numbers"
+                f"{self.name}: times are {array.dtype} of shape {array.shape}; required {length} numbers"
             )
-        times = np.asarray(array[:])
+        times = np.asarray(array[: self.total])
         # Whole numbers are subtracted before they are rounded: Unix time in ns has 19 digits.
         seconds: NDArray[np.float64] = (times - times[:1]) / (1e9 if array.dtype.kind in "iu" else 1.0)
         if not np.isfinite(seconds).all():
@@ -92,47 +110,81 @@ class ArrayDataset(FrameReader):
         return seconds
 
 
-def _open(path: Path) -> tuple[Arrays, Callable[[], None]]:
-    """The arrays of a file, and what closes it."""
-    is_zarr = path.suffix.lower() == ".zarr"
-    extra, package = ("zarr", "zarr") if is_zarr else ("hdf5", "h5py")
-    require(path, "Zarr files" if is_zarr else "HDF5 files", extra, package)
-    refuse_devices(path)
-    try:
-        return _open_zarr(path) if is_zarr else _open_hdf5(path)
-    except Exception as error:
-        raise damaged(str(path), error) from error
+class _Hdf5:
+    """The arrays of an HDF5 file by name."""
+
+    package, extra, what = "h5py", "hdf5", "HDF5 files"
+
+    def __init__(self, path: Path) -> None:
+        import h5py  # type: ignore[import-untyped]
+
+        file = h5py.File(path, "r")
+        self.close = file.close
+        self.arrays: dict[str, Any] = {}
+
+        def visit(name: str, item: Any) -> None:
+            # Not those whose pixels lie in other files, which may be any file of this machine.
+            if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
+                self.arrays[f"/{name}"] = item
+
+        file.visititems(visit)
+
+    @staticmethod
+    def stored(array: Any) -> tuple[Collection[int], int]:
+        """Indices of the stored chunks along the first axis, and the frames in each."""
+        if array.chunks is None:
+            return range(array.id.get_storage_size() > 0), array.shape[0]
+        found: set[int] = set()
+        array.id.chunk_iter(lambda chunk: found.add(chunk.chunk_offset[0] // array.chunks[0]))
+        return found, array.chunks[0]
 
 
-def _open_hdf5(path: Path) -> tuple[Arrays, Callable[[], None]]:
-    import h5py  # type: ignore[import-untyped]
+class _Zarr:
+    """The arrays of a Zarr folder by name."""
 
-    file, arrays = h5py.File(path, "r"), Arrays()
+    package, extra, what = "zarr", "zarr", "Zarr files"
 
-    def visit(name: str, item: Any) -> None:
-        # Not those whose pixels lie in other files, which may be any file of this machine.
-        if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
-            arrays[f"/{name}"] = item
+    def __init__(self, path: Path) -> None:
+        import zarr
 
-    file.visititems(visit)
-    return arrays, file.close
+        root = zarr.open(str(path), mode="r")
+        members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
+        self.arrays: dict[str, Any] = {
+            f"/{name}": item
+            for name, item in members
+            if isinstance(item, zarr.Array) and not self._is_pickled(item)
+        }
 
-
-def _open_zarr(path: Path) -> tuple[Arrays, Callable[[], None]]:
-    import zarr
-
-    def is_pickled(array: Any) -> bool:
+    @staticmethod
+    def _is_pickled(array: Any) -> bool:
         """Whether reading an array may execute code in it: only new versions of numcodecs refuse to."""
         codecs = (*(array.filters or ()), *(array.compressors or ()))
         return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
 
-    root = zarr.open(str(path), mode="r")
-    members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
-    arrays = {f"/{n}": item for n, item in members if isinstance(item, zarr.Array) and not is_pickled(item)}
-    return arrays, lambda: None
+    @staticmethod
+    def stored(array: Any) -> tuple[Collection[int], int]:
+        """Indices of the stored chunks along the first axis, and the frames in each."""
+        # The zarr package itself would look for every chunk that may be.
+        folder = Path(array.store.root, array.path)
+        paths = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+        found = {int(match[1]) for path in paths if (match := ZARR_CHUNK.fullmatch(path))}
+        return found, (array.shards or array.chunks)[0]
+
+    def close(self) -> None:
+        """Nothing stays open."""
 
 
-def _choose(spec: str, name: str | None, arrays: Arrays, setting: str) -> Any:
+def _open(path: Path) -> _Hdf5 | _Zarr:
+    kind = _Zarr if path.suffix.lower() == ".zarr" else _Hdf5
+    require(path, kind.what, kind.extra, kind.package)
+    refuse_devices(path)
+    try:
+        return kind(path)
+    except Exception as error:
+        raise damaged(str(path), error) from error
+
+
+def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:
     if name is not None and f"/{name.strip('/')}" in arrays:
         return arrays[f"/{name.strip('/')}"]
     found = [
@@ -153,10 +205,10 @@ def _check(array: Any, name: str) -> None:
         raise SourceError(f"{name}: has chunks of {chunk} bytes; required at most {LARGEST_CHUNK}")
 
 
-def _read_chunks(array: Any) -> Iterator[NDArray[Any]]:
+def _read_chunks(array: Any, length: int) -> Iterator[NDArray[Any]]:
     """One frame after the other; the file is read by whole chunks, as they are compressed."""
     frame_bytes = max(math.prod(array.shape[1:]) * array.dtype.itemsize, 1)
     together = max(1, min(array.chunks[0] if array.chunks else 1, BLOCK // frame_bytes))
-    for begin in range(0, array.shape[0], together):
-        for frame in array[begin : begin + together]:
+    for begin in range(0, length, together):
+        for frame in array[begin : min(begin + together, length)]:
             yield np.frombuffer(frame, np.uint8) if isinstance(frame, bytes) else np.asarray(frame)
