@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from tactflow.sources.files import decode_image
 from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
 if TYPE_CHECKING:
+    import av
     from mcap.records import Channel, Schema
 
 SETTINGS = {"topic": "name of a topic with pictures"}
@@ -26,6 +27,8 @@ DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf", "j
 """Encoding of the messages in an MCAP file -> package that decodes them."""
 PACKAGES = ("sensor_msgs/msg", "sensor_msgs", "foxglove", "foxglove_msgs/msg", "foxglove_msgs")
 """Where the types of messages with pictures are defined."""
+CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
+"""Format of a `CompressedVideo` -> FFmpeg's decoder."""
 ENCODINGS: dict[str, tuple[int, int | None]] = {
     **dict.fromkeys(("bgr8", "8UC3", "bgr16", "16UC3"), (3, None)),
     **dict.fromkeys(("rgb8", "rgb16"), (3, cv2.COLOR_RGB2BGR)),
@@ -41,6 +44,7 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 }
 """Encoding -> channels, and the conversion to BGR; named as in `sensor_msgs/image_encodings.hpp` and by
 Foxglove. Those with 16 in their name have 16-bit pixels."""
+
 
 Topics = Mapping[str, tuple[str, int | None]]
 """Topic -> type and number of its messages; None if that is unknown."""
@@ -81,9 +85,12 @@ class Bag(FrameReader):
         assert to_image is not None
         first: int | None = None
         for written, message in self._store.messages(self._topic):
+            image = to_image(message, self.name)
+            if image is None:
+                continue
             taken = _stamp(message) or written
             first = taken if first is None else first
-            yield to_image(message, self.name), (taken - first) / 1e9
+            yield image, (taken - first) / 1e9
 
     def close(self) -> None:
         """Close the file."""
@@ -98,9 +105,12 @@ def _choose(spec: str, topic: str | None, topics: Topics) -> str:
         return topic
     if topic is None and len(pictures) == 1:
         return pictures[0]
-    texts = {name: f"{name} ({kind})" for name, (kind, _) in sorted(topics.items())}
+    texts = {
+        name: f"{name} ({kind}{'' if count is None else f', {count}'})"
+        for name, (kind, count) in sorted(topics.items())
+    }
     others = listed([text for name, text in texts.items() if name not in pictures])
-    if not pictures:
+    if topic is None and not pictures:
         raise SourceError(f"{spec}: no topic holds pictures; there are {others}")
     if topic is None:
         problem = "add ?topic="
@@ -244,11 +254,13 @@ def _stamp(message: Any) -> int:
     return int(getattr(time, seconds)) * 1_000_000_000 + int(getattr(time, rest))
 
 
-def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any]] | None:
+def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any] | None] | None:
     """What takes the picture out of a message of this type; None where messages hold none."""
     package, _, name = kind.replace(".", "/").rpartition("/")
     if package not in PACKAGES:
         return None
+    if name == "CompressedVideo":
+        return VideoDecoder()
     return {"Image": raw_image, "RawImage": raw_image, "CompressedImage": compressed_image}.get(name)
 
 
@@ -257,7 +269,7 @@ def raw_image(message: Any, name: str) -> NDArray[Any]:
 
     Raises SourceError if the encoding is unknown, or there are fewer bytes than the message promises.
     """
-    width, height = int(message.width), int(message.height)
+    width, height, step = int(message.width), int(message.height), int(message.step)
     check_pixel_count(name, width, height)
     encoding = message.encoding if message.encoding in ENCODINGS else message.encoding.lower()
     if encoding not in ENCODINGS:
@@ -267,18 +279,16 @@ def raw_image(message: Any, name: str) -> NDArray[Any]:
     channels, conversion = ENCODINGS[encoding]
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     dtype = np.dtype(order + ("u2" if "16" in encoding else "u1"))
-    pixel = channels * dtype.itemsize
-    data, step = bytes(message.data), int(message.step)
-    try:
-        stored: NDArray[Any] = np.ndarray(
-            (height, width, channels), dtype, data, strides=(step, pixel, dtype.itemsize)
-        )
-    except (TypeError, ValueError):
+    row = width * channels * dtype.itemsize
+    data = np.frombuffer(message.data, np.uint8)
+    if not (width and height and step >= row and data.size >= step * (height - 1) + row):
         raise SourceError(
-            f"{name}: {width} x {height} pixels as {message.encoding} need rows of {width * pixel} bytes; "
-            f"got {len(data)} bytes in rows of {step}"
-        ) from None
-    image = np.ascontiguousarray(stored[..., 0] if channels == 1 else stored, dtype.newbyteorder("="))
+            f"{name}: {width} x {height} pixels as {message.encoding} need rows of {row} bytes; got "
+            f"{data.size} bytes in rows of {step}"
+        )
+    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    image = np.ascontiguousarray(rows).view(dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
     return image if conversion is None else cv2.cvtColor(image, conversion)
 
 
@@ -287,3 +297,39 @@ def compressed_image(message: Any, name: str) -> NDArray[Any]:
     if "compressedDepth" in getattr(message, "format", ""):
         raise SourceError(f"{name}: compressed depth, not a picture")
     return decode_image(bytes(message.data), name)
+
+
+class VideoDecoder:
+    """Decodes a video that comes in pieces, one picture each."""
+
+    def __init__(self) -> None:
+        self._codec: av.VideoCodecContext | None = None
+        self._begun = False
+
+    def __call__(self, message: Any, name: str) -> NDArray[np.uint8] | None:
+        """The picture of one piece, (H, W, 3) uint8 BGR; None as long as the video has not begun.
+
+        Raises SourceError if PyAV is not installed, or the codec is unknown.
+        """
+        require(name, "videos in messages", "av", "av")
+        import av
+
+        if self._codec is None:
+            if message.format not in CODECS:
+                known = ", ".join(CODECS)
+                raise SourceError(f"{name}: a video as {message.format!r}; required one of: {known}")
+            self._codec = cast("av.VideoCodecContext", av.CodecContext.create(CODECS[message.format], "r"))
+            # With threads of its own, FFmpeg returns a picture only several pictures later.
+            self._codec.thread_type = "NONE"
+        try:
+            frames = self._codec.decode(av.Packet(bytes(message.data)))
+        except av.error.InvalidDataError:
+            # A recording may begin between two key frames.
+            if self._begun:
+                raise
+            return None
+        for frame in frames:
+            self._begun = True
+            check_pixel_count(name, frame.width, frame.height)
+            return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+        return None
