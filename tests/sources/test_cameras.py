@@ -9,60 +9,61 @@ from pathlib import Path
 import pytest
 
 from tactflow.cli import cameras as command
-from tactflow.sources.cameras import list_cameras
+from tactflow.sources.cameras import Abilities, list_cameras
+
+GEL = Abilities("GelSight Mini", True, {"MJPG": [(800, 600), (320, 240)], "YUYV": []})
+METADATA = Abilities("GelSight Mini", False, {})
 
 
 @pytest.fixture
-def folders(tmp_path: Path) -> tuple[Path, Path]:
-    """Two devices of one camera, links to the first as udev makes them, and a third without a description."""
-    dev, sysfs = tmp_path / "dev", tmp_path / "sys"
-    dev.mkdir()
+def dev(tmp_path: Path) -> Path:
+    """Two devices of one camera, links to the first as udev makes them, and a third without links."""
     for name in ("video10", "video0", "video1", "videotape", "null"):
-        (dev / name).touch()
+        (tmp_path / name).touch()
     for kind, name in (("by-id", "usb-GelSight_R0B1-video-index0"), ("by-path", "pci-0000:00:14.0-usb-0:3")):
-        folder = dev / "v4l" / kind
+        folder = tmp_path / "v4l" / kind
         folder.mkdir(parents=True)
         (folder / name).symlink_to("../../video0")
-    for index in range(2):
-        folder = sysfs / f"video{index}"
-        folder.mkdir(parents=True)
-        (folder / "name").write_text("GelSight Mini\n")
-        (folder / "index").write_text(f"{index}\n")
-    return dev, sysfs
+    return tmp_path
 
 
-def test_cameras_are_listed_by_index_under_their_steadiest_names(folders: tuple[Path, Path]) -> None:
-    dev, _ = folders
+def ask(device: Path) -> Abilities:
+    if device.name == "video10":
+        raise PermissionError(13, "Permission denied")
+    return GEL if device.name == "video0" else METADATA
+
+
+def test_cameras_are_listed_by_index_under_their_steadiest_names(dev: Path) -> None:
     (dev / "v4l" / "by-id" / "usb-Unplugged-video-index0").symlink_to("../../video7")
-    cameras = list_cameras(*folders)
+    cameras = list_cameras(dev, ask)
     assert [camera.index for camera in cameras] == [0, 1, 10]
     by_id = f"{dev}/v4l/by-id/usb-GelSight_R0B1-video-index0"
     assert cameras[0].source == by_id
     assert cameras[0].names == (by_id, f"{dev}/v4l/by-path/pci-0000:00:14.0-usb-0:3")
     assert cameras[1].source == f"{dev}/video1"
-    assert [(camera.model, camera.part) for camera in cameras] == [
-        *(("GelSight Mini", 0), ("GelSight Mini", 1), ("", 0)),
-    ]
+    assert [camera.abilities for camera in cameras] == [GEL, METADATA, None]
+    assert "usermod -aG video" in cameras[2].problem
 
 
-def test_a_camera_is_described_with_all_its_names(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Root may open everything.
-    monkeypatch.setattr("os.access", lambda path, _: path.name != "video10")
-    first, second, third = ("\n".join(command.describe(camera)) for camera in list_cameras(*folders))
-    assert first.startswith(f"{folders[0]}/v4l/by-id/usb-GelSight_R0B1-video-index0\n    GelSight Mini: ")
+def test_a_device_that_is_no_camera_is_listed_with_the_drivers_refusal(dev: Path) -> None:
+    camera = list_cameras(dev)[0]
+    assert camera.abilities is None
+    assert camera.problem
+
+
+def test_a_camera_is_described_with_formats_and_all_its_names(dev: Path) -> None:
+    first, second, third = ("\n".join(command.describe(camera)) for camera in list_cameras(dev, ask))
+    assert first.startswith(f"{dev}/v4l/by-id/usb-GelSight_R0B1-video-index0\n    GelSight Mini: ")
     assert "(--source 0)" in first
     assert "also " in first
-    assert "metadata" not in first
-    assert "may carry only metadata" in second
+    assert "MJPG: 800 x 600, 320 x 240" in first
+    assert "YUYV: any size within a range" in first
+    assert "only metadata" in second
     assert "no permission" in third
 
 
-def test_the_command_lists_cameras_as_json(
-    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command.run(argparse.Namespace(dev=folders[0], sysfs=folders[1], json=True)) == 0
+def test_the_command_lists_cameras_as_json(dev: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.run(argparse.Namespace(dev=dev, json=True)) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["index"] for line in lines] == [0, 1, 10]
 
@@ -83,7 +84,7 @@ def test_without_a_camera_the_command_says_what_to_try(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(command.sys, "platform", system)
-    assert command.run(argparse.Namespace(dev=tmp_path, sysfs=tmp_path, json=False)) == 0
+    assert command.run(argparse.Namespace(dev=tmp_path, json=False)) == 0
     out, err = capsys.readouterr()
     assert out == ""
     assert all(word in err for word in words)

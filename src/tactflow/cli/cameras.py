@@ -11,7 +11,7 @@ from pathlib import Path
 import orjson
 
 from tactflow.cli.terminal import printable, say
-from tactflow.sources.cameras import SYSFS, CameraInfo, list_cameras
+from tactflow.sources.cameras import CameraInfo, list_cameras
 
 NO_CAMERA = """no camera is plugged in (/dev/video* is empty)
   plug it in and look at the last lines of: sudo dmesg
@@ -25,7 +25,7 @@ NO_NAMES = """on this system cameras have no names, only numbers in the order of
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `cameras`."""
     parser.add_argument("--json", action="store_true", help="one JSON object per camera")
-    parser.set_defaults(dev=Path("/dev"), sysfs=SYSFS)
+    parser.set_defaults(dev=Path("/dev"))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if not sys.platform.startswith("linux"):
         say(NO_NAMES)
         return 0
-    cameras = list_cameras(args.dev, args.sysfs)
+    cameras = list_cameras(args.dev)
     if not cameras:
         say(NO_CAMERA)
     for camera in cameras:
@@ -47,11 +47,15 @@ def run(args: argparse.Namespace) -> int:
 
 def describe(camera: CameraInfo) -> Iterator[str]:
     """A camera in words: the name to use first, then what else is known."""
-    title = f"{camera.model}: " if camera.model else ""
+    abilities = camera.abilities
+    title = f"{abilities.name}: " if abilities and abilities.name else ""
     yield camera.source
     yield f"    {title}{camera.device} (--source {camera.index})"
     yield from (f"    also {name}" for name in camera.names[1:])
-    if not camera.permitted:
-        yield "    no permission: sudo usermod -aG video $USER, then log in again"
-    if camera.part > 0:
-        yield "    a further device of the same camera; it may carry only metadata"
+    if camera.problem:
+        yield f"    cannot be asked: {camera.problem}"
+    if abilities and not abilities.pictures:
+        yield "    carries no pictures, only metadata"
+    for form, sizes in abilities.formats.items() if abilities else ():
+        sizes_text = ", ".join(f"{width} x {height}" for width, height in sizes)
+        yield f"    {form}: {sizes_text or 'any size within a range'}"
