@@ -17,7 +17,7 @@ from tactflow.batch.run import Batch, Plan, Result, make_plan
 from tactflow.batch.store import Outcome, Store
 from tactflow.batch.work import Request, prepared_differently, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
-from tactflow.cli.options import add_overrides, positive
+from tactflow.cli.options import add_overrides, add_quiet, add_sensor, positive
 from tactflow.cli.terminal import progress_bar, say
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of the results and of the table of runs (default: %(default)s)",
     )
     add_overrides(parser)
-    parser.add_argument("--sensor", metavar="NAME", help="which one of a pipeline with several sensors")
+    add_sensor(parser)
     parser.add_argument(
         "--workers", type=positive, metavar="N", help="processes on this machine (default: one a processor)"
     )
@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "results differ; --set changes the first pipeline alone",
     )
     parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
-    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+    add_quiet(parser)
 
 
 def run(args: argparse.Namespace) -> int:

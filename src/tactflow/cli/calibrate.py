@@ -31,7 +31,7 @@ from tactflow.calibration.presses import PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
 from tactflow.cli.guide import Guide, typed_lines
-from tactflow.cli.options import add_overwrite, number, positive, refuse_output
+from tactflow.cli.options import add_overwrite, add_sensor, number, positive, refuse_output
 from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "then presses of the ball. For force, a recording with a CSV of the same name beside it, or a folder "
         "of them",
     )
-    option("--sensor", metavar="NAME", help="which one of a file with sensors")
+    add_sensor(parser)
     option("--out", type=Path, metavar="FILE", help="default: calibration/SENSOR.yaml")
     option("--realtime", action="store_true", help="play a recording at its own pace, like a camera")
     option("--fresh", action="store_true", help="forget the presses of a session that was broken off")

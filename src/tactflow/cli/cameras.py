@@ -10,7 +10,8 @@ from pathlib import Path
 
 import orjson
 
-from tactflow.cli.terminal import printable, say
+from tactflow.cli.options import add_json
+from tactflow.cli.terminal import say, show
 from tactflow.sources.cameras import CameraInfo, list_cameras
 
 NO_CAMERA = """no camera is plugged in (/dev/video* is empty)
@@ -24,7 +25,7 @@ NO_NAMES = """on this system cameras have no names, only numbers in the order of
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `cameras`."""
-    parser.add_argument("--json", action="store_true", help="one JSON object per camera")
+    add_json(parser, "one JSON object per camera")
     parser.set_defaults(dev=Path("/dev"))
 
 
@@ -37,11 +38,10 @@ def run(args: argparse.Namespace) -> int:
     if not cameras:
         say(NO_CAMERA)
     for camera in cameras:
-        print(
-            orjson.dumps(asdict(camera)).decode()
-            if args.json
-            else "\n".join(map(printable, describe(camera)))
-        )
+        if args.json:
+            print(orjson.dumps(asdict(camera)).decode())
+        else:
+            show(describe(camera))
     return 0
 
 

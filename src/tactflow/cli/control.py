@@ -6,8 +6,8 @@ import argparse
 import json
 from pathlib import Path
 
-from tactflow.cli.options import add_endpoint, seconds, writing
-from tactflow.cli.terminal import printable, typed
+from tactflow.cli.options import add_endpoint, add_json, seconds, writing
+from tactflow.cli.terminal import show, typed
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timeout", type=seconds, default=5.0, metavar="S", help="wait S seconds for an answer; default: 5"
     )
-    parser.add_argument("--json", action="store_true", help="print the whole answer, a JSON object")
+    add_json(parser, "print the whole answer, a JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     elif "stats" in answer:
         print(json.dumps(answer["stats"], indent=2))
     else:
-        print(printable(f"{answer['state']['sensor']}: {answer['message']}"))
+        show([f"{answer['state']['sensor']}: {answer['message']}"])
     return 0
 
 

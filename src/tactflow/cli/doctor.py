@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import orjson
 
 from tactflow.cli.options import add_json, seconds
-from tactflow.cli.terminal import printable
+from tactflow.cli.terminal import show
 from tactflow.engine.errors import StageError
 from tactflow.sources import KINDS
 from tactflow.system.signals import ending_handled, interrupt
@@ -75,8 +75,7 @@ def run(args: argparse.Namespace) -> int:
         facts = {"source": seen.source, "frames": seen.frames, "verdict": verdict}
         print(orjson.dumps({**facts, "checks": [asdict(finding) for finding in findings]}).decode())
     else:
-        lines = [line for finding in findings for line in _lines(finding)]
-        print("\n".join(map(printable, [title, *lines, summary])))
+        show([title, *(line for finding in findings for line in _lines(finding)), summary])
     return StageError.exit_code if verdict == "fault" else 0
 
 

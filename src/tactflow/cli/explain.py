@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tactflow.cli.options import add_json, add_pipeline, load_plan
 from tactflow.cli.statistics import NodeStatistics, Statistics, milliseconds, saving, share
-from tactflow.cli.terminal import printable
+from tactflow.cli.terminal import show
 from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
@@ -42,13 +42,13 @@ def run(args: argparse.Namespace) -> int:
         about = {"file": pipeline.file, "sensor": pipeline.sensor, "segments": list(plan.segments)}
         print(json.dumps(about | {"nodes": dict(_facts(pipeline, plan, statistics))}, indent=2))
         return 0
-    print("\n".join(map(printable, explanation(*_load(args)))))
+    show(explanation(*_load(args)))
     return 0
 
 
 def run_graph(args: argparse.Namespace) -> int:
     """Print the flowchart."""
-    print("\n".join(map(printable, mermaid(*_load(args)))))
+    show(mermaid(*_load(args)))
     return 0
 
 

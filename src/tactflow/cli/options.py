@@ -45,6 +45,11 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_sensor(parser: argparse.ArgumentParser) -> None:
+    """Declare `--sensor`."""
+    parser.add_argument("--sensor", metavar="NAME", help="which one of a pipeline with several sensors")
+
+
 def add_quiet(parser: argparse.ArgumentParser) -> None:
     """Declare `--quiet`."""
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")

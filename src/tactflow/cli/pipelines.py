@@ -9,7 +9,7 @@ import time
 from importlib.resources import files
 
 from tactflow.cli.options import add_json, add_pipeline, add_quiet, load_plan
-from tactflow.cli.terminal import printable, say, table
+from tactflow.cli.terminal import say, show, table
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     elif args.json:
         print(json.dumps(described_pipelines(), indent=2))
     else:
-        print("\n".join(table(list(described_pipelines().items()))))
+        show(table(list(described_pipelines().items())))
     return 0
 
 
@@ -76,7 +76,7 @@ def run_check(args: argparse.Namespace) -> int:
         if warnings := len(pipeline.warnings) + len(plan.warnings):
             counts["warning"] = warnings
         words = ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for noun, count in counts.items())
-        print(printable(f"{pipeline.file}: {f'sensor {name} ' if name else ''}OK ({words})"))
+        show([f"{pipeline.file}: {f'sensor {name} ' if name else ''}OK ({words})"])
     return 0
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from tactflow.cli.options import refuse_output, writing
+from tactflow.cli.options import add_overwrite, add_quiet, refuse_output, writing
 from tactflow.cli.terminal import progress_bar, say, table
 from tactflow.engine.errors import ConfigError
 
@@ -32,9 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=".jsonl (one line a frame) or .npz (with contact masks), in raw pixels; .csv for force",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace files that are already there")
+    add_overwrite(parser, "these files")
     parser.add_argument("--list", action="store_true", help="print the scenes and the settings they know")
-    parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
+    add_quiet(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -70,14 +68,10 @@ def run(args: argparse.Namespace) -> int:
         if path is None:
             continue
         with writing(f"{option} {path}"), progress_bar(path.name, len(scene), shown=not args.quiet) as update:
-            write(scene, path, partial(_show, update))
+            write(scene, path, lambda done: update(completed=done))
         if not args.quiet:
             say(f"{path}: {len(scene)} frames of {scene.name}")
     return 0
-
-
-def _show(update: Callable[..., None], done: int) -> None:
-    update(completed=done)
 
 
 def _replaces_pictures(path: Path, overwrite: bool) -> bool:

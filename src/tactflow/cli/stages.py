@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
 from tactflow.cli.options import add_json
-from tactflow.cli.terminal import say, table
+from tactflow.cli.terminal import say, show, table
 from tactflow.config.document import shown
 from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, names, resolve
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join(details(components[0])))
         return 0
     heading = ("NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT IT DOES")
-    print("\n".join(table([heading, *map(_row, components)])))
+    show(table([heading, *map(_row, components)]))
     return 0
 
 

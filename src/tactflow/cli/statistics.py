@@ -55,10 +55,11 @@ class NodeStatistics(BaseModel):
 
     def reasons(self) -> list[str]:
         """Each reason for not running with its share, the most frequent first."""
-        ordered = sorted(((reason, count) for reason, count in self.skips.items() if count), key=_by_count)
+        ordered = sorted(self.skips.items(), key=lambda item: -item[1])
         return [
             f"{share(count, self.frames)} {_WORDS.get(reason, reason.replace('_', ' '))}"
             for reason, count in ordered
+            if count
         ]
 
     def __str__(self) -> str:
@@ -79,12 +80,8 @@ class NodeStatistics(BaseModel):
         return "; ".join(parts)
 
 
-def _by_count(item: tuple[str, int]) -> int:
-    return -item[1]
-
-
 class Latency(BaseModel):
-    """Time from capture to the end of the last stage, ms."""
+    """Time from capture to the end of the last stage, ms; None where unknown."""
 
     p50: float | None
     p99: float | None

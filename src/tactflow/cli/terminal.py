@@ -6,7 +6,7 @@ import logging
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -29,6 +29,11 @@ def typed(*words: str) -> str:
     'tactflow run left.yaml'
     """
     return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
+
+
+def show(lines: Iterable[str]) -> None:
+    """Print results, one line each, on standard output."""
+    print("\n".join(map(printable, lines)))
 
 
 def say(text: str) -> None:

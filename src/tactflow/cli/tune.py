@@ -10,8 +10,8 @@ from pathlib import Path
 
 import orjson
 
-from tactflow.cli.options import add_json, add_overwrite, number, refuse_output, seconds, writing
-from tactflow.cli.terminal import notes, printable, say, typed
+from tactflow.cli.options import add_json, add_overwrite, add_sensor, number, refuse_output, seconds, writing
+from tactflow.cli.terminal import notes, printable, say, show, typed
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.extras import missing
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", type=_seed, default=0, metavar="N", help="the same errors again; not the times"
     )
-    parser.add_argument("--sensor", metavar="NAME", help="which one of several in the pipeline file")
+    add_sensor(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
     )
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(orjson.dumps(report.as_json(tuned), option=orjson.OPT_NON_STR_KEYS).decode())
     else:
-        print("\n".join(map(printable, report.lines(tuned))))
+        show(report.lines(tuned))
     if page is not None:
         report.write_page(page, tuned)
     if tuned.chosen is None:

@@ -187,7 +187,7 @@ def _latency(observed: Observation) -> Measured | str:
 # At 46 grey levels, dots have 1.3 times the error; at 23 they are not detected.
 @check("exposure", "grey levels", warning=50.0, fault=30.0)
 def _exposure(observed: Observation) -> Measured:
-    level = float(np.median([exposure.level for exposure in observed.exposures]))
+    level = float(np.median([level for level, _ in observed.exposures]))
     return Measured(
         level,
         f"the brighter gel has {level:.0f} of 255 grey levels",
@@ -198,7 +198,7 @@ def _exposure(observed: Observation) -> Measured:
 
 @check("clipping", "%", warning=1.5, fault=10.0)
 def _clipping(observed: Observation) -> Measured:
-    share = 100.0 * float(np.mean([exposure.clipped for exposure in observed.exposures]))
+    share = 100.0 * float(np.mean([clipped for _, clipped in observed.exposures]))
     return Measured(
         share,
         f"{round(share, 2):.2g} % of the gel is clipped",

@@ -43,14 +43,6 @@ class Pair(NamedTuple):
     after: Image | None
 
 
-class Exposure(NamedTuple):
-    """level : 95th percentile of the gel's brightest channel, grey levels, because a dark gel with bright
-    pins is well exposed. clipped : share of the gel with a saturated channel."""
-
-    level: float
-    clipped: float
-
-
 class Lattice(NamedTuple):
     """found : number of dots. closed : share of the parallelograms of neighbours that close. missing : share
     of empty positions in a regular grid. contrast : median difference between a dot and its surroundings,
@@ -116,17 +108,20 @@ def _calm_deviation(values: NDArray[np.float32]) -> float:
     return float(np.sqrt(np.percentile(variance, 25.0)))
 
 
-def exposure(image: Image) -> Exposure:
-    """Exposure of a frame (H, W, 3) uint8, without the black surround.
+def exposure(image: Image) -> tuple[float, float]:
+    """Level and clipped share of a frame (H, W, 3) uint8, without the black surround.
+
+    The level is the 95th percentile of the gel's brightest channel, grey levels, because a dark gel with
+    bright pins is well exposed. The share, 0 to 1, is that of the gel with a saturated channel.
 
     >>> exposure(np.full((4, 4, 3), 255, np.uint8))
-    Exposure(level=255.0, clipped=1.0)
+    (255.0, 1.0)
     """
     brightest = image.max(axis=2)
     gel = brightest[brightest > BLACK]
     if not gel.size:
-        return Exposure(0.0, 0.0)
-    return Exposure(float(np.percentile(gel, 95.0)), float(np.mean(gel >= 254)))
+        return 0.0, 0.0
+    return float(np.percentile(gel, 95.0)), float(np.mean(gel >= 254))
 
 
 def blur(gray: Gray) -> float | None:

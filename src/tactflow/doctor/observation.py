@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.doctor.measures import REGULAR, Exposure, Gray, Image, Pair, exposure, grey, jpeg_step
+from tactflow.doctor.measures import REGULAR, Gray, Image, Pair, exposure, grey, jpeg_step
 from tactflow.engine.errors import SourceError
 from tactflow.sources import StampedReader, open_source
 from tactflow.sources.base import FrameReader
@@ -63,8 +63,8 @@ class Observation:
         return [grey(pair.image) for pair in self.pairs]
 
     @cached_property
-    def exposures(self) -> list[Exposure]:
-        """Exposure of the kept frames."""
+    def exposures(self) -> list[tuple[float, float]]:
+        """Level, grey levels, and clipped share of the kept frames (`measures.exposure`)."""
         return [exposure(pair.image) for pair in self.pairs]
 
     @cached_property
