@@ -1,16 +1,28 @@
-"""Labelling: the file of labels."""
+"""Labelling: the file of labels, the server, and the page in a browser."""
 
 from __future__ import annotations
 
 import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from tactflow.bench.label import LabelServer, main, read_items
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
 from tactflow.engine.errors import ConfigError, StageError
+from tests.clock import PATIENCE
 
+PATIENCE_MS = round(PATIENCE * 1000)
 TRIANGLE = ((10.0, 10.0), (50.5, 10.0), (30.0, 40.0))
 
 
@@ -62,3 +74,240 @@ def test_a_missing_file_and_an_impossible_one_are_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(StageError, match="cannot be written"):
         save_labels(tmp_path / "file" / "labels.json", [])
+
+
+@pytest.fixture
+def press(tmp_path: Path) -> Path:
+    """A folder of four pictures, 80 x 60, each of one grey level."""
+    folder = tmp_path / "finger" / "press"
+    folder.mkdir(parents=True)
+    for name, level in [("000", 40), ("001", 80), ("002", 120), ("rest", 160)]:
+        cv2.imwrite(str(folder / f"{name}.png"), np.full((60, 80, 3), level, np.uint8))
+    return folder
+
+
+Serve = Callable[..., LabelServer]
+
+
+@pytest.fixture
+def serve(press: Path, tmp_path: Path) -> Iterator[Serve]:
+    """Starts servers for two frames of the folder."""
+    started = []
+
+    def start(**options: Any) -> LabelServer:
+        items = read_items(str(press), "press", "rest", ["001", "2"])
+        server = LabelServer(items, tmp_path / "labels.json", **options)
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        started.append((server, thread))
+        return server
+
+    yield start
+    for server, thread in started:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def ask(server: LabelServer, method: str, path: str, body: Any = None, **headers: str) -> tuple[int, bytes]:
+    """Status and body of the answer to a request, by default one of the page itself."""
+    own = {"Origin": server.address.rstrip("/")}
+    connection = HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
+    connection.request(method, path, json.dumps(body), own | headers)
+    response = connection.getresponse()
+    answer = response.status, response.read()
+    connection.close()
+    return answer
+
+
+def level(png: bytes) -> int:
+    """The grey level of one of the pictures."""
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return int(image[0, 0, 0])
+
+
+def test_frames_are_chosen_by_name_index_and_step(press: Path) -> None:
+    chosen = read_items(str(press), "a", "rest", ["001", "2"])
+    assert [(item.frame, item.reference, level(item.picture)) for item in chosen] == [
+        ("001", "rest", 80),
+        ("002", "rest", 120),
+    ]
+    assert level(chosen[0].reference_picture) == 160
+    assert [item.frame for item in read_items(str(press), "a", every=3)] == ["rest"]
+    np.save(press / "frames.npy", np.zeros((5, 48, 64), np.uint8))
+    found = read_items(str(press / "frames.npy"), "a", every=2)
+    assert [(item.frame, item.reference) for item in found] == [(2, 0), (4, 0)]
+    with pytest.raises(ConfigError, match="has no frame 7; it has 4 frames"):
+        read_items(str(press), "a", frames=["7"])
+    with pytest.raises(ConfigError, match="no frame 'rset'"):
+        read_items(str(press), "a", "rset")
+
+
+def test_a_label_is_stored_changed_and_removed_and_others_stay(serve: Serve, tmp_path: Path) -> None:
+    path = tmp_path / "labels.json"
+    other = FrameLabel(recording="other", frame=1, reference=0, contact=None)
+    save_labels(path, [other])
+    server = serve()
+    label = entry(recording="press", frame="001", reference="rest")
+    assert ask(server, "POST", "/labels", label) == (200, b"saved")
+    assert ask(server, "POST", "/labels", label | {"outlines": [TRIANGLE, TRIANGLE]})[0] == 200
+    assert [len(stored.outlines) for stored in load_labels(path)] == [0, 2]
+    overview = json.loads(ask(server, "GET", "/frames")[1])
+    assert [frame["frame"] for frame in overview["frames"]] == ["001", "002"]
+    assert len(overview["labels"][1]["outlines"]) == 2
+    second = serve(round_=2)
+    assert json.loads(ask(second, "GET", "/frames")[1])["labels"] == []
+    assert ask(server, "DELETE", "/labels", label)[0] == 200
+    assert load_labels(path) == [other]
+
+
+def test_pictures_are_served_and_nothing_else(serve: Serve) -> None:
+    server = serve()
+    assert level(ask(server, "GET", "/frames/1/picture")[1]) == 120
+    assert level(ask(server, "GET", "/frames/1/reference")[1]) == 160
+    assert ask(server, "GET", "/frames/2/picture")[0] == 404
+    assert ask(server, "GET", "/../pyproject.toml")[0] == 404
+
+
+def test_other_web_sites_and_wrong_labels_are_refused(serve: Serve, tmp_path: Path) -> None:
+    server, label = serve(), entry(recording="press", frame="001", reference="rest")
+    assert ask(server, "GET", "/frames", Host="evil.example")[0] == 421
+    assert ask(server, "POST", "/labels", label, Origin="http://evil.example")[0] == 403
+    assert ask(server, "DELETE", "/labels", label, Origin="null")[0] == 403
+    assert ask(server, "POST", "/labels", label | {"contact": False})[0] == 400
+    assert not (tmp_path / "labels.json").exists()
+
+
+def test_a_broken_file_of_labels_is_never_overwritten(
+    serve: Serve, press: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server, path = serve(), tmp_path / "labels.json"
+    path.write_text("[{")
+    status, message = ask(server, "POST", "/labels", entry(recording="press", frame="001"))
+    assert (status, path.read_text()) == (500, "[{")
+    assert b"not a file of labels" in message
+    assert main([str(press), "--labels", str(path), "--every", "1"]) == 2
+    assert "not a file of labels" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is not sent to one process there")
+def test_the_command_prints_its_address_and_ends_at_ctrl_c(press: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tactflow.bench.label", str(press), "--labels", "labels.json"]
+    command += ["--every", "1", "--root", str(tmp_path), "--seed", "3", "--lab", "A", "--round", "2"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        found = re.search(r"3 frames to label at http://(127\.0\.0\.1:\d+)/", process.stdout.readline())
+        assert found
+        connection = HTTPConnection(found[1], timeout=PATIENCE)
+        connection.request("GET", "/frames")
+        overview = json.loads(connection.getresponse().read())
+        connection.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 0
+    assert {frame["recording"] for frame in overview["frames"]} == {"finger/press"}
+    assert sorted(frame["frame"] for frame in overview["frames"]) == ["001", "002", "rest"]
+    assert (overview["lab"], overview["round"]) == ("A", 2)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Headless Chromium."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: no playwright")
+    from tests.browser.test_view_page import CHROMIUM, FLAGS
+
+    if CHROMIUM is None:
+        pytest.skip("NO BROWSER TESTS: there is no chromium here; `make system-deps` installs it")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE_MS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[[LabelServer], Any]]:
+    """Opens pages; a script error or a complaint in the console fails the test."""
+    complaints: list[str] = []
+    context = browser.new_context(viewport={"width": 1400, "height": 900})
+
+    def open_(server: LabelServer) -> Any:
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.goto(server.address)
+        shown(page, "1 of 2")
+        return page
+
+    yield open_
+    context.close()
+    assert complaints == []
+
+
+def shown(page: Any, text: str) -> None:
+    """Wait for a text on the page, and until everything is saved."""
+    page.wait_for_function("text => document.body.innerText.includes(text)", arg=text)
+    page.evaluate("saving")
+
+
+def at(page: Any, x: float, y: float) -> tuple[float, float]:
+    """Where a place in raw pixels is on the screen."""
+    box = page.locator("#frame-picture").bounding_box()
+    return box["x"] + (x + 0.5) * box["width"] / 80, box["y"] + (y + 0.5) * box["height"] / 60
+
+
+def test_an_outline_drawn_in_a_browser_is_in_the_file(
+    serve: Serve, open_page: Callable[[LabelServer], Any], tmp_path: Path
+) -> None:
+    page, path = open_page(serve(lab="A")), tmp_path / "labels.json"
+    for x, y in [(10, 10), (50, 10), (50, 40)]:
+        page.mouse.click(*at(page, x, y))
+    page.mouse.dblclick(*at(page, 20, 50))
+    shown(page, "outlines: 1")
+    (label,) = load_labels(path)
+    assert (label.recording, label.frame, label.reference, label.lab) == ("press", "001", "rest", "A")
+    np.testing.assert_allclose(label.outlines, [[(10, 10), (50, 10), (50, 40), (20, 50)]], atol=0.1)
+
+    page.mouse.move(*at(page, 50, 10))
+    page.mouse.down()
+    page.mouse.move(*at(page, 60, 20))
+    page.mouse.up()
+    page.evaluate("saving")
+    np.testing.assert_allclose(load_labels(path)[0].outlines[0][1], (60, 20), atol=0.1)
+    page.keyboard.press("Control+z")
+    page.evaluate("saving")
+    assert load_labels(path) == [label]
+
+    page.keyboard.press("ArrowRight")
+    shown(page, "2 of 2, 1 labelled")
+    page.click("text=Nothing touches")
+    shown(page, "2 of 2, 2 labelled")
+    page.keyboard.press("ArrowLeft")
+    shown(page, "1 of 2, 2 labelled")
+    assert [stored.contact for stored in load_labels(path)] == [True, False]
+    # A label that is there is shown, and can be deleted.
+    page.reload()
+    shown(page, "outlines: 1")
+    page.mouse.click(*at(page, 40, 25), button="right")
+    shown(page, "outlines: 0")
+    assert [stored.frame for stored in load_labels(path)] == ["002"]
+
+
+def test_dots_are_marked_and_removed_and_outlines_stay(
+    serve: Serve, open_page: Callable[[LabelServer], Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "labels.json"
+    first = FrameLabel(
+        recording="press", frame="001", reference="rest", lab="B", contact=True, outlines=(TRIANGLE,)
+    )
+    save_labels(path, [first])
+    page = open_page(serve(dots=True))
+    page.keyboard.press("n")
+    for x in (10, 30, 70):
+        page.mouse.click(*at(page, x, 20))
+    page.mouse.click(*at(page, 36, 20), button="right")
+    shown(page, "dots: 2")
+    (label,) = load_labels(path)
+    assert label.dots is not None
+    np.testing.assert_allclose(label.dots, [(10, 20), (70, 20)], atol=0.1)
+    assert label.model_copy(update={"dots": None}) == first

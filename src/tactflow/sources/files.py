@@ -133,7 +133,7 @@ class ImageFiles(FrameReader):
         self.total = len(files)
         self.description = f"{name}, {len(files)} images"
         self.first = files[0].name
-        self._files = files
+        self.files = files
         self._read_first()
         pages = cv2.imcount(str(files[0])) if files[0].suffix.lower() in (".tif", ".tiff") else 1
         if pages > 1:
@@ -143,7 +143,7 @@ class ImageFiles(FrameReader):
             )
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        for index, path in enumerate(self._files):
+        for index, path in enumerate(self.files):
             self._picture = str(path)
             yield read_image(path), index / (self.fps or DEFAULT_FPS)
 
