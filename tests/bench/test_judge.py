@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench import judge as judging
 from tactflow.bench.judge import Judged, chosen_elsewhere, interval, judge, main, scatter
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
 from tactflow.bench.labels import OUTLINES
+from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 
 FRAMES = (0, 10, 25, 30)
@@ -69,6 +69,17 @@ def test_frames_that_a_failing_pipeline_does_not_reach_are_missed(
     assert len(said) == 2
     assert said[0].startswith("absent: not in")
     assert "markerless" in said[1]
+
+
+def test_labels_of_frames_that_cannot_be_there_are_refused(
+    labelled: tuple[Path, list[FrameLabel]], tmp_path: Path
+) -> None:
+    data, labels = labelled
+    with pytest.raises(ConfigError, match="no picture of that name"):
+        list(judge("default", [labels[0].model_copy(update={"frame": "999"})], data))
+    np.save(tmp_path / "press.npy", np.zeros((2, 60, 80, 3), np.uint8))
+    with pytest.raises(ConfigError, match="required an index"):
+        list(judge("default", [labels[0].model_copy(update={"recording": "press.npy"})], tmp_path))
 
 
 def test_a_new_lab_gets_what_is_best_for_the_others() -> None:
@@ -136,7 +147,7 @@ def test_the_labels_of_the_package_are_enough_to_judge_by() -> None:
 def test_outlines_of_real_gels_are_found(shared_data: Path) -> None:
     first = [label for label in load_labels(OUTLINES) if label.round == 1]
     some = [label for label in first if label.recording in ("gels/thu_real", "mini_ball_gelslam")]
-    judged = list(judging.judge("default", some, shared_data))
+    judged = list(judge("default", some, shared_data))
     assert len(judged) == 37
     assert all(one.found for one in judged)
     assert np.median([one.hull for one in judged]) > 0.65

@@ -20,9 +20,9 @@ import pytest
 from tactflow.bench.label import LabelServer, main, read_items
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
 from tactflow.engine.errors import ConfigError, StageError
+from tests import chromium
 from tests.clock import PATIENCE
 
-PATIENCE_MS = round(PATIENCE * 1000)
 TRIANGLE = ((10.0, 10.0), (50.5, 10.0), (30.0, 40.0))
 
 
@@ -210,20 +210,6 @@ def test_the_command_prints_its_address_and_ends_at_ctrl_c(press: Path, tmp_path
     assert (overview["lab"], overview["round"]) == ("A", 2)
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Headless Chromium."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: no playwright")
-    from tests.browser.test_view_page import CHROMIUM, FLAGS
-
-    if CHROMIUM is None:
-        pytest.skip("NO BROWSER TESTS: there is no chromium here; `make system-deps` installs it")
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE_MS)
-        yield chromium
-        chromium.close()
-
-
 @pytest.fixture
 def open_page(browser: Any) -> Iterator[Callable[[LabelServer], Any]]:
     """Opens pages; a script error or a complaint in the console fails the test."""
@@ -232,7 +218,7 @@ def open_page(browser: Any) -> Iterator[Callable[[LabelServer], Any]]:
 
     def open_(server: LabelServer) -> Any:
         page = context.new_page()
-        page.set_default_timeout(PATIENCE_MS)
+        page.set_default_timeout(chromium.PATIENCE)
         page.on("console", lambda message: complaints.append(message.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.goto(server.address)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import struct
 import subprocess
@@ -25,35 +24,18 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from websockets.http11 import Request, Response
+from websockets.sync.server import ServerConnection
+from websockets.sync.server import serve as websockets_serve
 
 from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
 from tactflow.view.compact import encode_packet
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers
-from tests import clock
-
-sync_api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER TESTS: playwright is not installed")
-
-from websockets.http11 import Request, Response  # noqa: E402
-from websockets.sync.server import ServerConnection  # noqa: E402
-from websockets.sync.server import serve as websockets_serve  # noqa: E402
+from tests.chromium import CHROMIUM, FLAGS, PATIENCE
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGE = REPOSITORY / "src" / "tactflow" / "view" / "page"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-PATIENCE = round(clock.PATIENCE * 1000)
-"""How long a test waits for what must happen, ms. Nothing is asserted about the time it takes."""
-
-FLAGS = [
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    *(["--no-sandbox"] if os.geteuid() == 0 else []),
-]
-
 ENDLESS = "sim:twist?frames=100000"
 
 DRAWN = """() => ['area', 'angle', 'flow'].every(
@@ -107,17 +89,6 @@ class Run:
         self._reader.join()
         assert self.process.stderr is not None
         self.process.stderr.close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """One Chromium for all tests."""
-    if CHROMIUM is None:
-        pytest.skip("NO BROWSER TESTS: there is no chromium here; `make system-deps` installs it")
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

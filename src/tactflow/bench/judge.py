@@ -4,8 +4,8 @@
     python -m tactflow.bench.judge --data RECORDINGS --labels mine.json default mine.yaml
 
 Frames were outlined by a person (`python -m tactflow.bench.label`): `outlines.json` beside this file has
-those of recordings that anybody can have, of twenty sensors. A recording runs as a whole, as a user would run
-it; pictures of separate presses run one after the other, behind their reference.
+those of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of separate
+presses run one after the other, behind their reference.
 
 What is chosen with the help of labels cannot be judged on them. With several pipelines the table ends with
 one that is chosen for each lab by the labels of all *other* labs: the result that a new lab can expect of
@@ -23,26 +23,25 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import metrics
+from tactflow.bench.gels import GELS
 from tactflow.bench.label_file import FrameLabel, load_labels
-from tactflow.bench.labels import OUTLINES
+from tactflow.bench.labels import FOLDER, OUTLINES
 from tactflow.bench.score import DIRECTED
+from tactflow.cli.terminal import say, table
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.message.result import Result
+from tactflow.sources import open_source
+from tactflow.sources.files import load_image
 from tactflow.streaming import stream
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 
 PLAIN: Final = (
-    "gels/9dtact_1",
-    "gels/digit_fots",
-    "gels/jar_7_31_2",
-    "gels/jar_8_06_1",
-    "gels/thu_real",
+    *(f"{FOLDER}/{gel.folder}" for gel in GELS if gel.dots == 0),
     "mini_ball_gelslam",
     "wedge_grasp",
     "wedge_grip",
@@ -50,6 +49,8 @@ PLAIN: Final = (
 """Recordings of gels without dots among those of `OUTLINES`: `default` gives way to `markerless` there."""
 LARGE: Final = 500
 """px: pictures with a longer side are halved, as the documentation advises."""
+Pictures = list[NDArray[np.uint8]]
+"""(H, W, 3) BGR each."""
 RESAMPLES: Final = 1000
 """For the intervals: as many as give their bounds two digits."""
 
@@ -104,31 +105,40 @@ def compare(label: FrameLabel, result: Result) -> Judged:
 
 
 def judge(
-    pipeline: str, labels: Iterable[FrameLabel], data: Path, say: Callable[[str], None] = print
+    pipeline: str, labels: Iterable[FrameLabel], data: Path, report: Callable[[str], None] = say
 ) -> Iterator[Judged]:
     """Run every recording that is there, and compare its labelled frames.
 
     pipeline : a file or the name of a shipped pipeline. "default" is replaced by "markerless" for the
         recordings in `PLAIN`.
     labels : those with `contact` None are left out. data : folder that holds the recordings.
-    say : called with what could not be judged, and why. Frames that a failing pipeline did not reach count as
-        missed contacts.
+    report : called with what could not be judged, and why. Frames that a failing pipeline did not reach count
+        as missed contacts.
+
+    Raises
+    ------
+    ConfigError : a label names a frame that its recording cannot have.
+    SourceError : a labelled picture cannot be read.
     """
     known = sorted((label for label in labels if label.contact is not None), key=_run)
     for (recording, reference), group in groupby(known, key=_run):
         path, wanted = data / recording, list(group)
         if not path.exists():
-            say(f"{recording}: not in {data}, left out")
+            report(f"{recording}: not in {data}, left out")
             continue
         chosen = "markerless" if pipeline == "default" and recording.startswith(PLAIN) else pipeline
-        frames, places = _stills(path, reference, wanted) if path.is_dir() else (path, wanted)
-        missing = {_place(label): label for label in places}
+        source: Path | Pictures = path
+        if path.is_dir():
+            source = [_picture(path, name) for name in (reference, *(str(label.frame) for label in wanted))]
+            missing = dict(enumerate(wanted, 1))
+        else:
+            missing = {_index(label): label for label in wanted}
         try:
-            for result in _results(chosen, frames, last=max(missing)):
+            for result in _results(chosen, source, last=max(missing)):
                 if result.seq in missing and not result.frame.reference:
                     yield compare(missing.pop(result.seq), result)
         except TactflowError as error:
-            say(f"{recording}: {str(error).splitlines()[0]}")
+            report(f"{recording}: {str(error).splitlines()[0]}")
         for label in missing.values():
             yield Judged(label.lab, label.recording, bool(label.contact), False, hull=0.0, region=0.0)
 
@@ -138,48 +148,37 @@ def _run(label: FrameLabel) -> tuple[str, str]:
     return label.recording, label.reference if isinstance(label.reference, str) else ""
 
 
-def _place(label: FrameLabel) -> int:
-    assert isinstance(label.frame, int)
+def _index(label: FrameLabel) -> int:
+    if not isinstance(label.frame, int):
+        raise ConfigError(
+            f"{label.recording}: no frame {label.frame!r}; required an index, as it is no folder of pictures"
+        )
     return label.frame
 
 
-def _stills(
-    folder: Path, reference: str, labels: Sequence[FrameLabel]
-) -> tuple[list[NDArray[np.uint8]], list[FrameLabel]]:
-    """The reference and the labelled pictures, and the labels with the pictures' places in that list."""
-    names = [reference, *(str(label.frame) for label in labels)]
-    placed = [label.model_copy(update={"frame": place}) for place, label in enumerate(labels, 1)]
-    return [_picture(folder, name) for name in names], placed
-
-
 def _picture(folder: Path, name: str) -> NDArray[np.uint8]:
-    files = [file for file in (folder / name).parent.iterdir() if file.stem == Path(name).name]
-    image = cv2.imread(str(files[0]), cv2.IMREAD_COLOR) if files else None
-    if image is None:
-        raise ConfigError(f"{folder / name}: no picture of that name can be read")
-    return np.asarray(image, np.uint8)
+    """A picture by its name without the suffix; it may stand in a folder beside."""
+    path = folder / name
+    files = sorted(path.parent.glob("*")) if path.parent.is_dir() else []
+    found = next((file for file in files if file.stem == path.name), None)
+    if found is None:
+        raise ConfigError(f"{path}: there is no picture of that name")
+    return load_image(str(found))
 
 
-def _results(pipeline: str, source: Path | list[NDArray[np.uint8]], last: int) -> Iterator[Result]:
-    settings = {
-        "stages.preprocess.rotate": 0,
-        "stages.preprocess.downsample": 1 + (_longer_side(source) > LARGE),
-    }
+def _results(pipeline: str, source: Path | Pictures, last: int) -> Iterator[Result]:
+    if isinstance(source, Path):
+        with closing(open_source(str(source))) as reader:
+            first = reader.peek()
+        size = max(first[0].shape) if first is not None else 0
+    else:
+        size = max(source[0].shape)
+    settings = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 2 if size > LARGE else 1}
     with closing(stream(pipeline, source=source, settings=settings, max_frames=last + 1)) as results:
         yield from results
 
 
-def _longer_side(source: Path | list[NDArray[np.uint8]]) -> int:
-    if not isinstance(source, Path):
-        return int(max(source[0].shape))
-    video = cv2.VideoCapture(str(source))
-    try:
-        return int(max(video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)))
-    finally:
-        video.release()
-
-
-def table(judged: Sequence[Judged]) -> Iterator[str]:
+def summary(judged: Sequence[Judged]) -> Iterator[str]:
     """Lines of a table: a row for each lab, and one for all."""
     heading = (
         "lab",
@@ -193,16 +192,11 @@ def table(judged: Sequence[Judged]) -> Iterator[str]:
         "x2",
         "missed",
     )
-    yield ROW.format(*heading, "rest", "false")
-    for lab in sorted({one.lab for one in judged}):
-        yield _row(lab or "-", [one for one in judged if one.lab == lab])
-    yield _row("all", judged)
+    labs = [_row(lab or "-", group) for lab, group in _by_lab(judged)]
+    yield from table([(*heading, "rest", "false"), *labs, _row("all", judged)])
 
 
-ROW: Final = "{:18} {:>6} {:>17} {:>5} {:>10} {:>9} {:>11} {:>5} {:>5} {:>6} {:>5} {:>5}"
-
-
-def _row(name: str, judged: Sequence[Judged]) -> str:
+def _row(name: str, judged: Sequence[Judged]) -> tuple[str, ...]:
     touched, rest = [one for one in judged if one.touched], [one for one in judged if not one.touched]
     hull, region, center, angle, area = (
         np.array([value for one in touched if not np.isnan(value := getattr(one, key))])
@@ -210,9 +204,9 @@ def _row(name: str, judged: Sequence[Judged]) -> str:
     )
     outside = np.mean((area < 0.5) | (area > 2)) if len(area) else np.nan
     low, high = interval(touched)
-    return ROW.format(
+    return (
         name,
-        len(touched),
+        str(len(touched)),
         f"{_median(hull):.2f} ({low:.2f}-{high:.2f})" if len(hull) else "-",
         f"{np.quantile(hull, 0.1):.2f}" if len(hull) else "-",
         f"{_median(region):.2f}" if len(region) else "-",
@@ -221,7 +215,7 @@ def _row(name: str, judged: Sequence[Judged]) -> str:
         f"{_median(area):.2f}" if len(area) else "-",
         f"{outside:.0%}" if len(area) else "-",
         f"{np.mean([not one.found for one in touched]):.1%}" if touched else "-",
-        len(rest),
+        str(len(rest)),
         f"{np.mean([one.found for one in rest]):.1%}" if rest else "-",
     )
 
@@ -322,26 +316,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             label for label in load_labels(options.labels) if label.recording.startswith(options.recording)
         ]
         first = [label for label in labels if label.round == 1]
-        results = {name: list(judge(name, first, options.data, _to_stderr)) for name in options.pipelines}
-    except ConfigError as error:
-        _to_stderr(f"error: {error}")
+        results = {name: list(judge(name, first, options.data)) for name in options.pipelines}
+        if not any(results.values()):
+            raise ConfigError(f"--data {options.data}: has none of the recordings of {options.labels}")
+    except TactflowError as error:
+        say(f"tactflow: {error}")
         return error.exit_code
-    if not any(results.values()):
-        _to_stderr(f"error: --data {options.data}: has none of the recordings of {options.labels}")
-        return ConfigError.exit_code
     if len(results) > 1:
         results["chosen on the labels of all other labs"] = chosen_elsewhere(results)
     for name, judged in results.items():
-        print(name, *table(judged), sep="\n", end="\n\n")
+        print(name, *summary(judged), sep="\n", end="\n\n")
     if again := scatter(labels):
         print(
             f"Labels: {len(again)} frames that were outlined twice overlap by {_median(again):.2f} (median)"
         )
     return 0
-
-
-def _to_stderr(text: str) -> None:
-    print(text, file=sys.stderr)
 
 
 if __name__ == "__main__":
