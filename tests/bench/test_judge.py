@@ -71,6 +71,17 @@ def test_frames_that_a_failing_pipeline_does_not_reach_are_missed(
     assert "markerless" in said[1]
 
 
+def test_a_wrong_pipeline_is_refused_and_not_judged(
+    labelled: tuple[Path, list[FrameLabel]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, labels = labelled
+    save_labels(tmp_path / "mine.json", labels)
+    assert main(["nosuch", "--data", str(data), "--labels", str(tmp_path / "mine.json")]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("tactflow: there is no file nosuch")
+
+
 def test_labels_of_frames_that_cannot_be_there_are_refused(
     labelled: tuple[Path, list[FrameLabel]], tmp_path: Path
 ) -> None:

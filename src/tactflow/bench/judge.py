@@ -117,7 +117,7 @@ def judge(
 
     Raises
     ------
-    ConfigError : a label names a frame that its recording cannot have.
+    ConfigError : the pipeline is wrong, or a label names a frame that its recording cannot have.
     SourceError : a labelled picture cannot be read.
     """
     known = sorted((label for label in labels if label.contact is not None), key=_run)
@@ -137,6 +137,8 @@ def judge(
             for result in _results(chosen, source, last=max(missing)):
                 if result.seq in missing and not result.frame.reference:
                     yield compare(missing.pop(result.seq), result)
+        except ConfigError:
+            raise
         except TactflowError as error:
             report(f"{recording}: {str(error).splitlines()[0]}")
         for label in missing.values():
