@@ -67,7 +67,7 @@ def test_a_tracker_of_ones_own_is_measured_whichever_ports_it_takes_and_a_broken
         use = f"stages.tracker={{use: {tmp_path / 'own.py'}:{name}}}"
         measured[name] = load_pipeline(find_pipeline("default"), overrides=[use])
     result = BenchResult(quick=True)
-    measure_methods(Bench(result, CopyUnit(), tmp_path), measured, Rendered(Case("press", 3), tmp_path))
+    measure_methods(Bench(result, CopyUnit(), tmp_path), measured, Case("press", 3))
     found = {m.method: m.errors for m in result.measurements("tracker")}
     assert found.keys() == {"default", "Own"}
     assert found["Own"]["displacement_rms"] >= 0

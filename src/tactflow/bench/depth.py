@@ -1,28 +1,21 @@
-"""Heights in mm: calibrated on presses of a ball, tried on other contacts, and on a real ball."""
+"""Heights in mm: calibrated on presses of a ball, tried on other contacts."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench.lockstep import on_recording
 from tactflow.bench.pipelines import Bench
 from tactflow.bench.quantities import Tally
-from tactflow.bench.recordings import labelled_presses, stack
-from tactflow.bench.results import RECORDING
 from tactflow.calibration.photometric import Photometry, fit_photometry
-from tactflow.calibration.presses import Press, Session, find_presses
+from tactflow.calibration.presses import Press, Session
 from tactflow.calibration.scale import centre
-from tactflow.engine.graph import Pipeline
 from tactflow.sim import Scene, open_scene
 from tactflow.sim.gel import MM
-from tactflow.streaming import stream
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale
@@ -37,10 +30,6 @@ LIGHTS: Final = ("photometric", "mixed", "dark_channel")
 """Lights of the simulator whose colours tell slopes; none is the polynomial that a calibration fits."""
 SCENES: Final = ("press", "cable", "long_edge", "coin")
 """What presses: like the ball of the calibration, longer, sharper, and with steep steps."""
-WEDGE_SCALE: Final = Scale(0.1, 0.1, (0.0, 0.0), centre((240, 320)))
-"""About 0.1 mm a pixel, as the readme of wedge_ball states."""
-WEDGE_BALL: Final = 1.98
-"""Radius of its ball, mm."""
 
 
 def measure_simulated(bench: Bench) -> None:
@@ -114,20 +103,3 @@ def _compare(photometry: Photometry, scene: Scene, tally: Tally, coverage: Tally
         assert depth.greatest_stderr is not None
         coverage.within("depth", depth.greatest - float(sunk.max()), depth.greatest_stderr)
         yield cpu_s
-
-
-def measure_ball(bench: Bench, wedge: Pipeline, folder: Path) -> None:
-    """Errors of a calibration on the presses of wedge_ball, each half learned from the other.
-
-    wedge : the pipeline of this sensor. folder : with `labels.csv`.
-    """
-    files, _ = labelled_presses(folder)
-    pipeline = replace(on_recording(wedge, stack(files, bench.scratch)), skipping=False)
-    session = find_presses(stream(pipeline, images=True))
-    found = fit_photometry(session, WEDGE_SCALE, WEDGE_BALL).found
-    errors = {
-        "normal_error": found.normal_error,
-        "ball_radius_error": 100 * abs(found.radius_error),
-        "sphere_rms": found.sphere_rms,
-    }
-    bench.result.add(DEPTH, "wedge", f"{RECORDING}wedge_ball", errors, frames=len(files) - 1)

@@ -14,13 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.bench.labels import (
-    FOLDER,
-    Label,
-    labels_of,
-    outlines_by_eye,
-    touch_of,
-)
+from tactflow.bench.labels import FOLDER, Label, labels_of, outlines_by_eye, touch_of
 from tactflow.bench.lockstep import TimedResult, on_recording, with_params
 from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
@@ -28,7 +22,6 @@ from tactflow.bench.results import RECORDING
 from tactflow.engine.graph import Pipeline
 
 _VIDEOS = (".avi", ".mp4", ".m4v", ".gif")
-_PICTURES = (".png", ".jpg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +46,9 @@ class Gel:
 
     def sources(self, gels: Path) -> list[Path]:
         """Its recordings: the videos in its folder, or the folder itself if it holds pictures."""
-        inside = sorted((gels / self.folder).iterdir()) if (gels / self.folder).is_dir() else []
+        inside = sorted((gels / self.folder).glob("*"))
         videos = [path for path in inside if path.suffix in _VIDEOS]
-        pictures = any(path.suffix in _PICTURES for path in inside)
-        return videos[:: self.every] or ([gels / self.folder] if pictures else [])
+        return videos[:: self.every] or ([gels / self.folder] if inside else [])
 
     def known(self, frames: int) -> NDArray[np.int8]:
         """(frames,): 1 touched, 0 at rest, -1 unknown, by `rest` and `touched`."""

@@ -51,10 +51,9 @@ class LockstepPipeline:
     def __init__(self, pipeline: Pipeline) -> None:
         self._turns: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         """For the pipeline's thread: how many frames to let through, or None to stop."""
-        self._done: queue.SimpleQueue[bool] = queue.SimpleQueue()
-        """For the bench: the turn is over; False if the run has ended."""
+        self._done: queue.SimpleQueue[RunResult | None] = queue.SimpleQueue()
+        """For the bench, after each turn: how the run ended, or None if it goes on."""
         self._results: list[TimedResult] = []
-        self._ended = False
         self._outcome: RunResult | None = None
         self._runner = make_runner(self._in_one_thread(pipeline))
         self._thread = threading.Thread(target=self._run, name="tactflow-bench", daemon=True)
@@ -70,11 +69,11 @@ class LockstepPipeline:
         TactflowError
             If the pipeline failed and there is nothing left to return.
         """
-        if not self._ended:
+        if self._outcome is None:
             self._turns.put(frames)
-            self._ended = not self._done.get()
+            self._outcome = self._done.get()
         results, self._results = self._results, []
-        if self._ended and not results and self._outcome is not None and self._outcome.error is not None:
+        if not results and self._outcome is not None and self._outcome.error is not None:
             raise TactflowError(self._outcome.error)
         return results
 
@@ -85,10 +84,7 @@ class LockstepPipeline:
         self._thread.join()
 
     def _run(self) -> None:
-        try:
-            self._outcome = self._runner.run()
-        finally:
-            self._done.put(False)
+        self._done.put(self._runner.run())
 
     def _take(self, result: TimedResult) -> None:
         encode_message(result)
@@ -108,7 +104,7 @@ class LockstepPipeline:
                     result.cpu_s = cpu_s
             if len(turn) < count:
                 return
-            self._done.put(True)
+            self._done.put(None)
 
     def _in_one_thread(self, pipeline: Pipeline) -> Pipeline:
         """The same graph in one segment, with frames in turns and a sink that keeps the results."""
@@ -179,7 +175,7 @@ def take_turns(
                 failures[name] = str(error)
         while running:
             if unit is not None:
-                unit.take(block)
+                unit.take()
             for name in list(running):
                 try:
                     results = running[name].block(block)

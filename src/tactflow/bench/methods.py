@@ -8,30 +8,24 @@ alternative; geometry and flow are given the true contact mask, so that their er
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, get_args
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import metrics, score
 from tactflow.bench.pipelines import Bench
 from tactflow.bench.quantities import Tally
-from tactflow.bench.scenes import Rendered
-from tactflow.bench.timing import interleaved
-from tactflow.engine.contract import StageParams
+from tactflow.bench.scenes import Case, Rendered, rendered
+from tactflow.bench.timing import BLOCK, Times, quiet
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.sim import Truth
-
-
-def methods_of(params: type[StageParams]) -> list[str]:
-    """The choices of a stage's `method` parameter; empty where it has none."""
-    method = params.model_fields.get("method")
-    if method is None or get_origin(method.annotation) is not Literal:
-        return []
-    return [str(choice) for choice in get_args(method.annotation)]
 
 
 def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Node]:
@@ -50,7 +44,8 @@ def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Nod
             method = str(getattr(node.params, "method", name))
             ways[name if method in ways else method] = node
     for node in nodes.values():
-        for method in methods_of(node.component.params):
+        choices = node.component.params.model_fields.get("method")
+        for method in get_args(choices.annotation) if choices else ():
             ways.setdefault(method, replace(node, params=node.params.changed(method=method)))
     return ways
 
@@ -118,7 +113,7 @@ class _Judge:
     def inpaint(self, inputs: _Inputs, found: Any) -> None:
         mask = inputs.ports["marker_mask"]
         if mask.any():
-            self.tally.add(inpaint_mae=metrics.masked_mae(found, inputs.clean, mask))
+            self.tally.add(inpaint_mae=np.mean(cv2.absdiff(found, inputs.clean)[mask != 0]))
 
     def difference(self, inputs: _Inputs, found: Any) -> None:
         if score.add_decision(self.tally, bool(found.touching), inputs.truth, inputs.deep):
@@ -149,52 +144,53 @@ STAGES: Mapping[str, frozenset[str]] = {
 the true contact are measured only in frames that show one."""
 
 
-def measure_methods(bench: Bench, pipelines: Mapping[str, Pipeline], rendered: Rendered) -> None:
+def measure_methods(bench: Bench, pipelines: Mapping[str, Pipeline], case: Case) -> None:
     """Measure every method of every stage on one scene.
 
     pipelines : name -> pipeline; the first is the default one and provides the inputs.
     """
-    frames = list(_run_chain(next(iter(pipelines.values())), rendered))
+    with rendered(case, bench.scratch) as scene:
+        frames = list(_run_chain(next(iter(pipelines.values())), scene))
     for stage, ports in STAGES.items():
         ways = alternatives(pipelines, stage)
         shown = [item for item in frames if item.truth.touching or "contact_mask" not in ports]
         if len(ways) > 1:
-            _measure_stage(bench, stage, ways, shown, rendered.case.label)
+            _measure_stage(bench, stage, ways, shown, case.label)
 
 
 def _measure_stage(
     bench: Bench, stage: str, ways: Mapping[str, Node], frames: Sequence[_Inputs], scene: str
 ) -> None:
     judges = {name: _Judge() for name in ways}
+    times: dict[str, Times] = {name: defaultdict(list) for name in ways}
+    calls = {name: _call(node, STAGES[stage]) for name, node in ways.items()}
     failures: dict[str, str] = {}
-
-    def call(name: str) -> Callable[[_Inputs], Any]:
-        component = ways[name].component
-        process = component.cls(ways[name].params).process
-        # A class of another kind may need other ports than the stage whose place it takes.
-        ports = [p.name for p in component.ports.inputs if p.name in STAGES[stage] or not p.optional]
-
-        def run(item: _Inputs) -> Any:
-            if name in failures:
-                return None
-            try:
-                return process(**{port: item.ports[port] for port in ports if port in item.ports})
-            except Exception as error:
-                failures[name] = f"{type(error).__name__}: {error}"
-                return None
-
-        return run
-
-    def see(name: str, item: _Inputs, found: Any) -> None:
-        if name not in failures:
-            getattr(judges[name], stage)(item, None if isinstance(found, Absent) else found)
-
     bench.unit.take()
-    calls = {name: call(name) for name in ways}
-    times = interleaved(calls, [(item.kind, item) for item in frames], see=see)
+    with quiet():
+        for first in range(0, len(frames), BLOCK):
+            turn = frames[first : first + BLOCK]
+            for name in [name for name in ways if name not in failures]:
+                answers = []
+                try:
+                    for item in turn:
+                        began = time.thread_time()
+                        answers.append(calls[name](item))
+                        times[name][item.kind].append(time.thread_time() - began)
+                except Exception as error:
+                    failures[name] = f"{type(error).__name__}: {error}"
+                for item, found in zip(turn, answers, strict=False):
+                    getattr(judges[name], stage)(item, None if isinstance(found, Absent) else found)
     for name in ways:
         if name in failures:
             bench.result.failures[f"{stage}/{name}/{scene}"] = failures[name]
         else:
             errors = judges[name].tally.errors()
             bench.result.add(stage, name, scene, errors, times=times[name], frames=len(frames))
+
+
+def _call(node: Node, ports: frozenset[str]) -> Callable[[_Inputs], Any]:
+    """A new stage of this kind, as a function of what it is given."""
+    process = node.component.cls(node.params).process
+    # A class of another kind may need other ports than the stage whose place it takes.
+    wanted = [port.name for port in node.component.ports.inputs if port.name in ports or not port.optional]
+    return lambda item: process(**{port: item.ports[port] for port in wanted if port in item.ports})

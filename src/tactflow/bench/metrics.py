@@ -11,17 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
 
 FloatArray = NDArray[np.floating[Any]]
 BoolArray = NDArray[np.bool_]
-
-
-def pairwise_distances(a: FloatArray, b: FloatArray) -> NDArray[np.float64]:
-    """(N, M) float64, distance of every row of `a` (N, 2) to every row of `b` (M, 2), px."""
-    from scipy.spatial.distance import cdist
-
-    first, second = (np.asarray(points, np.float64).reshape(-1, 2) for points in (a, b))
-    return np.asarray(cdist(first, second))
 
 
 def pixel_area(hull: FloatArray) -> float:
@@ -85,7 +78,7 @@ def dot_pitch(points: FloatArray) -> float:
 
     A single point has no neighbour that it could be mistaken for: infinite.
     """
-    apart = pairwise_distances(points, points)
+    apart = cdist(points, points)
     np.fill_diagonal(apart, np.inf)
     return float(np.median(apart.min(axis=1, initial=np.inf)))
 
@@ -102,20 +95,13 @@ def match_points(points: FloatArray, truth: FloatArray, radius: float) -> NDArra
     Two points belong together when each is the other's nearest and they are at most `radius` apart. This
     is stricter than an optimal assignment: a detection between two dots belongs to one of them at most.
 
-    Parameters
-    ----------
-    points : (N, 2) floating, found positions, px.
-    truth : (M, 2) floating, true positions, px.
-    radius : px, > 0. Half a pitch is the natural choice: beyond it, another dot is as likely.
-
-    Returns
-    -------
-    (M,) int64, indices into `points`.
+    points : (N, 2), found positions, px. truth : (M, 2), true ones. radius : px; half a pitch is the natural
+    choice: beyond it, another dot is as likely. Returns (M,) int64, indices into `points`.
     """
     index = np.full(len(truth), -1, dtype=np.int64)
     if len(points) == 0 or len(truth) == 0:
         return index
-    apart = pairwise_distances(truth, points)
+    apart = cdist(truth, points)
     nearest, back = apart.argmin(axis=1), apart.argmin(axis=0)
     rows = np.arange(len(truth))
     mutual = (back[nearest] == rows) & (apart[rows, nearest] <= radius)
@@ -138,23 +124,11 @@ def detection(points: FloatArray, truth: FloatArray, radius: float) -> tuple[flo
 def identity_errors(position: FloatArray, truth: FloatArray, pitch: float) -> BoolArray:
     """Which markers carry the wrong name: nearer to another marker's true position, or off by half a pitch.
 
-    Parameters
-    ----------
-    position : (N, 2) floating, claimed positions, px.
-    truth : (N, 2) floating, true positions of the same markers, px.
-    pitch : distance of neighbouring markers at rest, px.
-
-    Returns
-    -------
-    (N,) bool.
+    position, truth : (N, 2), claimed and true positions of the same markers, px. pitch : distance of
+    neighbouring markers at rest, px. Returns (N,) bool.
     """
-    apart = pairwise_distances(position, truth)
+    apart = cdist(position, truth)
     own = np.diagonal(apart)
     # Ties go to the marker itself: two dots that truly coincide cannot be told apart by anybody.
     nearest = apart.min(axis=1, initial=np.inf)
     return np.asarray((nearest < own) | (own > pitch / 2))
-
-
-def masked_mae(image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.generic]) -> float:
-    """Mean absolute error inside a mask (H, W) that is not empty, grey levels."""
-    return float(np.mean(cv2.absdiff(image, truth)[np.asarray(mask) != 0]))

@@ -11,7 +11,7 @@ from pathlib import Path
 from tactflow.bench.lockstep import LockstepPipeline, TimedResult, on_recording, take_turns
 from tactflow.bench.pictures import WorstFrame
 from tactflow.bench.quantities import Tally
-from tactflow.bench.results import BenchResult
+from tactflow.bench.results import RECORDING, BenchResult
 from tactflow.bench.timing import CopyUnit, Times, quiet
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
@@ -61,17 +61,13 @@ class Bench:
         pipelines: Mapping[str, Pipeline],
         scene: str,
         parts: Sequence[tuple[Path, Callable[[Tally], Judge]]],
-    ) -> dict[str, Tally]:
+    ) -> None:
         """Run pipelines, in turns of a few frames, on a scene or on the parts of a recording.
 
         Parameters
         ----------
         pipelines : name -> pipeline. scene : name of the scene or recording in the result.
         parts : recordings, each with a function that makes a judge for one pipeline.
-
-        Returns
-        -------
-        pipeline -> all values of all its errors.
         """
         tallies = {name: Tally() for name in pipelines}
         times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
@@ -93,14 +89,13 @@ class Bench:
                     times[name][kind] += samples
                 if self.pictures is not None:
                     part = f"{scene}-{path.stem}" if len(parts) > 1 else scene
-                    judge.worst.write(self.pictures, f"{part.removeprefix('data:')}-{name}")
+                    judge.worst.write(self.pictures, f"{part.removeprefix(RECORDING)}-{name}")
         for name, tally in tallies.items():
             if name in failures:
                 self.result.failures[f"{PIPELINE}/{name}/{scene}"] = failures[name]
             else:
                 errors = tally.errors()
                 self.result.add(PIPELINE, name, scene, errors, times=times[name], frames=frames[name])
-        return tallies
 
     def measure_refusal(self, name: str, pipeline: Pipeline, scene: str) -> None:
         """Measure what a pipeline for markers takes for markers on a gel without: at best, it refuses to run.

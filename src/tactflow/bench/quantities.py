@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -35,6 +34,10 @@ MEAN, MEDIAN, MOST, LEAST = np.mean, np.median, np.max, np.min
 """How values become one number."""
 
 
+SHARE = 0.1
+"""Share of a stored error by which a later one may exceed it: keeps the rule sensible for large errors."""
+
+
 @dataclass(frozen=True, slots=True)
 class Quantity:
     """One measured error.
@@ -42,10 +45,9 @@ class Quantity:
     key : name in results. title : for people. unit : "" for none.
     summary : makes one number of the values (N,) of all frames, N > 0.
     best : the perfect value. better : which direction is better.
-    slack, share : a stored result may be exceeded by slack + share * |stored - best| before it counts as
-        worse. Slack covers what other CPUs change in the last bits of floating-point sums (a marker or a
-        pixel at a threshold falls to the other side); share keeps the rule sensible for large errors. For
-        shares of frames, slack is a little more than one frame of the quick run's 30.
+    slack : a stored result may be exceeded by slack + `SHARE` * |stored - best| before it counts as worse:
+        by what other CPUs change in the last bits of floating-point sums (a marker or a pixel at a threshold
+        falls to the other side). For shares of frames, a little more than one frame of the quick run's 30.
     """
 
     key: str
@@ -55,7 +57,6 @@ class Quantity:
     better: Literal["lower", "higher"] = "lower"
     best: float = 0.0
     slack: float = 0.0
-    share: float = 0.1
 
     @property
     def heading(self) -> str:
@@ -68,17 +69,13 @@ class Quantity:
 
     def allowed(self, stored: float) -> float:
         """The worst value that still counts as no worse than `stored`."""
-        margin = self.slack + self.share * self.distance(stored)
+        margin = self.slack + SHARE * self.distance(stored)
         return stored + margin if self.better == "lower" else stored - margin
 
     def is_worse(self, value: float, stored: float) -> bool:
-        """True if `value` is worse than `stored` by more than the tolerance."""
+        """Whether `value` is worse than `stored` by more than the tolerance."""
         allowed = self.allowed(stored)
         return value > allowed if self.better == "lower" else value < allowed
-
-
-def _percent_right(key: str, title: str, slack: float = 0.0, **options: Any) -> Quantity:
-    return Quantity(key, title, "%", better="higher", best=100.0, slack=slack, **options)
 
 
 def _within(key: str, title: str) -> tuple[Quantity, Quantity]:
@@ -118,10 +115,7 @@ _ALL = [
     Quantity("depth_rms", "heights, RMS error over the greatest depth", "%", slack=0.3),
     *_within("depth", "greatest-depth errors"),
     Quantity("volume_error", "indented volume, error, mean", "%", slack=1.0),
-    Quantity("normal_error", "normals of a ball, mean angle", "deg", slack=0.3),
-    Quantity("ball_radius_error", "radius of a ball from its heights, median", "%", slack=0.5),
-    Quantity("sphere_rms", "heights of a ball, RMS from a sphere", "mm", slack=0.003),
-    _percent_right("found_percent", "labelled contacts found"),
+    Quantity("found_percent", "labelled contacts found", "%", MEAN, "higher", 100.0),
     Quantity("label_center_p50", "centre against hand label, median", "px", P50_OF_OFFSETS, slack=0.1),
     Quantity(
         "label_center_p95", "centre against hand label, 95th percentile", "px", P95_OF_OFFSETS, slack=0.3
@@ -131,7 +125,7 @@ _ALL = [
     Quantity("label_distance_p50", "centre against labelled circle, median", "px", MEDIAN, slack=0.1),
     Quantity("line_angle_p50", "direction against labelled line, median", "deg", MEDIAN, slack=0.1),
     Quantity("line_angle_max", "direction against labelled line, maximum", "deg", MOST, slack=0.3),
-    _percent_right("dots_found", "dots found, of those counted by eye", slack=1.0),
+    Quantity("dots_found", "dots found, of those counted by eye", "%", MEAN, "higher", 100.0, slack=1.0),
     Quantity("dots_beyond", "dots found beyond those counted by eye", "%", slack=1.0),
 ]
 
@@ -171,14 +165,3 @@ class Tally:
             for key, quantity in QUANTITIES.items()
             if key in joined and joined[key].size
         }
-
-
-def format_number(value: float) -> str:
-    """Three significant digits without an exponent where it stays readable."""
-    if value == 0:
-        return "0"
-    if not 1e-4 <= abs(value) < 1e5:
-        return f"{value:.1e}"
-    digits = max(0, 2 - math.floor(math.log10(abs(value))))
-    text = f"{value:.{digits}f}"
-    return text.rstrip("0").rstrip(".") if "." in text else text

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,15 +16,11 @@ from tactflow.bench.lockstep import TimedResult, with_params
 from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import RECORDING
+from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
-
-RECTIFY = {
-    "from": [[33, 58], [208, 61], [56, 250], [185, 244]],
-    "to": [[0, 0], [240, 0], [0, 320], [240, 320]],
-    "size": [240, 320],
-}
-"""The gel's corners in the picture of the Wedge, and the rectangle they belong to."""
+from tactflow.sources.files import load_image
 
 _MARKER_STAGES = frozenset({"tracker", "flow_in_mask", "visualize"})
 """Ids of the stages that need markers."""
@@ -34,14 +29,22 @@ _MARKER_STAGES = frozenset({"tracker", "flow_in_mask", "visualize"})
 def measure_presses(bench: Bench, pipelines: Mapping[str, Pipeline], folder: Path) -> None:
     """Compare the centres of a ball's presses with labels.
 
-    pipelines : their preprocessing is replaced by the Wedge's rectification. folder : with `labels.csv`.
+    pipelines : their preprocessing is replaced by the Wedge's rectification. folder : with `labels.csv` and
+        the pictures that it names, and `reference.jpg`.
+
+    Raises
+    ------
+    SourceError : a picture cannot be read.
     """
-    ready = {
-        name: with_params(pipeline, "preprocess", homography=RECTIFY) for name, pipeline in pipelines.items()
-    }
-    files, labels = labelled_presses(folder)
-    ball = [(stack(files, bench.scratch), partial(PressJudge, labels))]
-    bench.measure(ready, f"{RECORDING}wedge_ball", ball)
+    rectify = load_pipeline(find_pipeline("wedge")).nodes["preprocess"].params.model_dump(exclude_unset=True)
+    ready = {name: with_params(pipeline, "preprocess", **rectify) for name, pipeline in pipelines.items()}
+    with (folder / "labels.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    labels = np.array([(float(row["x"]), float(row["y"])) for row in rows])
+    names = ["reference.jpg", *(row["file"] for row in rows)]
+    path = bench.scratch / "recording.npy"
+    np.save(path, np.stack([load_image(str(folder / name)) for name in names]))
+    bench.measure(ready, f"{RECORDING}wedge_ball", [(path, partial(PressJudge, labels))])
 
 
 def check(data: Path) -> None:
@@ -61,25 +64,6 @@ def without_markers(pipeline: Pipeline) -> Pipeline:
     """The same pipeline without the stages that need markers to be there."""
     nodes = {name: node for name, node in pipeline.nodes.items() if name not in _MARKER_STAGES}
     return replace(pipeline, nodes=nodes)
-
-
-def stack(files: Sequence[Path], scratch: Path) -> Path:
-    """Images as one `.npy` recording."""
-    path = scratch / "recording.npy"
-    images = [cv2.imread(str(file), cv2.IMREAD_COLOR) for file in files]
-    missing = [file.name for file, image in zip(files, images, strict=True) if image is None]
-    if missing:
-        raise ConfigError(f"--data: cannot read {', '.join(missing[:3])} in {files[0].parent}")
-    np.save(path, np.stack([np.asarray(image) for image in images]))
-    return path
-
-
-def labelled_presses(folder: Path) -> tuple[list[Path], NDArray[np.float64]]:
-    """Pictures of a ball's presses, the untouched gel first, and the hand-labelled centres (N, 2) px."""
-    with (folder / "labels.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    labels = np.array([(float(row["x"]), float(row["y"])) for row in rows])
-    return [folder / "reference.jpg", *(folder / row["file"] for row in rows)], labels
 
 
 class PressJudge(Judge):

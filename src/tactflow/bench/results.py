@@ -8,7 +8,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.engine.errors import ConfigError
@@ -40,6 +39,16 @@ class Measurement:
     def key(self) -> str:
         """group/method/scene."""
         return f"{self.group}/{self.method}/{self.scene}"
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the scene is simulated, not a recording."""
+        return not self.scene.startswith(RECORDING)
+
+    @property
+    def recording(self) -> str:
+        """Name of the recording."""
+        return self.scene.removeprefix(RECORDING)
 
     @property
     def errors(self) -> dict[str, float]:
@@ -90,30 +99,15 @@ class BenchResult:
         """The numbers of one group, in the order in which they were measured."""
         return [measurement for measurement in self.measured if measurement.group == group]
 
-    def errors(self) -> dict[str, dict[str, float]]:
-        """group/method/scene -> quantity -> error."""
-        return {m.key: m.errors for m in self.measured if m.errors}
-
     def save(self, path: Path) -> None:
         """Write everything as JSON."""
         run = {name: value for name, value in asdict(self).items() if name != "measured"}
-        _write(path, {"schema": SCHEMA, **run, "values": {m.key: m.values for m in self.measured}})
-
-    def save_errors(self, path: Path) -> None:
-        """Write only the errors, which do not depend on the machine, to compare a later run with."""
-        errors = {
-            key: {name: float(f"{value:.6g}") for name, value in sorted(values.items())}
-            for key, values in self.errors().items()
-        }
-        _write(path, {"schema": SCHEMA, "quick": self.quick, "values": errors})
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        content = {"schema": SCHEMA, **run, "values": {m.key: m.values for m in self.measured}}
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
-    """Errors of a stored run, whole or errors only: group/method/scene -> quantity -> error.
+    """Errors of a stored run: group/method/scene -> quantity -> error.
 
     Raises
     ------
@@ -132,11 +126,10 @@ def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
     if stored["quick"] != quick:
         kind = "quick" if stored["quick"] else "full"
         raise ConfigError(f"{path}: is the result of a {kind} run; compare it with a {kind} run")
-    errors = {
-        key: {name: v for name, v in values.items() if name in QUANTITIES}
+    return {
+        key: {name: value for name, value in values.items() if name in QUANTITIES}
         for key, values in stored["values"].items()
     }
-    return {key: values for key, values in errors.items() if values}
 
 
 def regressions(
@@ -148,8 +141,8 @@ def regressions(
 
     stored : of `load_errors`. scenes : the simulated scenes that were chosen, or None for all.
     """
-    now, worse = result.errors(), []
-    measured = {key.rpartition("/")[2] for key in now}
+    now = {m.key: m.errors for m in result.measured}
+    measured, worse = {m.scene for m in result.measured}, []
     for key, errors in stored.items():
         scene = key.rpartition("/")[2]
         # Recordings are not everywhere; simulated scenes are, so a missing one is a regression.

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim import Scene, Truth, open_scene
+from tactflow.sim.camera import SIZE
 from tactflow.vision.geometry import PixelMapping
 
 
@@ -32,11 +33,6 @@ class Case:
     def label(self) -> str:
         """Its name in results."""
         return self.name + self.suffix
-
-    @property
-    def spec(self) -> str:
-        """What `open_scene` is given."""
-        return f"{self.name}?frames={self.frames}" + (f"&{self.query}" if self.query else "")
 
 
 def _cases(text: str) -> tuple[Case, ...]:
@@ -77,20 +73,23 @@ class Rendered:
 
     Parameters
     ----------
-    case : which scene. folder : where the file goes.
+    case : which scene. folder : where the file goes. size : (width, height) of the frames, px.
     """
 
-    def __init__(self, case: Case, folder: Path) -> None:
+    def __init__(self, case: Case, folder: Path, size: tuple[int, int] = SIZE) -> None:
         self.case = case
-        self.scene: Scene = open_scene(case.spec)
+        self.scene: Scene = open_scene(f"{case.name}?frames={case.frames}&{case.query}".rstrip("&"))
         self.path = folder / f"{case.label}-{case.frames}.npy"
-        size = (case.frames, self.scene.size[1], self.scene.size[0], 3)
-        frames = np.lib.format.open_memmap(self.path, mode="w+", dtype=np.uint8, shape=size)
+        shape = (case.frames, size[1], size[0], 3)
+        self.frames = np.lib.format.open_memmap(self.path, mode="w+", dtype=np.uint8, shape=shape)
         for index in range(case.frames):
-            frames[index] = self.scene.frame(index)
-        frames.flush()
-        self.frames: NDArray[np.uint8] = frames
+            self.frames[index] = self.render(index)
+        self.frames.flush()
         self._truths: dict[Any, list[Truth]] = {}
+
+    def render(self, index: int) -> NDArray[np.uint8]:
+        """The raw frame, (H, W, 3) uint8 BGR."""
+        return self.scene.frame(index)
 
     def __len__(self) -> int:
         return self.case.frames

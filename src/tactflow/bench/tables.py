@@ -1,22 +1,17 @@
-"""The result as sections of text and tables: for the terminal, for a page in Markdown, and for the report."""
+"""The result as sections of text and tables, for the terminal and the report."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 from statistics import median
 
-from rich.console import Console
-from rich.table import Table as RichTable
+import numpy as np
 
 from tactflow.bench.gels import GELS
 from tactflow.bench.pipelines import CLASSIC, PIPELINE
-from tactflow.bench.quantities import QUANTITIES, format_number
-from tactflow.bench.results import RECORDING, TIMES, BenchResult, Measurement
+from tactflow.bench.quantities import QUANTITIES
+from tactflow.bench.results import TIMES, BenchResult, Measurement
 from tactflow.report import Section, Table
-
-BEGIN = "<!-- tables of tactflow bench: written by --markdown -->"
-END = "<!-- end of tables -->"
 
 TITLES = {
     PIPELINE: "Whole pipelines",
@@ -40,7 +35,7 @@ PRIMARY = {
     "flow_in_mask": ("flow_error",),
     "depth": ("depth_rms", "volume_error", "depth_within_one", "depth_within_two"),
 }
-"""Group -> quantities that are shown of it."""
+"""Group -> quantities in its table."""
 
 SCENE_COLUMNS = {
     "dots not found, false": ("markers_missed", "markers_false"),
@@ -56,7 +51,7 @@ SCENE_COLUMNS = {
     "direction, deg": ("angle_mean",),
     "mean flow, px": ("flow_error",),
 }
-"""Heading -> quantities, for the table of scenes; a dash where one was not measured."""
+"""Heading -> quantities, for the table of scenes."""
 
 GEL_COLUMNS = {
     "dots found, beyond, %": ("dots_found", "dots_beyond"),
@@ -66,7 +61,7 @@ GEL_COLUMNS = {
     "centre, px": ("label_distance_p50",),
     "direction, median, worst, deg": ("line_angle_p50", "line_angle_max"),
 }
-"""The same for recordings of gels."""
+"""Heading -> quantities, for the table of gels."""
 
 
 def sections(result: BenchResult) -> list[Section]:
@@ -78,7 +73,7 @@ def sections(result: BenchResult) -> list[Section]:
         f"medians; one copy of a raw frame of 800 x 600 px took {result.copy_ms:.3f} ms."
     )
     groups = dict.fromkeys(m.group for m in result.measured)
-    found = [Section("Machine", summary), *(methods(result, group) for group in groups)]
+    found = [Section("Machine", summary), *(_methods(result, group) for group in groups)]
     found += [_scenes(result), *_recordings(result), *_gels(result)]
     if result.failures:
         rows = [[key, why.partition("\n")[0]] for key, why in result.failures.items()]
@@ -86,67 +81,63 @@ def sections(result: BenchResult) -> list[Section]:
     return found
 
 
-def methods(result: BenchResult, group: str) -> Section:
-    """One row per method of a group: median over the simulated scenes, in brackets the worst one."""
-    simulated = [m for m in result.measurements(group) if not m.scene.startswith(RECORDING)]
+def _methods(result: BenchResult, group: str) -> Section:
+    """One row per method of a group."""
+    simulated = [m for m in result.measurements(group) if m.simulated]
     quantities = [QUANTITIES[key] for key in PRIMARY.get(group, ())]
     heads = ["method", "contact, ms", "copies", "idle, ms", "copies", *(q.heading for q in quantities)]
     rows = []
     for method in dict.fromkeys(m.method for m in simulated):
-        own = [m for m in simulated if m.method == method]
+        own = [m.values for m in simulated if m.method == method]
         row = [method]
         for key in TIMES.values():
-            times = [m.values[key] for m in own if key in m.values]
-            row += [format_number(median(times) / unit) if times else "-" for unit in (1.0, result.copy_ms)]
+            times = [values[key] for values in own if key in values]
+            row += [_number(median(times) / unit) if times else "-" for unit in (1.0, result.copy_ms)]
         for quantity in quantities:
-            values = [m.values[quantity.key] for m in own if quantity.key in m.values]
-            worst = max(values, key=quantity.distance, default=0.0)
-            row.append(f"{format_number(median(values))} ({format_number(worst)})" if values else "-")
+            errors = [values[quantity.key] for values in own if quantity.key in values]
+            worst = max(errors, key=quantity.distance, default=0.0)
+            row.append(f"{_number(median(errors))} ({_number(worst)})" if errors else "-")
         rows.append(row)
     text = "Median over the simulated scenes, in brackets the worst one."
     return Section(TITLES.get(group, group), text, tables=[Table(heads, rows)])
 
 
 def _scenes(result: BenchResult) -> Section:
+    """One row for each pipeline on each simulated scene."""
     rows = [
-        [m.scene, m.method, _time(m), *_cells(m, SCENE_COLUMNS.values())]
-        for m in result.measurements(PIPELINE)
-        if not m.scene.startswith(RECORDING)
+        [m.scene, m.method, *_cells(m, SCENE_COLUMNS)] for m in result.measurements(PIPELINE) if m.simulated
     ]
-    table = Table(["scene", "pipeline", "ms", *SCENE_COLUMNS], rows)
     text = f"Time of a frame with contact, and mean errors. `{CLASSIC}` is the original script."
+    table = Table(["scene", "pipeline", "ms", *SCENE_COLUMNS], rows)
     return Section("Whole pipelines, scene by scene", text, tables=[table])
 
 
 def _recordings(result: BenchResult) -> Iterator[Section]:
-    """One row for each recording of the Wedge and each pipeline."""
-    gels = {RECORDING + gel.folder for gel in GELS}
+    """One row for each pipeline on the recordings of the Wedge."""
     rows = []
     for m in result.measured:
-        if m.scene.startswith(RECORDING) and m.scene not in gels:
-            errors = (f"{QUANTITIES[key].heading}: {format_number(v)}" for key, v in m.errors.items())
-            rows.append([m.scene.removeprefix(RECORDING), m.method, _time(m), "; ".join(errors)])
+        if not m.simulated and m.recording not in {gel.folder for gel in GELS}:
+            errors = (f"{QUANTITIES[key].heading}: {_number(v)}" for key, v in m.errors.items())
+            rows.append([m.recording, m.method, *_cells(m, {}), "; ".join(errors)])
     if rows:
         yield Section("Real recordings", tables=[Table(["recording", "pipeline", "ms", "errors"], rows)])
 
 
 def _gels(result: BenchResult) -> Iterator[Section]:
     """One row for each recording of a gel, with the half of the sensors that it belongs to."""
-    by_scene: dict[str, list[Measurement]] = {}
-    for m in result.measurements(PIPELINE):
-        by_scene.setdefault(m.scene.removeprefix(RECORDING), []).append(m)
     rows = []
     for gel in GELS:
-        if gel.folder not in by_scene:
+        measured = [m for m in result.measurements(PIPELINE) if m.recording == gel.folder]
+        if not measured:
             continue
-        m, *refused = by_scene[gel.folder]
+        m, *refused = measured
         dots = "?" if gel.dots is None else str(gel.dots)
         if refused:
             false_markers = refused[0].values["markers_false"]
             dots += ", refused" if not false_markers else f", took {false_markers:g} for dots"
         half = "chosen on" if gel.chosen else "test"
         frames = f"{m.values['frames']:g}"
-        rows.append([gel.folder, gel.sensor, half, frames, dots, *_cells(m, GEL_COLUMNS.values())])
+        rows.append([gel.folder, gel.sensor, half, frames, dots, *_cells(m, GEL_COLUMNS)[1:]])
     if rows:
         text = (
             "With the settings as they are shipped, but for `rotate: 0` and a `downsample` of 1 or 2. "
@@ -157,47 +148,14 @@ def _gels(result: BenchResult) -> Iterator[Section]:
         yield Section("Real gels of many labs", text, tables=[Table(heads, rows)])
 
 
-def _time(measurement: Measurement) -> str:
-    return "-" if measurement.time_ms is None else format_number(measurement.time_ms)
-
-
-def _cells(measurement: Measurement, columns: Iterable[Sequence[str]]) -> list[str]:
+def _cells(measurement: Measurement, columns: dict[str, tuple[str, ...]]) -> list[str]:
+    """The time, ms, and the quantities of each column; a dash where one was not measured."""
     values = measurement.values
-    return [", ".join(format_number(values[k]) if k in values else "-" for k in keys) for keys in columns]
+    time = "-" if measurement.time_ms is None else _number(measurement.time_ms)
+    cells = (", ".join(_number(values[k]) if k in values else "-" for k in keys) for keys in columns.values())
+    return [time, *cells]
 
 
-def print_sections(found: Sequence[Section], console: Console) -> None:
-    """Print text and tables; long cells are folded, nothing is cut."""
-    for section in found:
-        console.print(f"\n[bold]{section.title}[/bold]", highlight=False)
-        if section.text:
-            console.print(section.text, markup=False, highlight=False)
-        for table in section.tables:
-            drawn = RichTable()
-            for column in table.columns:
-                drawn.add_column(column, overflow="fold")
-            for row in table.rows:
-                drawn.add_row(*map(str, row))
-            console.print(drawn, markup=False)
-
-
-def markdown(found: Sequence[Section]) -> str:
-    """Text and tables in Markdown."""
-    parts = []
-    for section in found:
-        parts += [f"### {section.title}", *([section.text] if section.text else [])]
-        for table in section.tables:
-            lines = [table.columns, ["---"] * len(table.columns), *table.rows]
-            cells = ([str(cell).replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines)
-            parts.append("\n".join(f"| {' | '.join(line)} |" for line in cells))
-    return "\n\n".join(parts) + "\n"
-
-
-def write_markdown(found: Sequence[Section], path: Path) -> None:
-    """Write the tables to a file; where it has the lines `BEGIN` and `END`, only between these."""
-    text = path.read_text(encoding="utf-8") if path.exists() else ""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        before, after = "", "\n"
-    path.write_text(f"{before}{BEGIN}\n\n{markdown(found)}\n{END}{after}", encoding="utf-8")
+def _number(value: float) -> str:
+    """Three significant digits, without an exponent."""
+    return np.format_float_positional(value, 3, fractional=False, trim="-")

@@ -14,11 +14,8 @@ from __future__ import annotations
 import gc
 import statistics
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import islice
-from typing import Any
 
 import cv2
 import numpy as np
@@ -47,48 +44,11 @@ def quiet() -> Iterator[None]:
             gc.enable()
 
 
-def interleaved(
-    alternatives: Mapping[str, Callable[[Any], Any]],
-    inputs: Iterable[tuple[str, Any]],
-    *,
-    see: Callable[[str, Any, Any], None] = lambda *_: None,
-    block: int = BLOCK,
-) -> dict[str, Times]:
-    """Give every input to every alternative, in turns of a few inputs, and time each call.
-
-    Parameters
-    ----------
-    alternatives : name -> callable of one input.
-    inputs : (kind of frame, input) pairs.
-    see : called after each turn, outside the timed part, with (name, input, result).
-    block : inputs in a turn; their results are kept until it ends.
-
-    Returns
-    -------
-    name -> times.
-    """
-    times: dict[str, Times] = {name: defaultdict(list) for name in alternatives}
-    waiting = iter(inputs)
-    with quiet():
-        while turn := list(islice(waiting, block)):
-            for name, call in alternatives.items():
-                results = []
-                for kind, value in turn:
-                    began = time.thread_time()
-                    results.append(call(value))
-                    times[name][kind].append(time.thread_time() - began)
-                for (_, value), result in zip(turn, results, strict=True):
-                    see(name, value, result)
-    return times
-
-
 class CopyUnit:
     """The unit "copy", to be taken again and again during a run.
 
     Source and destination come from a pool several times as large as any cache nearby, because a camera's
     frame is in memory too, and not in the cache, when it arrives. All of that memory has been written before.
-    Take many in a row, as pipelines are given many frames in a row: the first copy after other work takes a
-    fifth to a half longer than the next ones.
     """
 
     _POOL = 120
@@ -98,9 +58,9 @@ class CopyUnit:
         self._pool = [np.full((600, 800, 3), value, dtype=np.uint8) for value in range(self._POOL)]
         self._copies: list[float] = []
 
-    def take(self, repeats: int = BLOCK) -> None:
-        """Measure `repeats` copies."""
-        for _ in range(repeats):
+    def take(self) -> None:
+        """Measure `BLOCK` copies in a row: the first one after other work takes longer than the next ones."""
+        for _ in range(BLOCK):
             number = len(self._copies)
             source, target = (self._pool[(number + step) % self._POOL] for step in (0, self._POOL // 2))
             began = time.perf_counter()

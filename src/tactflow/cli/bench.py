@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
-
-from rich.console import Console
 
 from tactflow.bench.pipelines import CLASSIC
 from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import load_errors, regressions
 from tactflow.bench.run import DEFAULT, MARKERLESS, WEDGE, Plan, run_bench
-from tactflow.bench.tables import print_sections, sections, write_markdown
+from tactflow.bench.tables import sections
 from tactflow.cli.options import refuse_output, writing
-from tactflow.cli.terminal import notes, progress_bar, say
+from tactflow.cli.terminal import notes, progress_bar, say, show
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
+from tactflow.report import markdown
 from tactflow.system.extras import missing
 
 WORSE = 3
 """Exit code when `--against` finds something worse."""
-
-PIPED_WIDTH = 200
-"""Columns of tables in a file or a pipe: enough for the widest without folding most cells."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,12 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--html", type=Path, metavar="PATH", help="write the report with plots here, as one HTML file")
     add(
-        "--markdown",
-        type=Path,
-        metavar="PATH",
-        help="write tables for a page of documentation; an existing page keeps the rest of its text",
-    )
-    add(
         "--pictures",
         type=Path,
         metavar="DIR",
@@ -74,9 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--against",
         type=Path,
         metavar="FILE",
-        help="compare the errors with a stored result; exit code 3 if one got worse than its tolerance",
+        help="compare the errors with those of an earlier --json; exit code 3 if one exceeds its tolerance",
     )
-    add("--write-baseline", type=Path, metavar="FILE", help="write the errors alone, for --against")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -84,19 +72,16 @@ def run(args: argparse.Namespace) -> int:
     stored = None if args.against is None else load_errors(args.against, quick=args.quick)
     if args.html is not None and (problem := missing("--html", "plot", ["matplotlib"])):
         raise ConfigError(problem)
-    for name in ("json", "html", "write_baseline", "markdown"):
+    for name in ("json", "html"):
         if getattr(args, name) is not None:
-            refuse_output(f"--{name.replace('_', '-')}", getattr(args, name), overwrite=True)
+            refuse_output(f"--{name}", getattr(args, name), overwrite=True)
     scenes = frozenset(args.scene) if args.scene else None
     plan = Plan(_files(args.pipelines), args.quick, args.data, scenes, args.pictures)
     with notes("ERROR"), progress_bar("rendering") as update:
         result = run_bench(plan, lambda what, n, total: update(description=what, completed=n, total=total))
-    found = sections(result)
-    print_sections(found, Console(width=None if sys.stdout.isatty() else PIPED_WIDTH))
+    show(markdown(sections(result)))
     _write(args.json, result.save)
-    _write(args.write_baseline, result.save_errors)
     _write(args.html, lambda path: write_bench_report(result, path))
-    _write(args.markdown, lambda path: write_markdown(found, path))
     if stored is None:
         return 0
     worse = regressions(result, stored, scenes)

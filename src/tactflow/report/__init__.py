@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -77,6 +77,31 @@ def write_report(path: Path, title: str, sections: Iterable[Section], text: str 
     except OSError as error:
         raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path
+
+
+def markdown(sections: Iterable[Section]) -> Iterator[str]:
+    """Lines of the text and tables of sections in Markdown, with aligned columns.
+
+    >>> speed = Table(["method", "time, ms"], [["fast", 1.25], ["exact", 31]])
+    >>> print(*markdown([Section("Times", tables=[speed])]), sep="\\n")
+    ### Times
+    <BLANKLINE>
+    | method | time, ms |
+    | ------ | -------- |
+    | fast   | 1.25     |
+    | exact  | 31       |
+    <BLANKLINE>
+    """
+    for section in sections:
+        yield from (f"### {section.title}", "", *([*section.text.splitlines(), ""] if section.text else []))
+        for table in section.tables:
+            lines = [table.columns, *table.rows]
+            cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines]
+            widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+            cells.insert(1, ["-" * width for width in widths])
+            for line in cells:
+                yield f"| {' | '.join(map(str.ljust, line, widths))} |"
+            yield ""
 
 
 def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (4.8, 3.0), **options: Any) -> Any:
