@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 
 from tactflow.cli.main import main
 from tactflow.sim import open_scene
-from tactflow.sources import open_source
+from tactflow.sources import Arrival, open_source
 from tests.cli.kill_me import image
 from tests.clock import until
 
@@ -81,7 +81,7 @@ def test_replay_is_equal_across_a_new_reference(tmp_path: Path) -> None:
         replay=("--set", "sinks.again=null"),
     )
     assert len(results) == 40
-    epochs = {stamp.epoch for stamp in stamps(tmp_path / "a.mcap")}
+    epochs = {frame.epoch for frame in frames_of(tmp_path / "a.mcap")}
     assert epochs == {0, 1}
 
 
@@ -89,12 +89,11 @@ def test_replay_is_equal_with_a_reference_from_an_image_file(tmp_path: Path) -> 
     cv2.imwrite(str(tmp_path / "gel.png"), open_scene("press?frames=2").frame(0))
     reference = ("--set", f"stages.capture.reference={tmp_path / 'gel.png'}")
     record_and_replay(tmp_path, "--source", "sim:press?frames=40", *reference)
-    assert [stamp.seq for stamp in stamps(tmp_path / "a.mcap")] == [-1, *range(40)]
+    assert [frame.seq for frame in frames_of(tmp_path / "a.mcap")] == [-1, *range(40)]
 
 
-def stamps(path: Path) -> list[Any]:
-    source = open_source(str(path))
-    return [item[2] for item in iter(source.read_stamped, None)]  # type: ignore[attr-defined]
+def frames_of(path: Path) -> list[Arrival]:
+    return list(iter(open_source(str(path)).read_arrival, None))
 
 
 @pytest.mark.parametrize(
@@ -121,7 +120,7 @@ def test_number_records_beside_what_is_there_and_overwrite_replaces_it(tmp_path:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a-001.mcap", "a-002.mcap", "a.mcap"]
     out.write_bytes(b"old")
     assert main([*command[:-1], "--overwrite"]) == 0
-    assert len(stamps(out)) == 2
+    assert len(frames_of(out)) == 2
 
 
 def test_a_kill_at_any_moment_loses_no_frame_that_was_written(tmp_path: Path) -> None:
@@ -165,9 +164,9 @@ def pixels_are_right(path: Path) -> int:
     """Play a recording of `kill_me`; the number of frames."""
     source = open_source(str(path))
     count = 0
-    for pixels, _, stamp in iter(source.read_stamped, None):  # type: ignore[attr-defined]
-        assert stamp.seq == count
-        assert np.array_equal(pixels, image(stamp.seq))
+    for frame in iter(source.read_arrival, None):
+        assert frame.seq == count
+        assert np.array_equal(frame.image, image(frame.seq))
         count += 1
     return count
 
@@ -205,7 +204,7 @@ def test_repair_can_write_elsewhere_and_replaces_nothing_unasked(
     assert out.read_bytes() == data
     with copy.open("rb") as file:
         assert make_reader(file).get_summary() is not None
-    assert len(stamps(copy)) == 3
+    assert len(frames_of(copy)) == 3
 
 
 @pytest.mark.parametrize(("content", "words"), [(b"no", "is not an MCAP file"), (None, "no such file")])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tactflow.cli.main import main
 from tactflow.doctor import examine, observe
 from tactflow.sim import open_scene
+from tactflow.sources import FrameReader
 from tactflow.sources.devices import Camera
 from tactflow.system.signals import ending_handled, interrupt
 from tests.vision.dots import grid, render
@@ -117,19 +118,13 @@ def test_missing_and_repeated_frames_of_a_camera_are_counted(
     times = np.delete(np.arange(FRAMES + 4) / 30.0, [5, 6, 7, 20])
     frames = [clean[max(0, index - index % 4)] for index in range(FRAMES)]
 
-    class Stuttering:
-        live, fps, size, total, description = True, 30.0, (400, 300), None, "a camera"
+    class Stuttering(FrameReader):
+        live, fps = True, 30.0
 
-        def __init__(self) -> None:
-            self._frames = iter(zip(frames, times, strict=True))
+        def _frames(self) -> Iterator[tuple[Image, float]]:
+            return zip(frames, times, strict=True)
 
-        def read(self) -> tuple[Image, float] | None:
-            return next(self._frames, None)
-
-        def close(self) -> None:
-            pass
-
-    monkeypatch.setattr("tactflow.doctor.observation.open_source", lambda _: Stuttering())
+    monkeypatch.setattr("tactflow.doctor.observation.open_source", lambda _: Stuttering("a camera"))
     found = {finding.name: finding for finding in examine(observe("0", 1.0))}
     assert found["drop-outs"].verdict == "fault"
     assert "4 of " in found["drop-outs"].says

@@ -15,7 +15,6 @@ import zmq
 
 from tactflow.cli.main import main
 from tactflow.sources import open_source
-from tactflow.sources.mcap import Recording
 from tests.clock import PATIENCE, until
 
 GRAPH = """
@@ -52,8 +51,7 @@ def rows(path: Path) -> list[dict[str, object]]:
 def numbers(path: Path) -> list[int]:
     """Of the frames in a recording."""
     source = open_source(str(path))
-    assert isinstance(source, Recording)
-    found = [stamp.seq for _, _, stamp in iter(source.read_stamped, None)]
+    found = [frame.seq for frame in iter(source.read_arrival, None)]
     source.close()
     return found
 

@@ -23,7 +23,6 @@ from tactflow.network.remote_control import RemoteControl
 from tactflow.sinks.record import Record
 from tactflow.sinks.zmq import Zmq
 from tactflow.sources import open_source
-from tactflow.sources.mcap import Recording
 from tests.clock import PATIENCE, until
 
 ANY_PORT = "tcp://127.0.0.1:*"
@@ -71,8 +70,7 @@ def test_a_run_carries_out_commands_and_answers(tmp_path: Path, monkeypatch: pyt
         runner.stop()
         thread.join()
     recording = open_source("touch-001.mcap")
-    assert isinstance(recording, Recording)
-    epochs = [stamp.epoch for _, _, stamp in iter(recording.read_stamped, None)]
+    epochs = [frame.epoch for frame in iter(recording.read_arrival, None)]
     recording.close()
     assert epochs[0] == 0
     assert epochs[-1] == 1

@@ -20,9 +20,7 @@ from tactflow.engine.run import Runner
 from tactflow.message.result import Result
 from tactflow.recording.frames import parse_frame
 from tactflow.sinks.record import Record
-from tactflow.sources import open_source
-from tactflow.sources.base import Stamp
-from tactflow.sources.mcap import Recording
+from tactflow.sources import Arrival, open_source
 from tactflow.vision.types import Contact
 
 FPS = 10.0
@@ -49,22 +47,21 @@ def write(sink: Record, seqs: range, contact: Contact | None = None) -> None:
             sink.write(Result(frame_of(seq), {"contact": contact}))
 
 
-def stamped(path: Path) -> list[tuple[NDArray[np.uint8], float, Stamp]]:
+def stored(path: Path) -> list[Arrival]:
     """The frames of a recording."""
     source = open_source(str(path))
-    assert isinstance(source, Recording)
-    found = list(iter(source.read_stamped, None))
+    found = list(iter(source.read_arrival, None))
     source.close()
     return found
 
 
 def seqs_in(path: Path) -> list[int]:
     """The frames of a recording, after comparing their pixels with what was written."""
-    for pixels, t, stamp in (found := stamped(path)):
-        np.testing.assert_array_equal(pixels, image(stamp.seq))
-        assert t == stamp.seq / FPS
-        assert stamp.reference == (stamp.seq == 0)
-    return [stamp.seq for *_, stamp in found]
+    for frame in (found := stored(path)):
+        np.testing.assert_array_equal(frame.image, image(frame.seq))
+        assert frame.t == frame.seq / FPS
+        assert frame.reference == (frame.seq == 0)
+    return [frame.seq for frame in found]
 
 
 def test_a_file_is_replaced_with_overwrite_and_counted(tmp_path: Path) -> None:
@@ -180,11 +177,11 @@ def test_a_ring_across_two_epochs_brings_the_references_of_the_older_one(tmp_pat
         sink.write(Result(frame))
     sink.start_recording()
     sink.close()
-    stamps = [stamp for *_, stamp in stamped(tmp_path / "ring-001.mcap")]
-    assert [stamp.seq for stamp in stamps] == [0, 1, *range(19, 30)]
-    assert [stamp.seq for stamp in stamps if stamp.reference] == [0, 1, 25]
-    assert [stamp.epoch for stamp in stamps] == [0] * 8 + [1] * 5
-    assert [stamp.seq for stamp in stamps if not stamp.paced] == [0, 1]
+    frames = stored(tmp_path / "ring-001.mcap")
+    assert [frame.seq for frame in frames] == [0, 1, *range(19, 30)]
+    assert [frame.seq for frame in frames if frame.reference] == [0, 1, 25]
+    assert [frame.epoch for frame in frames] == [0] * 8 + [1] * 5
+    assert [frame.seq for frame in frames if not frame.paced] == [0, 1]
 
 
 def test_without_the_extra_the_error_says_what_to_install(
@@ -245,10 +242,10 @@ def test_a_recording_in_several_files_is_the_same_as_in_one(rotation: dict[str, 
     assert [m for path in files for m in messages_in(path)] == messages_in(tmp_path / "whole.mcap")
     assert parts.counters()["files"] == len(files)
     for path, begins in zip(files, np.cumsum([0, *lengths[:-1]]), strict=True):
-        stamps = [stamp for *_, stamp in stamped(path)]
+        frames = stored(path)
         references = [0, 1] if begins <= 11 else [11]
-        assert [stamp.seq for stamp in stamps if stamp.reference][: len(references)] == references
-        assert stamps[0].reference, "each file begins with the references of its first frame"
+        assert [frame.seq for frame in frames if frame.reference][: len(references)] == references
+        assert frames[0].reference, "each file begins with the references of its first frame"
 
 
 def test_a_run_loses_no_frame_where_one_file_ends_and_the_next_begins(tmp_path: Path) -> None:

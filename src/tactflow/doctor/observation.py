@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.doctor.measures import REGULAR, Gray, Image, Pair, exposure, grey, jpeg_step
 from tactflow.engine.errors import SourceError
-from tactflow.sources import StampedReader, open_source
-from tactflow.sources.base import FrameReader
+from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.devices import Camera
 from tactflow.sources.files import ArrayFile, ImageFiles
 from tactflow.vision.geometry.valid_area import valid_area
@@ -158,10 +157,10 @@ def _read(
     last_seq: int | None = None
     stride = 1
     while (frame := _next(reader)) is not None:
-        image, t, seq = frame
+        image, t, seq = frame.image, frame.t, frame.seq
         if times and t - times[0] > seconds:
             return
-        if seq is not None and last_seq is not None:
+        if last_seq is not None:
             observation.missing += max(seq - last_seq - 1, 0)
         if last is not None:
             observation.repeated += bool(np.array_equal(last, image))
@@ -182,13 +181,9 @@ def _read(
         observation.stopped = f"it ended after {times[-1] - times[0]:.1f} s"
 
 
-def _next(reader: FrameReader) -> tuple[Image, float, int | None] | None:
-    """The next frame, its time, and its number if the recording has one."""
-    if not isinstance(reader, StampedReader):
-        frame = reader.read()
-        return None if frame is None else (*frame, None)
-    while (stamped := reader.read_stamped()) is not None:
-        image, t, stamp = stamped
-        if stamp.paced:
-            return image, t, stamp.seq
+def _next(reader: FrameReader) -> Arrival | None:
+    """The next frame, without those that are shown ahead of their time."""
+    while (arrival := reader.read_arrival()) is not None:
+        if arrival.paced:
+            return arrival
     return None

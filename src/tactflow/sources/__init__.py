@@ -15,12 +15,12 @@ from typing import cast
 
 from tactflow.engine.errors import SourceError
 from tactflow.recording import missing_packages
-from tactflow.sources.base import FrameReader, StampedReader
+from tactflow.sources.base import Arrival, FrameReader, StampedReader
 from tactflow.sources.devices import Camera, CameraRequest, Stream
 from tactflow.sources.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_image, open_file
 from tactflow.sources.memory import MemoryFrames
 from tactflow.sources.paths import locate, split_prefix
-from tactflow.sources.watch import Arrival, Watch, Watched
+from tactflow.sources.watch import Watch, Watched
 from tactflow.system.files import is_utf8
 from tactflow.system.plugins import plugins
 from tactflow.system.redaction import public_address

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
-from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -35,6 +35,25 @@ SHORTEST_SIDE = 2
 BgrImage = NDArray[np.uint8]
 
 
+class Arrival(NamedTuple):
+    """A frame as it came from its source.
+
+    image, t : as from `FrameReader.read`. seq, reference, epoch : as in `Frame`; seq counts all frames of a
+    live source, those that nobody took included. paced : False for a frame that is shown ahead of its time,
+    because those after it are compared with it. connection : grows by one with each reconnection that
+    delivered. captured : monotonic time (`time.perf_counter`) when it arrived, s; 0 for a recording.
+    """
+
+    image: BgrImage
+    t: float
+    seq: int
+    reference: bool = False
+    epoch: int = 0
+    paced: bool = True
+    connection: int = 0
+    captured: float = 0.0
+
+
 class FrameReader:
     """Frames, one after the other.
 
@@ -46,6 +65,9 @@ class FrameReader:
     size : (width, height) of the frames, px, or None before the first one.
     total : number of frames, or None if unknown or endless.
     description : one line for people.
+    state : of a live source: `running`, `waiting since ...` or `reconnecting since ...`.
+    missed : frames of a live source that a newer one replaced before they were read.
+    threads : native ids of threads of its own that frames arrive in.
 
     name : what messages call the source.
     """
@@ -55,6 +77,9 @@ class FrameReader:
     size: tuple[int, int] | None = None
     total: int | None = None
     description = ""
+    state = "running"
+    missed = 0
+    threads: Sequence[int] = ()
     parser_errors: tuple[type[Exception], ...] = (OSError,)
     """What `_frames` may raise on damaged data; it reaches the caller as a SourceError."""
 
@@ -63,7 +88,7 @@ class FrameReader:
         self._picture = ""
         """What messages call the picture that `_frames` yields next; its index if empty."""
         self._items: Iterator[tuple[Any, ...]] = self._converted()
-        self._peeked: deque[tuple[Any, ...] | SourceError] = deque()
+        self._count = itertools.count()
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
         """Yield every picture, as `to_bgr` takes them, and its time, s; ends at the last one."""
@@ -82,41 +107,40 @@ class FrameReader:
         SourceError
             If the next frame cannot be read.
         """
-        item = self._read()
+        item = next(self._items, None)
         return None if item is None else (item[0], item[1])
 
-    def peek(self) -> tuple[BgrImage, float] | None:
-        """The next frame that was neither read nor peeked at; `read` still returns it in its turn.
-
-        None at the end, and where reading fails: `read` then raises in its turn.
-        """
-        try:
-            item = next(self._items, None)
-        except SourceError as error:
-            self._peeked.append(error)
-            return None
+    def read_arrival(self) -> Arrival | None:
+        """Like `read`, with what `capture` needs to know of the frame."""
+        item = next(self._items, None)
         if item is None:
             return None
-        self._peeked.append(item)
+        image, t, *stamp = item
+        return Arrival(image, t, *(stamp or [next(self._count)]))
+
+    def peek(self) -> tuple[BgrImage, float] | None:
+        """The next frame, which `read` still returns in its turn; None at the end. Raises as `read`."""
+        item = next(self._items, None)
+        if item is None:
+            return None
+        self._items = itertools.chain([item], self._items)
         return item[0], item[1]
+
+    def stop(self) -> None:
+        """End a read that waits for a live source, at once. From any thread."""
 
     def close(self) -> None:
         """Release the file or device; `read` then returns None. May be called twice."""
         self._items = iter(())
-        self._peeked.clear()
 
     def _read_first(self, empty: str = "there is no picture in it") -> None:
         """Read the first frame ahead, so that `size` is known. Raises SourceError if there is none."""
-        if self.peek() is None:
-            error = self._peeked.pop() if self._peeked else None
+        try:
+            if self.peek() is None:
+                raise SourceError(f"{self.name}: {empty}")
+        except SourceError:
             self.close()
-            raise error if isinstance(error, SourceError) else SourceError(f"{self.name}: {empty}")
-
-    def _read(self) -> tuple[Any, ...] | None:
-        item = self._peeked.popleft() if self._peeked else next(self._items, None)
-        if isinstance(item, SourceError):
-            raise item
-        return item
+            raise
 
     def _converted(self) -> Iterator[tuple[Any, ...]]:
         """What `_frames` yields, with pictures in BGR and of one size."""
@@ -147,29 +171,12 @@ class FrameReader:
             raise damaged(self.name, error) from error
 
 
-class Stamp(NamedTuple):
-    """What a recording remembers of how a frame was taken.
-
-    seq, reference, epoch : as in `Frame`. paced : False for a frame that is shown ahead of its time, because
-    those after it are compared with it.
-    """
-
-    seq: int
-    reference: bool
-    epoch: int
-    paced: bool = True
-
-
 class StampedReader(FrameReader):
-    """A source whose frames went through `capture` once before; `_frames` also yields a `Stamp`.
+    """A source whose frames went through `capture` once before.
 
-    Capture then decides nothing by itself: seq, references and epochs are the recorded ones.
+    `_frames` also yields their seq, reference, epoch and paced, as in `Arrival`; capture then decides nothing
+    by itself.
     """
-
-    def read_stamped(self) -> tuple[BgrImage, float, Stamp] | None:
-        """Like `read`, with the frame's stamp."""
-        item = self._read()
-        return None if item is None else (item[0], item[1], item[2])
 
 
 class CaptureReader(FrameReader):

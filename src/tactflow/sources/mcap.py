@@ -10,7 +10,7 @@ from tactflow.engine.errors import SourceError
 from tactflow.recording.frames import RawFrame, decode_pixels, nanoseconds, parse_frame
 from tactflow.recording.reader import look_into, messages
 from tactflow.recording.records import DAMAGE, NotARecordingError
-from tactflow.sources.base import BgrImage, Stamp, StampedReader, damaged, log
+from tactflow.sources.base import BgrImage, StampedReader, damaged, log
 from tactflow.sources.paths import describe_settings, find_path, split_query
 
 SETTINGS = {"start": "SECONDS (from the beginning)"}
@@ -56,14 +56,14 @@ class Recording(StampedReader):
                 self._path,
             )
 
-    def _frames(self) -> Iterator[tuple[BgrImage, float, Stamp]]:
-        """Each frame, its time, and its stamp."""
+    def _frames(self) -> Iterator[tuple[BgrImage, float, int, bool, int, bool]]:
+        """Each frame, and what is known of it."""
         self._picture = str(self._path)
         try:
             for frame, paced in self._stored_frames():
                 self._picture = f"{self._path}, frame {frame.seq}"
                 image = decode_pixels(frame)
-                yield image, frame.t, Stamp(frame.seq, frame.reference, frame.epoch, paced)
+                yield image, frame.t, frame.seq, frame.reference, frame.epoch, paced
         except DAMAGE as error:
             raise SourceError(
                 f"{self._picture}: is damaged ({error or type(error).__name__}); "

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
+from tactflow.sources.base import Arrival
 from tactflow.system.clock import SYSTEM, Clock
 
 REST = 0.5
@@ -66,24 +66,20 @@ class Pace:
         return not self._clock.sleep(max(self._start + t - now, 0.0), self._stop)
 
 
-def paced(
-    read: Callable[[], tuple[Any, ...] | None], name: str, realtime: bool, stop: threading.Event
-) -> Iterator[Any]:
-    """What `read` returns, until None or `stop`: picture, time, s, and a `Stamp` where there is one.
+def paced(arrivals: Iterator[Arrival], name: str, realtime: bool, stop: threading.Event) -> Iterator[Arrival]:
+    """Frames of a source until its end or `stop`, with times that never run back.
 
-    Times that run back are counted on from the last one, with a warning in which the source is `name`.
+    Times that do are counted on from the last one, with a warning in which the source is `name`.
     realtime : each is returned when it is due; else as fast as it is taken.
     """
     pace = Pace(stop) if realtime else None
     latest, ahead = -math.inf, 0.0
     while not stop.is_set() and (pace is None or pace.wait_to_read()):
-        item = read()
-        if item is None:
+        arrival = next(arrivals, None)
+        if arrival is None:
             return
-        image, t, *stamp = item
-        t += ahead
-        # A frame that is shown ahead of its time does not count.
-        if not stamp or stamp[0].paced:
+        t = arrival.t + ahead
+        if arrival.paced:
             if t < latest:
                 if ahead == 0:
                     text = "%s: its times run back by %.3g s; they are counted on from there"
@@ -92,4 +88,4 @@ def paced(
             latest = t
             if pace is not None and not pace.wait_for(t):
                 return
-        yield image, t, *stamp
+        yield arrival._replace(t=t)

@@ -9,15 +9,14 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import BgrImage, FrameReader, log
+from tactflow.sources.base import Arrival, BgrImage, FrameReader, log
 from tactflow.system.clock import SYSTEM, Clock
 
 BLACK_LEVEL = 4.0
@@ -56,21 +55,6 @@ class Watch:
     silent_after: float = 0.8
     first_retry: float = 0.25
     last_retry: float = 2.0
-
-
-class Arrival(NamedTuple):
-    """A frame of a live source.
-
-    image, t : as from `FrameReader.read`; t grows strictly. seq : index among all frames of the source, those
-    that nobody took included. connection : grows by one with each reconnection that delivered. captured :
-    monotonic time (`time.perf_counter`) when it arrived, s.
-    """
-
-    image: BgrImage
-    t: float
-    seq: int
-    connection: int
-    captured: float
 
 
 @dataclass(slots=True)
@@ -118,8 +102,6 @@ class Watched(FrameReader):
         self._clock = clock
         source = opener()
         self.fps, self.size, self.description = source.fps, source.size, source.description
-        self.missed = 0
-        """Good frames that a newer one replaced before they were read."""
         self._changed = threading.Condition()
         self._stopped = threading.Event()
         self._ended = False
@@ -131,15 +113,20 @@ class Watched(FrameReader):
         self._arrived_at = self._good_at = self._lit_at = self._changed_at = clock.now()
         self._lit = False
         self._previous: BgrImage | None = None
-        self.reader = threading.Thread(
+        self._reader = threading.Thread(
             target=self._work, args=(source,), name=f"tactflow-read-{name}", daemon=True
         )
-        """The thread that frames arrive in."""
-        self.reader.start()
+        self._reader.start()
 
     @property
-    def state(self) -> str:
-        """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
+    def threads(self) -> Sequence[int]:  # type: ignore[override]
+        """The thread that reads."""
+        reader = self._reader.native_id
+        return () if reader is None else (reader,)
+
+    @property
+    def state(self) -> str:  # type: ignore[override]
+        """What is wrong, and since when."""
         fault = self._fault
         if fault is None:
             return "running"
@@ -173,7 +160,7 @@ class Watched(FrameReader):
         """Release the source. A read that hangs is given a moment; it releases it when it ends."""
         super().close()
         self.stop()
-        self.reader.join(CLOSE_SECONDS)
+        self._reader.join(CLOSE_SECONDS)
 
     def _frames(self) -> Iterator[tuple[BgrImage, float]]:
         while (arrival := self.read_arrival()) is not None:
@@ -297,7 +284,7 @@ class Watched(FrameReader):
             self._good_at = now
             self._t = max(t, float(np.nextafter(self._t, np.inf)))
             self.missed += self._newest is not None
-            self._newest = Arrival(image, self._t, self._seq, self._connection, now)
+            self._newest = Arrival(image, self._t, self._seq, connection=self._connection, captured=now)
             self._changed.notify_all()
             return False
 
