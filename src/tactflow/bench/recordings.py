@@ -36,7 +36,8 @@ def measure_presses(bench: Bench, pipelines: Mapping[str, Pipeline], folder: Pat
     ------
     SourceError : a picture cannot be read.
     """
-    rectify = load_pipeline(find_pipeline("wedge")).nodes["preprocess"].params.model_dump(exclude_unset=True)
+    wedge = load_pipeline(find_pipeline("wedge")).nodes["preprocess"]
+    rectify = wedge.params.model_dump(exclude_unset=True, by_alias=True)
     ready = {name: with_params(pipeline, "preprocess", **rectify) for name, pipeline in pipelines.items()}
     with (folder / "labels.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
