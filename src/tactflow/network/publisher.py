@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import NamedTuple
+from collections import Counter
+from functools import cache
 
 import zmq
 
@@ -29,7 +30,8 @@ class Publisher(BoundSocket):
     """A bound XPUB socket: sends from any thread to whoever has subscribed, and never waits for them.
 
     endpoint, keys, Raises : as for `BoundSocket`. backlog : messages that may wait for each subscriber.
-    send_buffer : the kernel's, per subscriber, bytes.
+    send_buffer : the kernel's, per subscriber, bytes. subscriptions : how many distinct prefixes are
+    subscribed to.
 
     >>> publisher = Publisher("tcp://127.0.0.1:*", backlog=32, send_buffer=65536)
     >>> publisher.send(b"tactflow.main {}")
@@ -41,10 +43,8 @@ class Publisher(BoundSocket):
     def __init__(self, endpoint: str, backlog: int, send_buffer: int, keys: str | None = None) -> None:
         # A socket belongs to one thread at a time.
         self._lock = threading.Lock()
-        self._prefixes: set[bytes] = set()
-        # How many subscriptions match each question: counted when one comes or goes, since anybody may
-        # subscribe a hundred thousand times.
-        self._matches: dict[_Question, int] = {}
+        self._topics: Counter[bytes] = Counter()
+        self.subscriptions = 0
         super().__init__(zmq.XPUB, endpoint, _HINT, {zmq.SNDHWM: backlog, zmq.SNDBUF: send_buffer}, keys)
 
     def next_event(self) -> bytes | None:
@@ -58,34 +58,26 @@ class Publisher(BoundSocket):
 
         topic : with the space that ends it. A subscription may be longer: it is a prefix of the message.
         """
-        question = _Question(topic, by_name)
-        # While another thread sends, the last answer is good enough.
-        if self._lock.acquire(blocking=question not in self._matches):
+        # While another thread sends, what was read last is good enough.
+        if self._lock.acquire(blocking=False):
             try:
                 self._read_events()
-                if question not in self._matches:
-                    self._matches[question] = sum(map(question.is_met_by, self._prefixes))
             finally:
                 self._lock.release()
-        return self._matches[question] > 0
-
-    @property
-    def subscriptions(self) -> int:
-        """How many distinct prefixes are subscribed to."""
-        return len(self._prefixes)
+        return not self._topics.keys().isdisjoint(_beginnings(topic, len(topic) - 1 if by_name else 0))
 
     def _read_events(self) -> None:
-        """Read subscriptions that have come since the last time; a flood of them in parts."""
+        """Count subscriptions by topic as they come and go; a flood of them is read in parts."""
         for _ in range(MOST_EVENTS):
             event = self.next_event()
             if event is None:
                 return
-            subscribed, prefix = event[:1] == b"\x01", event[1:]
-            if event[:1] not in (b"\x00", b"\x01") or subscribed == (prefix in self._prefixes):
-                continue
-            (self._prefixes.add if subscribed else self._prefixes.discard)(prefix)
-            for question in self._matches:
-                self._matches[question] += question.is_met_by(prefix) * (1 if subscribed else -1)
+            topic, space, _ = event[1:].partition(b" ")
+            change = {b"\x01": 1, b"\x00": -1}.get(event[:1], 0)
+            self._topics[topic + space] += change
+            self.subscriptions += change
+            if self._topics[topic + space] == 0:
+                del self._topics[topic + space]
 
     def wait_for(self, topic: bytes, seconds: float) -> bool:
         """Wait until somebody has subscribed to a topic, at most so long; whether somebody has."""
@@ -103,16 +95,10 @@ class Publisher(BoundSocket):
     def close(self, linger: float = 0.0) -> None:
         """Deliver what is under way, for at most `linger` seconds, and free the address. May come twice."""
         with self._lock:
-            self._prefixes.clear()
-            self._matches = dict.fromkeys(self._matches, 0)
+            self._topics.clear()
             super().close(linger)
 
 
-class _Question(NamedTuple):
-    topic: bytes
-    by_name: bool
-
-    def is_met_by(self, prefix: bytes) -> bool:
-        if self.by_name:
-            return prefix.startswith(self.topic.rstrip())
-        return prefix.startswith(self.topic) or self.topic.startswith(prefix)
+@cache
+def _beginnings(topic: bytes, shortest: int) -> frozenset[bytes]:
+    return frozenset(topic[:length] for length in range(shortest, len(topic) + 1))
