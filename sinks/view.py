@@ -101,7 +101,7 @@ class View(Guiding):
         self._last: tuple[Result, Valid | None, float] | None = None
 
     @classmethod
-    def among(cls, params: View.Params, folder: Path) -> View.Params:
+    def among(cls, params: View.Params, folder: Path, address: str | None) -> View.Params:  # noqa: ARG003
         """Its page shows a tab for each of the others."""
         return params.changed(neighbours=str(folder))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from pathlib import Path
 
 import numpy as np
 import orjson
@@ -180,8 +181,10 @@ class Zmq(Sink):
         return Publication(params.endpoint, params.backlog, params.keys, params.linger)
 
     @classmethod
-    def publish_at(cls, params: Zmq.Params, address: str) -> Zmq.Params:
+    def among(cls, params: Zmq.Params, folder: Path, address: str | None) -> Zmq.Params:  # noqa: ARG003
         """With another endpoint, of this machine alone: it is the relay that asks for keys."""
+        if address is None:
+            return params
         kept = params.commanders if params.control is not None else params.control_keys
         return params.changed(endpoint=address, keys=None, control_keys=kept)
 

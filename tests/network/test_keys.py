@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
+from tactflow.engine.contract import Publication
 from tactflow.engine.errors import StageError
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import clash_problems
@@ -118,7 +119,7 @@ def test_the_relay_of_several_sensors_requires_keys_and_their_own_processes_need
     finder.close()
     try:
         with (
-            relay(finder.endpoint, [sensor.endpoint], 10, 0.0, str(folders[0])),
+            relay(Publication(finder.endpoint, 10, str(folders[0]), 0.0), [sensor.endpoint]),
             Subscriber(finder.endpoint, timeout=PATIENCE, keys=folders[1]) as messages,
         ):
             assert sensor.socket.recv() == b"\x01tactflow."
@@ -151,7 +152,7 @@ def test_an_address_that_other_machines_reach_needs_keys_or_an_explicit_word(end
 
 def test_among_several_sensors_commands_still_require_the_keys_of_all() -> None:
     alone = Zmq.Params(control="tcp://*:5557", keys="mine")
-    among = Zmq.publish_at(alone, "ipc:///tmp/left")
+    among = Zmq.among(alone, Path(), "ipc:///tmp/left")
     assert (among.keys, among.commanders) == (None, "mine")
 
 

@@ -9,6 +9,7 @@ from contextlib import closing
 import pytest
 import zmq
 
+from tactflow.engine.contract import Publication
 from tactflow.fleet.relay import relay
 from tactflow.network.publisher import MOST_EVENTS, SEND_BUFFER, Publisher
 from tests.clock import PATIENCE
@@ -55,7 +56,7 @@ def test_a_flood_through_the_relay_loses_no_subscription_while_a_sensor_is_busy(
     finder.close()
     with (
         closing(busy),
-        relay(finder.endpoint, [publisher.endpoint, busy.endpoint], 32, 0.0),
+        relay(Publication(finder.endpoint, 32), [publisher.endpoint, busy.endpoint]),
         zmq.Context() as context,
         context.socket(zmq.SUB) as flood,
         context.socket(zmq.SUB) as reader,

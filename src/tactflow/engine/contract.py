@@ -254,15 +254,11 @@ class Sink(Part):
         return None
 
     @classmethod
-    def publish_at(cls, params: Any, address: str) -> StageParams:
-        """The same parameters, publishing at another address; only asked of a sink that `publishes`."""
-        raise NotImplementedError(f"{cls.__name__} publishes nowhere")
-
-    @classmethod
-    def among(cls, params: Any, folder: Path) -> StageParams:  # noqa: ARG003 (for sinks with neighbours)
+    def among(cls, params: Any, folder: Path, address: str | None) -> StageParams:  # noqa: ARG003
         """The same parameters for one of several sensors that run side by side.
 
-        folder : theirs alone, for what they tell each other; removed at the end.
+        folder : theirs alone, for what they tell each other; removed at the end. address : where a sink that
+        `publishes` does so instead, if a relay publishes for all of them; else None.
         """
         kept: StageParams = params
         return kept

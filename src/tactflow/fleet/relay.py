@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 import zmq
 
+from tactflow.engine.contract import Publication
 from tactflow.network.publisher import SEND_BUFFER, Publisher
 
 POLL_MS = 100
@@ -18,33 +19,33 @@ LONGEST_END = 5.0
 
 
 @contextmanager
-def relay(
-    address: str, upstream: Sequence[str], backlog: int, linger: float, keys: str | None = None
-) -> Iterator[None]:
-    """Bind `address`, and forward messages and subscriptions while the block lasts.
+def relay(publication: Publication, upstream: Sequence[str]) -> Iterator[None]:
+    """Bind the address of a publication, and forward messages and subscriptions while the block lasts.
 
     The upstream publishers must have ended when the block ends; what they sent is still forwarded.
 
-    upstream : addresses of the publishers. backlog : messages that may wait for each subscriber.
-    linger : time to deliver the last messages, s. keys : as for `Publisher`.
+    upstream : addresses of the publishers.
 
     Raises
     ------
     StageError : the address cannot be bound, or the keys are invalid.
     """
-    publisher = Publisher(address, backlog, SEND_BUFFER, keys)
+    publisher = Publisher(publication.address, publication.backlog, SEND_BUFFER, publication.keys)
     stop = threading.Event()
     thread = threading.Thread(
-        target=_forward, args=(publisher, upstream, backlog, stop), name="tactflow-relay", daemon=True
+        target=_forward,
+        args=(publisher, upstream, publication.backlog, stop),
+        name="tactflow-relay",
+        daemon=True,
     )
     thread.start()
-    print(f"tactflow: publishing {len(upstream)} sensors on {address}", file=sys.stderr)
+    print(f"tactflow: publishing {len(upstream)} sensors on {publication.address}", file=sys.stderr)
     try:
         yield
     finally:
         stop.set()
-        thread.join(linger + LONGEST_END)
-        publisher.close(linger)
+        thread.join(publication.linger + LONGEST_END)
+        publisher.close(publication.linger)
 
 
 def _forward(publisher: Publisher, upstream: Sequence[str], backlog: int, stop: threading.Event) -> None:

@@ -20,7 +20,6 @@ from tactflow.fleet.sinks import (
     changes,
     clash_problems,
     shared_addresses,
-    sink_class,
 )
 from tactflow.fleet.supervisor import Member, Supervisor
 from tactflow.system.children import python_command
@@ -67,9 +66,9 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
         # The path of a local socket has 107 bytes at most (Linux), and TMPDIR may be longer.
         short = None if len(tempfile.gettempdir()) < 40 else "/tmp"
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-", dir=short)))
-        for group in shared:
-            upstream = [_private(scratch, sensor, node) for sensor, node in group.sinks]
-            stack.enter_context(relay(group.address, upstream, group.backlog, group.linger, group.keys))
+        for sinks, publication in shared:
+            upstream = [_private(scratch, sensor, node) for sensor, node in sinks]
+            stack.enter_context(relay(publication, upstream))
         members = []
         for sensor, pipeline in pipelines.items():
             watchdog = Watchdog(scratch / f"{sensor}.alive", request.hang_after)
@@ -94,13 +93,11 @@ def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequenc
 
 def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scratch: Path) -> list[str]:
     """Settings of one sensor's sinks that depend on the other sensors."""
-    relayed = {node.id for group in shared for name, node in group.sinks if name == sensor}
+    relayed = {node.id for sinks, _ in shared for name, node in sinks if name == sensor}
     settings = []
     for node in pipeline.sinks:
-        params = sink_class(node).among(node.params, scratch)
-        if node.id in relayed:
-            params = sink_class(node).publish_at(params, _private(scratch, sensor, node))
-        settings += changes(node, params)
+        address = _private(scratch, sensor, node) if node.id in relayed else None
+        settings += changes(node, node.component.cls.among(node.params, scratch, address))
     return settings
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from tactflow.config.overrides import as_yaml
 from tactflow.config.sensors import PLACEHOLDER
-from tactflow.engine.contract import Output, Sink, StageParams
+from tactflow.engine.contract import Output, Publication, StageParams
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.fleet.names import STREAMS
 from tactflow.system.files import is_device, status
@@ -43,19 +43,12 @@ class WatchedSink:
     @property
     def _params(self) -> StageParams:
         begun = any(_state(output) not in (None, before) for output, before in self._before.items())
-        return sink_class(self._node).on_restart(self._node.params) if begun else self._node.params
-
-
-def sink_class(node: Node) -> type[Sink]:
-    """The class of a sink."""
-    cls = node.component.cls
-    assert issubclass(cls, Sink)
-    return cls
+        return self._node.component.cls.on_restart(self._node.params) if begun else self._node.params
 
 
 def written_files(node: Node, params: StageParams) -> Sequence[Output]:
     """The files and folders that a sink declares, without devices and streams."""
-    declared: Sequence[Output] = sink_class(node).outputs(params)
+    declared: Sequence[Output] = node.component.cls.outputs(params)
     return [
         output for output in declared if str(output.path) not in STREAMS and not is_device(str(output.path))
     ]
@@ -79,10 +72,10 @@ def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
     pipelines : sensor -> its pipeline. Results may be published at one address with the same keys.
     """
     problems = [
-        f"{node.mark}  sinks.{node.id}.keys: required the same for all that publish at {group.address}"
-        for group in shared_addresses(pipelines)
-        for _, node in group.sinks
-        if (publication := sink_class(node).publishes(node.params)) and publication.keys != group.keys
+        f"{node.mark}  sinks.{node.id}.keys: required the same for all that publish at {together.address}"
+        for sinks, together in shared_addresses(pipelines)
+        for _, node in sinks
+        if node.component.cls.publishes(node.params).keys != together.keys
     ]
     owners: dict[str, str] = {}
     for sensor, pipeline in pipelines.items():
@@ -101,39 +94,34 @@ def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
     for output in written_files(node, node.params):
         advice = f"put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
         yield output.parameter, f"write {output.path}", advice
-    for parameter, address in sink_class(node).binds(node.params).items():
+    for parameter, address in node.component.cls.binds(node.params).items():
         advice = f"give {sensor} its own, as sensors.{sensor}.sinks.{node.id}.{parameter}"
         yield parameter, f"listen at {address}", advice
 
 
 class Shared(NamedTuple):
-    """An address at which several sinks publish.
+    """An address at which several sinks publish: (sensor, sink) of each, and what a relay does for all."""
 
-    sinks : (sensor, sink). backlog : messages. keys : as in `Publication`. linger : longest of the sinks', s.
-    """
-
-    address: str
     sinks: Sequence[tuple[str, Node]]
-    backlog: int
-    keys: str | None
-    linger: float
+    publication: Publication
 
 
 def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
     """Addresses shared by sinks of several sensors. pipelines : sensor -> its pipeline."""
-    found: dict[str, Shared] = {}
+    found: dict[str, list[tuple[str, Node, Publication]]] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
-            publication = sink_class(node).publishes(node.params)
+            publication = node.component.cls.publishes(node.params)
             if publication is not None:
-                address = publication.address
-                before = found.get(address, Shared(address, (), 0, publication.keys, 0.0))
-                found[address] = before._replace(
-                    sinks=(*before.sinks, (sensor, node)),
-                    backlog=before.backlog + publication.backlog,
-                    linger=max(before.linger, publication.linger),
-                )
-    return [shared for shared in found.values() if len(shared.sinks) > 1]
+                found.setdefault(publication.address, []).append((sensor, node, publication))
+    shared = []
+    for address, sinks in found.items():
+        if len(sinks) > 1:
+            backlog = sum(publication.backlog for *_, publication in sinks)
+            linger = max(publication.linger for *_, publication in sinks)
+            together = Publication(address, backlog, sinks[0][2].keys, linger)
+            shared.append(Shared([(sensor, node) for sensor, node, _ in sinks], together))
+    return shared
 
 
 def _plain(params: StageParams) -> dict[str, object]:

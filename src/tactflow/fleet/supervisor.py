@@ -7,8 +7,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from types import FrameType
 from typing import IO, TextIO
 
@@ -47,28 +47,14 @@ def start_process(command: Sequence[str]) -> Process:
     )
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Member:
-    """One sensor's process and its history.
-
-    command : runs the sensor. watchdog : of its heartbeat. sinks : what they have written decides with which
-    parameters the sensor is restarted.
-    process : the running one; None between two. started, start_at : when it was started, and when it may be
-    restarted, s. signals_sent : signals forwarded to the process; KILL_AT if it was killed. failures : in a
-    row. code : final exit code. readers : threads that forward its output.
-    """
+    """A sensor: the command that runs it, its heartbeat, and its sinks, which say how it is restarted."""
 
     sensor: str
     command: Sequence[str]
     watchdog: Watchdog
     sinks: Sequence[WatchedSink] = ()
-    process: Process | None = None
-    started: float = 0.0
-    start_at: float = 0.0
-    signals_sent: int = 0
-    failures: int = 0
-    code: int | None = None
-    readers: list[threading.Thread] = field(default_factory=list[threading.Thread])
 
 
 class Supervisor:
@@ -89,6 +75,7 @@ class Supervisor:
         self._signals = 0
         self._refused = False
         self._unwritten = False
+        self._readers: list[threading.Thread] = []
         # Separate locks: a blocked reader of results must not hold up messages.
         self._results, self._messages = threading.Lock(), threading.Lock()
 
@@ -99,64 +86,85 @@ class Supervisor:
         -------
         The exit code: 0 if all ended well, 130 after a second signal, else that of the first failed sensor.
         """
-        while any(member.code is None for member in members):
-            for member in members:
-                self._attend(member)
+        running = {member.sensor: self._keep_running(member) for member in members}
+        codes = dict.fromkeys(running, 0)
+        while running:
+            for sensor, steps in list(running.items()):
+                try:
+                    next(steps)
+                except StopIteration as end:
+                    codes[sensor] = end.value
+                    del running[sensor]
             self._pause(LOOK_EVERY)
-        for member in members:
-            for reader in member.readers:
-                reader.join(5)
+        for reader in self._readers:
+            reader.join(5)
         if self._signals > 1:
             return INTERRUPTED
-        return next((m.code for m in members if m.code), StageError.exit_code if self._unwritten else 0)
+        return next(filter(None, codes.values()), StageError.exit_code if self._unwritten else 0)
 
     @property
     def _ends(self) -> int:
         """Number of signals that each process should have received."""
         return max(self._signals, int(self._refused or self._unwritten))
 
-    def _attend(self, member: Member) -> None:
-        if member.code is not None:
-            return
-        if member.process is None:
-            if self._ends:
-                member.code = 0
-            elif self._clock() >= member.start_at:
-                self._start(member)
-            return
-        code = member.process.poll()
-        if code is None:
-            if self._signals >= KILL_AT and member.signals_sent < KILL_AT:
-                member.signals_sent = KILL_AT
-                member.process.kill()
-            elif member.signals_sent < self._ends:
+    def _keep_running(self, member: Member) -> Generator[None, None, int]:
+        """Run a sensor, again after each failure, until it has ended for good.
+
+        Yields while there is nothing to do. Returns the exit code.
+        """
+        failures = 0
+        while not self._ends:
+            started = self._clock()
+            code = yield from self._watch(member, self._start(member))
+            if code in (0, ConfigError.exit_code, INTERRUPTED) or self._ends:
+                # A wrong command line or file is wrong for the whole run: end the others.
+                self._refused |= code == ConfigError.exit_code
+                return self._last_code(member, code)
+            refused = next((path for sink in member.sinks if (path := sink.refused)), None)
+            if code == StageError.exit_code and refused is not None:
+                self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
+                return code
+            lasted = self._clock() - started - member.watchdog.silent
+            failures = 1 if lasted > GOOD_RUN else failures + 1
+            if failures > GIVE_UP_AFTER:
+                self._say(member, f"failed {failures} times in a row (exit code {code}); given up")
+                return self._last_code(member, code)
+            pause = min(FIRST_PAUSE * 2 ** (failures - 1), LONGEST_PAUSE)
+            self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
+            start_at = self._clock() + pause
+            while self._clock() < start_at and not self._ends:
+                yield
+        return 0
+
+    def _watch(self, member: Member, process: Process) -> Generator[None, None, int]:
+        """Forward signals to a process, and kill it if its heartbeat stops. Returns its exit code."""
+        sent = 0
+        killed = False
+        while (code := process.poll()) is None:
+            if not killed and (self._signals >= KILL_AT or self._hangs(member)):
+                killed = True
+                process.kill()
+            elif not killed and sent < self._ends:
                 # SIGINT would show a traceback in a process that is still importing. One signal at a time:
                 # two at once may be merged.
-                member.process.send_signal(signal.SIGTERM)
-                member.signals_sent += 1
-            self._look_for_life(member, member.process)
-            return
-        if member.process.stdin is not None:
-            member.process.stdin.close()
-        member.process = None
-        if code in (0, ConfigError.exit_code, INTERRUPTED) or self._ends:
-            member.code = self._last_code(member, code)
-            # A wrong command line or file is wrong for the whole run: end the others.
-            self._refused |= code == ConfigError.exit_code
-        else:
-            self._start_again(member, code)
+                process.send_signal(signal.SIGTERM)
+                sent += 1
+            yield
+        if process.stdin is not None:
+            process.stdin.close()
+        return code
 
-    def _look_for_life(self, member: Member, process: Process) -> None:
-        """Kill a process whose heartbeat has stopped."""
-        if member.signals_sent >= KILL_AT:
-            return
+    def _hangs(self, member: Member) -> bool:
+        """Whether the heartbeat of a process has stopped."""
+        watchdog, now = member.watchdog, self._clock()
         if self._results.locked() or self._messages.locked():
             # It may be blocked by our own reader.
-            member.watchdog.skip(self._clock())
-        elif member.watchdog.expired(self._clock()):
-            self._say(member, f"has hung for {member.watchdog.timeout:g} s and is killed")
-            member.signals_sent = KILL_AT
-            process.kill()
+            watchdog.skip(now)
+            return False
+        hangs = watchdog.expired(now)
+        if hangs:
+            self._say(member, f"has hung for {watchdog.timeout:g} s and is killed")
+        return hangs
 
     def _last_code(self, member: Member, code: int) -> int:
         """Exit code of a sensor that is not restarted."""
@@ -168,39 +176,21 @@ class Supervisor:
             return StageError.exit_code
         return code
 
-    def _start_again(self, member: Member, code: int) -> None:
-        """Schedule the restart after a failure, or give up."""
-        refused = next((path for sink in member.sinks if (path := sink.refused)), None)
-        if code == StageError.exit_code and refused is not None:
-            self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
-            member.code = code
-            return
-        lasted = self._clock() - member.started - member.watchdog.silent
-        member.failures = 1 if lasted > GOOD_RUN else member.failures + 1
-        if member.failures > GIVE_UP_AFTER:
-            self._say(member, f"failed {member.failures} times in a row (exit code {code}); given up")
-            member.code = self._last_code(member, code)
-            return
-        pause = min(FIRST_PAUSE * 2 ** (member.failures - 1), LONGEST_PAUSE)
-        member.start_at = self._clock() + pause
-        self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
-
-    def _start(self, member: Member) -> None:
-        kept = [text for sink in member.sinks for text in sink.overrides]
-        member.process = self._start_process(
-            [*member.command, *(word for t in kept for word in ("--set", t))]
-        )
-        member.started, member.signals_sent = self._clock(), 0
-        member.watchdog.start(member.started)
-        assert member.process.stdout is not None
-        assert member.process.stderr is not None
+    def _start(self, member: Member) -> Process:
+        """Start the process of a sensor, and the threads that forward its output."""
+        kept = [word for sink in member.sinks for text in sink.overrides for word in ("--set", text)]
+        process = self._start_process([*member.command, *kept])
+        member.watchdog.start(self._clock())
+        assert process.stdout is not None
+        assert process.stderr is not None
         for stream, target, prefix in (
-            (member.process.stdout, sys.stdout, ""),
-            (member.process.stderr, sys.stderr, f"[{member.sensor}] "),
+            (process.stdout, sys.stdout, ""),
+            (process.stderr, sys.stderr, f"[{member.sensor}] "),
         ):
             reader = threading.Thread(target=self._copy, args=(stream, target, prefix), daemon=True)
             reader.start()
-            member.readers.append(reader)
+            self._readers.append(reader)
+        return process
 
     def _copy(self, stream: IO[bytes], target: TextIO, prefix: str) -> None:
         """Forward whole lines, so that those of two processes do not mix; they may be any bytes."""
