@@ -437,8 +437,9 @@ def _run(
 
     needed : port -> the stage that gives it. page : sinks that look on. A signal such as Ctrl-C ends it.
     """
+    ports = {port.name for node in pipeline.nodes.values() for port in node.component.ports.outputs}
     for port, stage in needed.items():
-        if pipeline.last_output(port) is None:
+        if port not in ports:
             raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
     plain = replace(pipeline, skipping=False, calibration=calibration)
     name = "tactflow.calibrate"

@@ -57,7 +57,8 @@ def with_collector(
     """
     nodes = {id_: node for id_, node in pipeline.nodes.items() if sinks or node.component.kind != "sink"}
     known = {port.name for port in ports_of(kind)}
-    stages = [node for node in pipeline.nodes.values() if node.component.kind == "stage" and not _waits(node)]
+    stages = [node for node in pipeline.nodes.values() if node.component.kind == "stage"]
+    stages = [node for node in stages if not node.component.cls.on_demand]
     outputs = {
         name: ref
         for name, (ref, port) in _named_outputs(stages).items()
@@ -75,11 +76,6 @@ def with_collector(
         name, component, cls.Params(take=take), inputs, Mark(name, 0, 0), passive_inputs=passive
     )
     return replace(pipeline, nodes=nodes)
-
-
-def _waits(stage: Node) -> bool:
-    """Whether a stage waits for a sink of its own."""
-    return bool(getattr(stage.component.cls, "on_demand", False))
 
 
 def _named_outputs(stages: Sequence[Node]) -> dict[str, tuple[Ref, Port]]:

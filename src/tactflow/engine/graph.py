@@ -40,7 +40,7 @@ class Component:
 
     name: str
     kind: Kind
-    cls: type
+    cls: type[Any]
     params: type[StageParams]
     ports: Ports
     memory: Memory
@@ -153,11 +153,3 @@ class Pipeline:
     def sinks(self) -> Sequence[Node]:
         """The nodes that publish or write."""
         return [node for node in self.nodes.values() if node.component.kind == "sink"]
-
-    def last_output(self, port: str) -> Ref | None:
-        """The output of that name which comes last, as a sink at the end of the file would see it."""
-        last = None
-        for node in self.nodes.values():
-            if any(output.name == port for output in node.component.ports.outputs):
-                last = Ref(node.id, port)
-        return last

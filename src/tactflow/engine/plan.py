@@ -14,8 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from tactflow.engine.contract import Sink
-from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline
+from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline, Queue
 
 CAPTURE = "capture"
 COMPUTE = "compute"
@@ -61,7 +60,7 @@ class Plan:
     @property
     def idle(self) -> list[Node]:
         """Stages that no sink needs, without those that wait for a sink: perhaps a mistake."""
-        return [node for node in self.pruned if not getattr(node.component.cls, "on_demand", False)]
+        return [node for node in self.pruned if not node.component.cls.on_demand]
 
     @property
     def warnings(self) -> list[str]:
@@ -98,24 +97,15 @@ def demand(pipeline: Pipeline) -> dict[str, frozenset[str] | None]:
 def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
     """Prune what no sink needs, cut the rest into segments, and choose the links between them.
 
-    live : the source does not wait; its frames are dropped rather than delayed.
-
-    Raises
-    ------
-    ConfigError
-        If the segments named in the file depend on each other in a circle, or a queue is given to a node
-        that shares its segment with the node before it.
+    pipeline : without `plan_problems`. live : the source does not wait; its frames are dropped rather than
+    delayed.
     """
-    problems = plan_problems(pipeline)
-    if problems:
-        raise ConfigError("\n".join(f"{mark}  {message}" for mark, message in problems))
-    pruned, names, members, before = _cut(pipeline)
-    source = names[pipeline.source.id]
+    pruned, members, before = _cut(pipeline)
     links: list[LinkPlan] = []
     for consumer, producers in before.items():
         direct = producers - {a for producer in producers for a in _ancestors(producer, before)}
         links.extend(
-            _link(pipeline, producer, consumer, members[consumer], source, live=live)
+            _link(pipeline, producer, consumer, members, live=live)
             for producer in sorted(direct, key=list(members).index)
         )
     return Plan(pipeline, members, links, pruned)
@@ -123,61 +113,46 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
 
 def plan_problems(pipeline: Pipeline) -> list[tuple[Mark, str]]:
     """What keeps a pipeline from being planned: every mistake, at the place that is to be changed."""
-    _, _, members, before = _cut(pipeline)
+    _, members, before = _cut(pipeline)
     return [*_circles(pipeline, before, members), *_idle_queues(pipeline, members)]
 
 
-def _cut(
-    pipeline: Pipeline,
-) -> tuple[list[Node], dict[str, str], dict[str, list[str]], dict[str, set[str]]]:
-    """Pruned nodes; node -> its segment; segment -> its nodes; segment -> those directly or not before it."""
-    needed = {pipeline.source.id, *(sink.id for sink in pipeline.sinks)}
+def _cut(pipeline: Pipeline) -> tuple[list[Node], dict[str, list[str]], dict[str, set[str]]]:
+    """Pruned nodes; segment -> its nodes, beginning with the source's; segment -> those of its inputs."""
+    source = pipeline.source
+    needed = {source.id, *(sink.id for sink in pipeline.sinks)}
     # Every input comes before its user.
     for node in reversed(list(pipeline.nodes.values())):
         if node.id in needed:
             needed |= dependencies(node)
-    pruned = [node for node in pipeline.nodes.values() if node.id not in needed]
-    nodes = [node for node in pipeline.nodes.values() if node.id in needed]
-    names = _segment_names(nodes)
-    source = names[pipeline.source.id]
-    members: dict[str, list[str]] = {source: []}
-    for node in nodes:
-        members.setdefault(names[node.id], []).append(node.id)
-    before: dict[str, set[str]] = {name: set() for name in members}
-    for node in nodes:
-        mine = names[node.id]
-        before[mine] |= {names[other] for other in dependencies(node)} - {mine}
-        if mine != source and not dependencies(node):
-            before[mine].add(source)
-    return pruned, names, members, before
+    first = source.segment or CAPTURE
+    names = {source.id: first}
+    members = {first: [source.id]}
+    before: dict[str, set[str]] = {first: set()}
+    for node in pipeline.nodes.values():
+        if node.id in needed and node is not source:
+            inputs = {names[id_] for id_ in dependencies(node)} or {first}
+            name = node.segment or _segment_for(node, inputs, first, before)
+            names[node.id] = name
+            members.setdefault(name, []).append(node.id)
+            before.setdefault(name, set()).update(inputs - {name})
+    return [node for node in pipeline.nodes.values() if node.id not in needed], members, before
 
 
-def _segment_names(nodes: Sequence[Node]) -> dict[str, str]:
-    """The segment of each node, given in order of evaluation.
+def _segment_for(node: Node, inputs: set[str], first: str, before: Mapping[str, set[str]]) -> str:
+    """The segment of a node for which the file names none.
 
-    A node that names none is run by the segment that its inputs reach last, so that it never makes two
-    segments wait for each other; where its inputs come from segments side by side, it gets its own.
+    It is the segment that its inputs reach last, so that two segments never wait for each other; where its
+    inputs come from segments side by side, one of its own.
+
+    inputs : segments that they are in. first : that of the source.
     """
-    names: dict[str, str] = {}
-    before: dict[str, set[str]] = {}
-    sources = {node.segment or CAPTURE for node in nodes if node.component.kind == "source"}
-    for node in nodes:
-        inputs = {names[other] for other in dependencies(node) if other in names}
-        earlier = inputs | {a for name in inputs for a in _ancestors(name, before)}
-        last = {name for name in inputs if not any(name in _ancestors(other, before) for other in inputs)}
-        if node.segment:
-            name = node.segment
-        elif node.component.kind == "source":
-            name = CAPTURE
-        elif issubclass(node.component.cls, Sink) and node.component.cls.threaded:
-            name = node.id
-        elif last <= sources:
-            name = COMPUTE
-        else:
-            name = last.pop() if len(last) == 1 else node.id
-        names[node.id] = name
-        before.setdefault(name, set()).update(earlier - {name})
-    return names
+    if issubclass(node.component.cls, Sink) and node.component.cls.threaded:
+        return node.id
+    last = {name for name in inputs if not any(name in _ancestors(other, before) for other in inputs)}
+    if last == {first}:
+        return COMPUTE
+    return last.pop() if len(last) == 1 else node.id
 
 
 def _ancestors(name: str, before: Mapping[str, Iterable[str]]) -> set[str]:
@@ -212,38 +187,32 @@ def _circles(
 
 
 def _link(
-    pipeline: Pipeline, producer: str, consumer: str, members: Sequence[str], source: str, *, live: bool
+    pipeline: Pipeline, producer: str, consumer: str, members: Mapping[str, Sequence[str]], *, live: bool
 ) -> LinkPlan:
-    nodes = [pipeline.nodes[node_id] for node_id in members]
-    capacity: int | None = None
-    policy: FullPolicy | None = None
-    for node in nodes:
-        capacity = capacity or node.queue.capacity
-        policy = policy or node.queue.when_full
-    classes = [node.component.cls for node in nodes]
-    sinks = [cls for cls in classes if issubclass(cls, Sink)]
-    only_sinks = len(sinks) == len(classes)
-    if policy is None:
-        newest = all(sink.when_live == "latest" for sink in sinks) if only_sinks else producer == source
-        policy = "latest" if live and newest else "block"
-    if capacity is None:
-        capacity = max((sink.queue_capacity for sink in sinks), default=BLOCK_CAPACITY)
-        capacity = capacity if only_sinks else max(capacity, BLOCK_CAPACITY)
-    return LinkPlan(producer, consumer, capacity, policy)
+    nodes = [pipeline.nodes[id_] for id_ in members[consumer]]
+    queue = next((node.queue for node in nodes if node.queue != Queue()), Queue())
+    sinks = [node.component.cls for node in nodes if issubclass(node.component.cls, Sink)]
+    if len(sinks) == len(nodes):
+        capacity = max(sink.queue_capacity for sink in sinks)
+        newest = all(sink.when_live == "latest" for sink in sinks)
+    else:
+        capacity = max([BLOCK_CAPACITY, *(sink.queue_capacity for sink in sinks)])
+        newest = pipeline.source.id in members[producer]
+    policy: FullPolicy = "latest" if live and newest else "block"
+    return LinkPlan(producer, consumer, queue.capacity or capacity, queue.when_full or policy)
 
 
 def _idle_queues(pipeline: Pipeline, members: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mark, str]]:
-    for nodes in members.values():
-        queued = [n for n in (pipeline.nodes[i] for i in nodes) if n.queue.capacity or n.queue.when_full]
-        for node in queued[1:]:
-            yield (
-                node.marks.get("queue", node.mark),
-                f"{node.id}.queue: its segment has a queue already, given at {queued[0].mark} by "
-                f"{queued[0].id}; a segment has one queue in front of it",
-            )
+    """Queues with which the plan can do nothing."""
+    for ids in members.values():
+        queued = [pipeline.nodes[id_] for id_ in ids if pipeline.nodes[id_].queue != Queue()]
         for node in queued:
-            if node.component.kind == "source":
+            place = node.marks.get("queue", node.mark)
+            if node is not queued[0]:
                 yield (
-                    node.marks.get("queue", node.mark),
-                    f"{node.id}.queue: nothing comes before the source",
+                    place,
+                    f"{node.id}.queue: its segment has a queue already, given at {queued[0].mark} by "
+                    f"{queued[0].id}; a segment has one queue in front of it",
                 )
+            if node.component.kind == "source":
+                yield place, f"{node.id}.queue: nothing comes before the source"
