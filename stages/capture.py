@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ class Capture(Source):
         realtime: bool = Field(
             False, description="play a recording at its own pace, with a live camera's drop policy"
         )
-        reference: int | str = Field(
+        reference: Annotated[int, Field(ge=1, strict=True)] | Annotated[str, Field(min_length=1)] = Field(
             1,
             description="which frames show the untouched gel: the first N in steady light, N >= 1 (more "
             "average out noise), or an image file that is shown to the stages before the first frame",
@@ -97,15 +97,6 @@ class Capture(Source):
         @classmethod
         def _index_is_text(cls, value: object) -> object:
             return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-        @field_validator("reference", mode="before")
-        @classmethod
-        def _at_least_one_frame(cls, value: object) -> object:
-            if isinstance(value, bool) or not isinstance(value, int | str) or value == "":
-                raise ValueError(f"required a number of frames or an image file, got {value!r}")
-            if isinstance(value, int) and value < 1:
-                raise ValueError(f"required at least 1 frame, got {value}")
-            return value
 
     def __init__(
         self,

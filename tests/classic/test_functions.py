@@ -38,15 +38,6 @@ def test_contact_is_brighter_by_14_grey_levels_for_every_pair_of_values_in_every
         assert np.array_equal(centers, brighter_by >= BRIGHTER_BY)
 
 
-def test_brightening_in_two_channels_only_is_not_contact() -> None:
-    reference = np.full((40, 40, 3), 100, np.uint8)
-    frame = reference.copy()
-    frame[..., :2] += 50
-    assert not difference(frame, reference).any()
-    frame[..., 2] += BRIGHTER_BY
-    assert difference(frame, reference).all()
-
-
 def test_mask_marker_follows_the_description_step_by_step() -> None:
     rng = np.random.default_rng(3)
     image = np.full((121, 90, 3), 150, np.uint8)

@@ -15,7 +15,6 @@ from tactflow.classic.functions import (
     get_all_contour,
     get_convex_hull_area,
     mean_flow,
-    regress_line,
 )
 from tactflow.vision.types import Contact, Flow, Markers
 
@@ -65,10 +64,6 @@ def test_the_hull_and_its_line_are_those_of_the_script(seed: int) -> None:
     assert contact.center == middle
 
 
-def test_an_empty_mask_is_no_contact() -> None:
-    assert get_convex_hull_area(np.zeros((30, 40), np.uint8)) is None
-
-
 def test_one_pixel_is_a_point_without_area() -> None:
     mask = np.zeros((30, 40), np.uint8)
     mask[7, 11] = 255
@@ -105,12 +100,6 @@ def test_fewer_than_five_points_have_no_ellipse() -> None:
     mask = np.zeros((30, 40), np.uint8)
     mask[7:9, 11:13] = 255
     assert fit_ellipse(get_all_contour(mask)) is None
-
-
-def test_a_line_through_two_points_goes_through_both() -> None:
-    line = regress_line(np.array([[[10, 20]], [[30, 40]]], np.int32), 100)
-    assert line.angle == pytest.approx(-45, abs=1e-4)
-    assert line.slope == pytest.approx(1, abs=1e-5)
 
 
 GRID = np.stack(np.meshgrid(np.arange(10.0, 200, 15), np.arange(10.0, 160, 15)), axis=-1).reshape(-1, 2)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
-from pydantic import ValidationError
 
 from tactflow.classic import functions
 from tactflow.classic.stages import ConvexHull, Difference, FlowMask, MaskMarker, Tracker
 from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Absent, Frame
-from tactflow.sim import open_scene
-from tactflow.vision.types import Contact, Markers, MarkerStatus
+from tactflow.vision.types import Contact
 from tests.vision.dots import grid, render
 
 PIPELINE = Path(__file__).resolve().parents[2] / "pipelines" / "classic.yaml"
@@ -42,11 +39,6 @@ def test_the_pipeline_is_the_script_in_the_places_of_the_built_in_stages() -> No
     assert nodes["inpaint"].params.model_dump() == {"method": "telea", "radius": 7.0}
 
 
-def test_the_marker_mask_is_that_of_the_function() -> None:
-    image = open_scene("idle?frames=2").frame(0)
-    assert np.array_equal(MaskMarker(MaskMarker.Params()).process(image), functions.mask_marker(image))
-
-
 def test_the_difference_is_taken_from_the_last_reference_until_a_reset() -> None:
     stage = Difference(Difference.Params())
     assert not stage.process(GREY - np.uint8(50), frame(0, reference=True)).touching
@@ -58,34 +50,22 @@ def test_the_difference_is_taken_from_the_last_reference_until_a_reset() -> None
     assert not stage.process(touched(), frame(3)).touching
 
 
-def test_the_hull_has_the_area_of_the_polygon_of_pixel_centres() -> None:
-    mask = np.zeros((60, 80), np.uint8)
-    mask[10:20, 5:55] = 255
-    contact = ConvexHull(ConvexHull.Params()).process(mask)
-    assert isinstance(contact, Contact)
-    assert contact.area == 49 * 9
-    assert ConvexHull(ConvexHull.Params()).process(0 * mask) == Absent("no_contact")
-
-
-def test_the_tracker_follows_the_markers_of_its_first_frame() -> None:
+def test_the_other_stages_are_their_functions() -> None:
     centers = grid(6, 6, 30.0, corner=(25.0, 28.0), jitter=0.4)
-    stage = Tracker(Tracker.Params())
-    stage.process(render((205, 210), centers, 4.2))
-    markers = stage.process(render((205, 210), centers + np.array([3.0, 2.0]), 4.2))
-    np.testing.assert_allclose(markers.displacement, np.tile([3.0, 2.0], (36, 1)), atol=1.0)
-    assert (markers.status == MarkerStatus.TRACKED).all()
-    stage.reset()
-    assert np.abs(stage.process(render((205, 210), centers + 5, 4.2)).displacement).max() == 0
-
-
-def test_the_flow_is_cut_to_whole_pixels() -> None:
-    origin = np.array([[20.0, 15.0], [30.0, 15.0]])
-    markers = Markers(origin, origin + np.array([1.5, -0.5]), np.zeros(2, np.uint8), np.full(2, np.nan))
-    mask = np.full((40, 60), 255, np.uint8)
-    assert FlowMask(FlowMask.Params()).process(markers, mask).mean == (1.0, 0.0)
-
-
-@pytest.mark.parametrize("wrong", [{"dilate": -1}, {"dilate": 2.5}, {"dilation": 3}], ids=str)
-def test_wrong_parameters_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValidationError):
-        FlowMask.Params(**wrong)  # type: ignore[arg-type]
+    image, moved = render((205, 210), centers, 4.2), render((205, 210), centers + 3.0, 4.2)
+    mask = MaskMarker(MaskMarker.Params()).process(image)
+    assert np.array_equal(mask, functions.mask_marker(image))
+    tracker = Tracker(Tracker.Params())
+    tracker.process(image)
+    markers = tracker.process(moved)
+    flow = FlowMask(FlowMask.Params()).process(markers, mask)
+    assert flow == functions.mean_flow(markers, mask, dilate=8)
+    tracker.reset()
+    assert np.abs(tracker.process(moved).displacement).max() == 0
+    hull = ConvexHull(ConvexHull.Params())
+    contact = hull.process(mask)
+    expected = functions.get_convex_hull_area(mask)
+    assert isinstance(contact, Contact)
+    assert expected is not None
+    assert np.array_equal(contact.hull, expected.hull)
+    assert hull.process(0 * mask) == Absent("no_contact")

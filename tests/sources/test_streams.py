@@ -148,12 +148,3 @@ def test_a_stream_that_fails_is_reported_and_comes_back(
     until(lambda: len(arrivals) > count + 10)
     assert "is back after" in caplog.text
     assert [arrival.seq for arrival in arrivals] == sorted({arrival.seq for arrival in arrivals})
-
-
-def test_a_server_that_stays_away_ends_the_run_with_what_to_try(server: Server, watched: Opens) -> None:
-    reading = watched(no_frame_timeout=0.5)
-    until(lambda: reading.arrivals)
-    server.stop()
-    reading.join()
-    assert "gone, no good frame for" in reading.error
-    assert "no stream can be opened there" in reading.error

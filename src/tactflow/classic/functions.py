@@ -7,7 +7,6 @@ with `method: telea`), and the drawing of `draw_flow` and `draw_flow_mask` (the 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
@@ -29,20 +28,6 @@ _THINNEST_AXIS: Final = 1e-3
 
 _SQUARE = np.ones((5, 5), np.uint8)
 """Structuring element with which the script erodes and dilates."""
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A regression line.
-
-    angle : degrees in (-90, 90], counter-clockwise on the screen. slope : dy/dx (y down); None where
-    vertical.
-    midpoint : (x, y), px, halfway between the left and right edges of the image; any point if vertical.
-    """
-
-    angle: float
-    slope: float | None
-    midpoint: tuple[float, float]
 
 
 def mask_marker(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -154,15 +139,18 @@ def fit_ellipse(points: NDArray[np.int32]) -> Ellipse | None:
     return Ellipse((x + left, y + top), (float(max(first, second)), float(min(first, second))), angle)
 
 
-def regress_line(points: NDArray[np.int32], width: int) -> Line:
+def regress_line(points: NDArray[np.int32], width: int) -> tuple[float, float | None, tuple[float, float]]:
     """The script's line through points, by least squares of perpendicular distances.
 
-    points : (N, 1, 2) int32, px, N >= 2. width : of the image, px; the midpoint lies between the line's ends
-    at x = 0 and x = width, both truncated to whole pixels. OpenCV's single precision gives 2e-4 degrees and
+    Returns its angle, degrees in (-90, 90], counter-clockwise on the screen; its slope dy/dx (y down), None
+    where it is vertical; and (x, y), px, halfway between its ends at x = 0 and x = width, both truncated to
+    whole pixels, or any of its points if it is vertical. OpenCV's single precision gives 2e-4 degrees and
     1e-4 px.
 
+    points : (N, 1, 2) int32, px, N >= 2. width : of the image, px.
+
     >>> regress_line(np.array([[[0, 10]], [[100, 10]]], np.int32), 200)
-    Line(angle=0.0, slope=0.0, midpoint=(99.5, 10.0))
+    (0.0, 0.0, (99.5, 10.0))
     """
     # Relative to the contact, as in `fit_ellipse`.
     left, top = points.min(axis=(0, 1)).tolist()
@@ -171,10 +159,10 @@ def regress_line(points: NDArray[np.int32], width: int) -> Line:
     x, y = x + left, y + top
     angle, slope = axis_direction(math.atan2(vy, vx))
     if slope is None:
-        return Line(angle, None, (x, y))
+        return angle, None, (x, y)
     at_left = int(-x * vy / vx + y)
     at_right = int((width - x) * vy / vx + y)
-    return Line(angle, slope, ((width - 1) / 2, (at_left + at_right) / 2))
+    return angle, slope, ((width - 1) / 2, (at_left + at_right) / 2)
 
 
 def get_convex_hull_area(mask: NDArray[np.uint8]) -> Contact | None:
@@ -200,12 +188,12 @@ def get_convex_hull_area(mask: NDArray[np.uint8]) -> Contact | None:
         center = (float(vertices[0, 0]), float(vertices[0, 1]))
         return Contact(0.0, center, None, None, vertices, None, 0.0, region_area)
     area = cv2.contourArea(polygon)
-    line = regress_line(polygon, mask.shape[1])
+    angle, slope, midpoint = regress_line(polygon, mask.shape[1])
     return Contact(
         area=area,
-        center=line.midpoint,
-        angle=line.angle,
-        slope=line.slope,
+        center=midpoint,
+        angle=angle,
+        slope=slope,
         hull=vertices,
         ellipse=fit_ellipse(outline) if area > 0 else None,
         confidence=1.0,

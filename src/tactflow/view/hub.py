@@ -21,7 +21,6 @@ import orjson
 from websockets.asyncio.server import ServerConnection
 
 from tactflow.engine.control import Control
-from tactflow.engine.stats import Durations
 from tactflow.network.commands import Commands, RefusedError
 from tactflow.view.guided import Session
 
@@ -29,9 +28,6 @@ log = logging.getLogger("tactflow")
 
 STATS_SECONDS = 0.5
 """Interval at which pages receive the statistics of the run, s."""
-
-STALE_SECONDS = 1.0
-"""Maximum age of a picture shown to a newly opened page, unless the run is paused, s."""
 
 REST_MS = 250
 """Longest pause that a page on a busy machine may request before its next frame, ms."""
@@ -46,14 +42,12 @@ MAX_PAGES = 16
 class Packet(NamedTuple):
     """An encoded frame.
 
-    number : counts from 1. captured, published : `time.perf_counter` at capture, and when the sink got the
-    results, s.
+    number : counts from 1. captured : `time.perf_counter` at capture, s.
     """
 
     number: int
     data: bytes
     captured: float
-    published: float
 
 
 @dataclass(eq=False, slots=True)
@@ -129,7 +123,6 @@ class Hub:
         self._latest: Packet | None = None
         self._number = 0
         self._sent = 0
-        self._screen = Durations()
         self._end: str | None = None
         self._by_name: dict[str, Callable[[Any], Any]] = {
             "pause": lambda value: self._commands.pause(value is True),
@@ -156,19 +149,13 @@ class Hub:
         header = header + b',"number":%d}' % self._number
         # A little-endian length, the JSON header, the heights and the picture.
         data = struct.pack("<I", len(header)) + header + pixels
-        packet = Packet(self._number, data, captured, time.perf_counter())
+        packet = Packet(self._number, data, captured)
         if self.loop is not None and not self.loop.is_closed():
             self.loop.call_soon_threadsafe(self._take, packet)
 
     def counters(self) -> dict[str, int]:
-        """Statistics: open `pages`, frames `sent` to all pages, and quantiles of the time from capture to
-        acknowledgement, ms (an upper bound of the time to the screen)."""
-        result = {"pages": len(self.pages), "sent": self._sent}
-        for name, q in (("p50", 0.5), ("p99", 0.99)):
-            value = self._screen.quantile(q)
-            if value is not None:
-                result[f"screen_{name}_ms"] = round(value * 1000)
-        return result
+        """Statistics: open `pages`, and frames `sent` to all pages."""
+        return {"pages": len(self.pages), "sent": self._sent}
 
     # -- the life of a page -------------------------------------------------------------------------------
 
@@ -177,7 +164,8 @@ class Hub:
         page = Page(socket)
         page.post("hello", _text(type="hello", run=self.run_id, sensors=[self.sensor]))
         page.post("state", self.state())
-        if self._latest is not None and not self._fresh(self._latest):
+        if not (self.pages or self._paused):
+            # Made when a page was last open.
             self._latest = None
         self.pages.add(page)
         self._recount()
@@ -201,12 +189,10 @@ class Hub:
 
     def end(self) -> None:
         """Send every page the reason for the end of the run, and disconnect it."""
-        snapshot = self._commands.snapshot()
-        self._end = str(snapshot.get("end", "eos"))
+        self._end = str(self._commands.snapshot().get("end", "eos"))
         for page in self.pages:
-            page.post("stats", _text(type="stats", sensor=self.sensor, screen_ms=None, run=snapshot))
-            page.post("state", self.state())
             page.ended = True
+        self.post_stats()
 
     def post_state(self) -> None:
         """Send the current state to every page."""
@@ -216,7 +202,7 @@ class Hub:
 
     def post_stats(self) -> None:
         """Send statistics and state to the pages that are not stuck."""
-        listeners = [page for page in self.pages if not page.stuck]
+        listeners = [page for page in self.pages if page.ended or not page.stuck]
         if not listeners:
             return
         snapshot = self._commands.snapshot()
@@ -258,9 +244,9 @@ class Hub:
             if page.credit:
                 page.wake.set()
 
-    def _fresh(self, packet: Packet) -> bool:
-        paused = self.control is not None and self.control.paused
-        return paused or time.perf_counter() - packet.published < STALE_SECONDS
+    @property
+    def _paused(self) -> bool:
+        return self.control is not None and self.control.paused
 
     def _recount(self) -> None:
         self.wanted = any(page.credit for page in self.pages)
@@ -307,7 +293,7 @@ class Hub:
         before = self.shown
         self._recount()
         # While paused, no new frame would provide the layer.
-        if self.shown - before and self.control is not None and self.control.paused:
+        if self.shown - before and self._paused:
             await asyncio.to_thread(self._again)
 
     def _acknowledged(self, page: Page, message: Mapping[str, Any]) -> None:
@@ -316,9 +302,7 @@ class Hub:
         page.answered = page.sent
         # A hidden page draws when it becomes visible again, which does not count as latency.
         if message.get("late") is not True and page.captured > 0:
-            delay = time.perf_counter() - page.captured
-            page.screen_s.append(delay)
-            self._screen.add(delay)
+            page.screen_s.append(time.perf_counter() - page.captured)
         rest = message.get("rest")
         # On a busy machine shared with the browser, leave half of the time to the pipeline.
         if isinstance(rest, int) and rest > 0:
