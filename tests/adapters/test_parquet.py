@@ -17,7 +17,6 @@ import pytest
 
 from tactflow.adapters import parquet as parquet_module
 from tactflow.adapters.parquet import TABLES, Parquet
-from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.schema import message_schema
 from tactflow.vision.types import Depth, Force, Scale, Slip
@@ -139,14 +138,12 @@ def test_a_part_is_written_at_the_interval_and_can_be_read_while_the_run_goes_on
     assert sink.counters() == {"frames": 6, "parts": 2}
 
 
-def test_tables_are_refused_replaced_or_added_to(tmp_path: Path) -> None:
+def test_tables_are_replaced_or_added_to(tmp_path: Path) -> None:
     for settings, expected in (({}, [0, 1]), ({"append": True}, [0, 1, 0, 1]), ({"overwrite": True}, [0, 1])):
         sink = opened(tmp_path, **settings)
         write(sink, range(2))
         sink.close()
         assert [row["seq"] for row in rows(tmp_path, "frames")] == expected
-    with pytest.raises(StageError, match="holds tables already; set overwrite: true to replace them, append"):
-        opened(tmp_path)
 
 
 def test_the_example_of_the_page_runs(

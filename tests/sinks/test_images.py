@@ -71,9 +71,3 @@ def test_a_folder_that_holds_frames_is_refused_unless_asked(suffix: str, tmp_pat
     assert (tmp_path / f"frame-000000.{suffix}").read_bytes() == b"precious"
     run(tmp_path, [0], overwrite=True)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "frame-000000.png")), picture(0))
-
-
-def test_other_files_in_the_folder_are_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    run(tmp_path, [0])
-    assert names(tmp_path) == ["frame-000000.png", "notes.txt"]

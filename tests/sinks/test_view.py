@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import logging
 import socket
 import struct
 import threading
@@ -545,12 +544,6 @@ def test_a_taken_port_gives_way_to_the_next_free_one(view: Views, caplog: pytest
         assert sink.description not in (None, f"http://127.0.0.1:{port}/")
         assert f"port {port} is taken" in caplog.text
         assert get(sink).status == 200
-
-
-def test_the_address_is_logged(view: Views, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO, "tactflow"):
-        sink = view(token=SECRET)
-    assert caplog.messages == [f"view: {sink.description}?token={SECRET}"]
 
 
 def test_the_browser_is_opened_only_on_request(monkeypatch: pytest.MonkeyPatch, view: Views) -> None:

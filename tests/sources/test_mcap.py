@@ -87,11 +87,6 @@ def test_frames_come_back_with_seq_time_and_flags_as_they_were(
     assert ("was not finished" in caplog.text) == ("tactflow repair" in caplog.text) == cut
 
 
-def test_a_reference_image_that_was_no_part_of_the_source_comes_first_again(tmp_path: Path) -> None:
-    made = frames([-1, 0, 1, 2], references=(-1,))
-    same(captured(record(tmp_path / "a.mcap", made)), made)
-
-
 def test_a_recording_says_how_long_and_how_fast_it_is(tmp_path: Path) -> None:
     source = open_source(str(record(tmp_path / "a.mcap", frames(range(21)))))
     assert isinstance(source, StampedReader)

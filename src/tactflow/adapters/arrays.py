@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,13 +48,13 @@ class ArrayDataset(FrameReader):
         path = find_path(name, directory)
         super().__init__(f"{path}, {settings.get('dataset', '')}")
         self._swapped = settings.get("order") == "rgb"
-        self._file = file = _open(path)
+        arrays, self._close = _open(path)
         try:
-            self._array = _choose(spec, settings.get("dataset"), file.arrays, "dataset")
+            self._array = _choose(spec, settings.get("dataset"), arrays, "dataset")
             _check(self._array, self.name)
-            self.total = self._count_stored(*file.stored(self._array))
+            self.total = self._count_stored(*_stored_chunks(self._array))
             if "times" in settings:
-                self._times = self._seconds(_choose(spec, settings["times"], file.arrays, "times"))
+                self._times = self._seconds(_choose(spec, settings["times"], arrays, "times"))
             else:
                 self.fps = fps or DEFAULT_FPS
                 self._times = np.arange(self.total) / self.fps
@@ -67,7 +67,7 @@ class ArrayDataset(FrameReader):
     def close(self) -> None:
         """Close the file."""
         super().close()
-        self._file.close()
+        self._close()
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         for index, (frame, t) in enumerate(
@@ -110,83 +110,70 @@ class ArrayDataset(FrameReader):
         return seconds
 
 
-class _Hdf5:
-    """The arrays of an HDF5 file by name."""
+def _hdf5_arrays(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
+    """The arrays of an HDF5 file by name, and what closes it."""
+    import h5py  # type: ignore[import-untyped]
 
-    package, extra, what = "h5py", "hdf5", "HDF5 files"
+    file = h5py.File(path, "r")
+    arrays: dict[str, Any] = {}
 
-    def __init__(self, path: Path) -> None:
-        import h5py  # type: ignore[import-untyped]
+    def visit(name: str, item: Any) -> None:
+        # Not those whose pixels lie in other files, which may be any file of this machine.
+        if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
+            arrays[f"/{name}"] = item
 
-        file = h5py.File(path, "r")
-        self.close = file.close
-        self.arrays: dict[str, Any] = {}
-
-        def visit(name: str, item: Any) -> None:
-            # Not those whose pixels lie in other files, which may be any file of this machine.
-            if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
-                self.arrays[f"/{name}"] = item
-
-        file.visititems(visit)
-
-    @staticmethod
-    def stored(array: Any) -> tuple[Collection[int], int]:
-        """Indices of the stored chunks along the first axis, and the frames in each."""
-        if array.chunks is None:
-            return range(array.id.get_storage_size() > 0), array.shape[0]
-        found: set[int] = set()
-        array.id.chunk_iter(lambda chunk: found.add(chunk.chunk_offset[0] // array.chunks[0]))
-        return found, array.chunks[0]
+    file.visititems(visit)
+    return arrays, file.close
 
 
-class _Zarr:
-    """The arrays of a Zarr folder by name."""
+def _zarr_arrays(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
+    """The arrays of a Zarr folder by name; nothing needs to be closed."""
+    import zarr
 
-    package, extra, what = "zarr", "zarr", "Zarr files"
+    root = zarr.open(str(path), mode="r")
+    members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
+    arrays = {f"/{name}": item for name, item in members if isinstance(item, zarr.Array)}
+    return {name: array for name, array in arrays.items() if not _is_pickled(array)}, lambda: None
 
-    def __init__(self, path: Path) -> None:
-        import zarr
 
-        root = zarr.open(str(path), mode="r")
-        members = [("", root)] if isinstance(root, zarr.Array) else root.members(max_depth=None)
-        self.arrays: dict[str, Any] = {
-            f"/{name}": item
-            for name, item in members
-            if isinstance(item, zarr.Array) and not self._is_pickled(item)
-        }
+def _is_pickled(array: Any) -> bool:
+    """Whether reading a Zarr array may execute code in it: only new versions of numcodecs refuse to."""
+    codecs = (*(array.filters or ()), *(array.compressors or ()))
+    return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
 
-    @staticmethod
-    def _is_pickled(array: Any) -> bool:
-        """Whether reading an array may execute code in it: only new versions of numcodecs refuse to."""
-        codecs = (*(array.filters or ()), *(array.compressors or ()))
-        return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
 
-    @staticmethod
-    def stored(array: Any) -> tuple[Collection[int], int]:
-        """Indices of the stored chunks along the first axis, and the frames in each."""
+def _open(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
+    is_zarr = path.suffix.lower() == ".zarr"
+    if is_zarr:
+        require(path, "Zarr files", "zarr", "zarr")
+    else:
+        require(path, "HDF5 files", "hdf5", "h5py")
+    refuse_devices(path)
+    try:
+        return _zarr_arrays(path) if is_zarr else _hdf5_arrays(path)
+    except Exception as error:
+        raise damaged(str(path), error) from error
+
+
+def _stored_chunks(array: Any) -> tuple[Collection[int], int]:
+    """Indices of the stored chunks along the first axis, and the frames in each."""
+    if hasattr(array, "store"):
         # The zarr package itself would look for every chunk that may be.
         folder = Path(array.store.root, array.path)
         paths = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
         found = {int(match[1]) for path in paths if (match := ZARR_CHUNK.fullmatch(path))}
         return found, (array.shards or array.chunks)[0]
-
-    def close(self) -> None:
-        """Nothing stays open."""
-
-
-def _open(path: Path) -> _Hdf5 | _Zarr:
-    kind = _Zarr if path.suffix.lower() == ".zarr" else _Hdf5
-    require(path, kind.what, kind.extra, kind.package)
-    refuse_devices(path)
-    try:
-        return kind(path)
-    except Exception as error:
-        raise damaged(str(path), error) from error
+    if array.chunks is None:
+        return range(array.id.get_storage_size() > 0), array.shape[0]
+    found = set()
+    array.id.chunk_iter(lambda chunk: found.add(chunk.chunk_offset[0] // array.chunks[0]))
+    return found, array.chunks[0]
 
 
 def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:
-    if name is not None and f"/{name.strip('/')}" in arrays:
-        return arrays[f"/{name.strip('/')}"]
+    array = None if name is None else arrays.get(f"/{name.strip('/')}")
+    if array is not None:
+        return array
     found = [
         f"{key} ({array.dtype} {' x '.join(map(str, array.shape))})" for key, array in sorted(arrays.items())
     ]

@@ -53,7 +53,7 @@ class References:
             first = self._begin_settling()
             self._left = self._count if first is None else 0
         held: list[Arrival] = []
-        connection = 0
+        connection, failure = 0, None
         try:
             for arrival in arrivals:
                 if arrival.connection != connection and self._retakes:
@@ -68,10 +68,12 @@ class References:
                     continue
                 yield from self._released(first, held, source)
                 first, held = None, []
-        except SourceError:
+        except SourceError as error:
+            failure = error
+        if not source.live:
             yield from self._released(first, held, source)
-            raise
-        yield from self._released(first, held, source)
+        if failure is not None:
+            raise failure
 
     def marked(self, arrival: Arrival) -> Arrival:
         """The next frame, as a reference if it is one."""
