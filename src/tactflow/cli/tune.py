@@ -12,6 +12,7 @@ import orjson
 
 from tactflow.cli.options import add_json, add_overwrite, add_sensor, number, refuse_output, seconds, writing
 from tactflow.cli.terminal import notes, printable, say, show, typed
+from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.extras import missing
@@ -72,25 +73,21 @@ def run(args: argparse.Namespace) -> int:
     # Imported here: the simulator and the bench take their time.
     from tactflow.tune import report
     from tactflow.tune.recording import take
-    from tactflow.tune.search import DEFAULT, Goal, Search, impossible
-    from tactflow.tune.space import Candidate
+    from tactflow.tune.search import Goal, Search, impossible
+    from tactflow.tune.space import candidates
 
     with notes("ERROR"), tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
         folder = Path(name)
         file = find_pipeline(args.pipeline)
-        recording = take(args.source, Candidate(DEFAULT).load(file, args.sensor), folder)
-        if args.pipeline is None and recording.observation.dots is None:
+        recording = take(args.source, load_pipeline(file, sensor=args.sensor), folder)
+        dots = recording.observation.dots
+        if args.pipeline is None and dots is None:
             file = find_pipeline("markerless")
             say(f"no dots are found: starting from {file.name}")
-        search = Search(
-            file,
-            Goal(args.error, args.max_error, args.max_ms),
-            args.sensor,
-            seconds=args.budget - (time.monotonic() - began),
-            seed=args.seed,
-            say=say,
-        )
-        tuned = search.run(recording, folder)
+        known = candidates(file, recording.size, None if dots is None else dots.pitch, args.sensor)
+        goal = Goal(args.error, args.max_error, args.max_ms)
+        search = Search(goal, args.budget - (time.monotonic() - began), args.seed, say)
+        tuned = search.run(known, recording, folder)
     if args.json:
         print(orjson.dumps(report.as_json(tuned), option=orjson.OPT_NON_STR_KEYS).decode())
     else:

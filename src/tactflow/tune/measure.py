@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -47,6 +48,9 @@ DRAWS: Final = 200
 INTERVAL: Final = (5.0, 95.0)
 """Percentiles of an interval's ends."""
 
+Late = Callable[[], bool]
+"""Whether the time for an evaluation is over."""
+
 
 @dataclass
 class Interval:
@@ -86,17 +90,14 @@ class Trial:
 
 
 def judge(
-    pipelines: Mapping[str, Pipeline],
-    recordings: Sequence[Rendered],
-    seed: int,
-    late: Callable[[], bool] = lambda: False,
+    pipelines: Mapping[str, Pipeline], recordings: Sequence[Rendered], seed: int, late: Late = lambda: False
 ) -> list[Trial]:
     """Measure errors and times of pipelines on simulated recordings, in turns.
 
-    late : whether to stop; the first recording is always processed completely.
+    The first recording is always processed completely.
     """
     tallies = {name: Tally() for name in pipelines}
-    times: dict[str, Times] = {name: {} for name in pipelines}
+    times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
     scales = dict.fromkeys(pipelines, 1.0)
     failures: dict[str, str] = {}
     for number, rendered in enumerate(recordings):
@@ -116,7 +117,7 @@ def judge(
         failures |= failed
         for name, kinds in took.items():
             for kind, samples in kinds.items():
-                times[name].setdefault(kind, []).extend(samples)
+                times[name][kind] += samples
     return [
         Trial(name, failure=failures[name])
         if name in failures
@@ -127,11 +128,12 @@ def judge(
 
 def _on_sensor(pipeline: Pipeline) -> Pipeline:
     """The pipeline without the geometry of `preprocess`, except for downsampling."""
-    node = pipeline.nodes.get("preprocess")
-    if node is None:
+    if "preprocess" not in pipeline.nodes:
         return pipeline
-    params = node.params.model_dump(include={"downsample", "method"}, exclude_unset=True)
-    return with_params(pipeline, node.id, **params)
+    params = pipeline.nodes["preprocess"].params
+    return with_params(
+        pipeline, "preprocess", **params.model_dump(include={"downsample", "method"}, exclude_unset=True)
+    )
 
 
 def _trial(name: str, tally: Tally, scale: float, times: Times, seed: int) -> Trial:
@@ -185,50 +187,42 @@ def mark_unsound(trials: Sequence[Trial]) -> None:
                 trial.unsound = f"{description} {value:.3g} (best {sign * best:.3g})"
 
 
-def show_recording(
-    pipelines: Mapping[str, Pipeline], recording: Recording, late: Callable[[], bool] = lambda: False
-) -> tuple[dict[str, Times], dict[str, dict[str, float]], dict[str, str]]:
-    """Run pipelines on the recording, in turns.
+def measure_on_recording(
+    pipelines: Mapping[str, Pipeline], trials: Sequence[Trial], recording: Recording, seed: int, late: Late
+) -> bool:
+    """Run pipelines on the recording, in turns; set the times, checks and failures of their trials.
 
-    Parameters
-    ----------
-    pipelines : name -> pipeline; the first, the most expensive, is the baseline of comparisons.
-    late : whether to stop; frames processed until then are compared.
-
-    Returns
-    -------
-    times : name -> times; empty if stopped early. checks : name -> key of `CHECKS` -> value. failures : name
-        -> error message.
+    pipelines : name -> pipeline; the first, the most expensive, is the baseline of the checks. late : whether
+    to stop. Returns whether there was enough time; if not, only failures are set.
     """
-    centers: dict[str, dict[int, NDArray[np.float64] | None]] = {name: {} for name in pipelines}
+    centers: dict[str, list[NDArray[np.float64] | None]] = {name: [] for name in pipelines}
 
     def observe(name: str, result: TimedResult) -> str:
         contact, mapping = result.contact, result.mapping
-        center = None if contact is None else np.array(contact.center, np.float64)
-        if center is not None and mapping is not None:
-            center = np.array(mapping.to_raw(center))
-        centers[name][result.frame.seq] = center
+        center = None if contact is None else np.array(contact.center)
+        centers[name].append(center if center is None or mapping is None else mapping.to_raw(center))
         return "idle" if contact is None else "contact"
 
     ready = {name: on_recording(pipeline, recording.path) for name, pipeline in pipelines.items()}
     times, failures = take_turns(ready, observe, late=late)
-    good = [name for name in pipelines if name not in failures]
-    if not good or len(centers[good[0]]) < recording.frames:
-        times = {}
-    return times, {name: _compared(centers[name], centers[good[0]]) for name in good}, failures
+    done = [name for name in pipelines if name not in failures]
+    complete = bool(done) and len(centers[done[0]]) == recording.frames
+    for trial in trials:
+        trial.failure = trial.failure or failures.get(trial.name)
+        if complete and trial.name in done:
+            set_time(trial, times[trial.name], seed)
+            trial.checks = _compared(centers[trial.name], centers[done[0]])
+    return complete
 
 
 def _compared(
-    centers: Mapping[int, NDArray[np.float64] | None], baseline: Mapping[int, NDArray[np.float64] | None]
+    centers: Sequence[NDArray[np.float64] | None], baseline: Sequence[NDArray[np.float64] | None]
 ) -> dict[str, float]:
-    """Compare a pipeline with the baseline. centers, baseline : frame -> centre of its contact or None,
-    px."""
-    pairs = [(centers[seq], baseline[seq]) for seq in centers.keys() & baseline.keys()]
+    """Compare the centres of contacts with those of the baseline, px; None without contact."""
+    pairs = list(zip(centers, baseline, strict=True))
+    equal = [(here is None) == (there is None) for here, there in pairs]
+    checks = {"agreement": 100.0 * float(np.mean(equal))}
     distances = [math.dist(here, there) for here, there in pairs if here is not None and there is not None]
-    checks: dict[str, float] = {}
-    if pairs:
-        equal = [(here is None) == (there is None) for here, there in pairs]
-        checks["agreement"] = 100.0 * float(np.mean(equal))
     if distances:
         checks["distance"] = float(np.median(distances))
     return checks

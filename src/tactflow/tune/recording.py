@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.bench.lockstep import with_params
 from tactflow.doctor.measures import DIM, Pair
 from tactflow.doctor.observation import KEPT, Observation
-from tactflow.engine.errors import ConfigError, SourceError
+from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.sources import open_source
@@ -112,16 +113,10 @@ def change_between(first: Image, now: Image) -> float:
 
 def _geometry(pipeline: Pipeline) -> Callable[[Image], Image]:
     """The geometry of the pipeline's `preprocess` without downsampling, a function on (H, W, 3) uint8."""
-    node = pipeline.nodes.get("preprocess")
-    if node is None:
+    if "preprocess" not in pipeline.nodes:
         return np.array
-    params = {**node.params.model_dump(exclude_unset=True, by_alias=True), "downsample": 1}
-    try:
-        stage = node.component.cls(node.component.params.model_validate(params))
-    except ValueError as error:
-        raise ConfigError(f"stages.preprocess: {error}") from None
-
-    def transform(image: Image) -> Image:
-        return np.array(stage.process(Frame("tune", 0, 0.0, np.array(image))).image)
-
-    return transform
+    params = pipeline.nodes["preprocess"].params
+    kept = params.model_dump(exclude={"downsample"}, exclude_unset=True, by_alias=True)
+    node = with_params(pipeline, "preprocess", **kept).nodes["preprocess"]
+    process = node.component.cls(node.params).process
+    return lambda image: np.array(process(Frame("tune", 0, 0.0, np.array(image))).image)

@@ -6,26 +6,22 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import yaml
 
 from tactflow.engine.errors import ConfigError
-from tactflow.report import COLORS, Section, Table, figure, picture, write_report
+from tactflow.report import COLORS, Section, Table, figure, markdown, picture, write_report
 from tactflow.tune.measure import ANY, CHECKS, ERRORS, Interval, Trial
-from tactflow.tune.search import DEFAULT, Tuned
+from tactflow.tune.search import Tuned
+from tactflow.tune.space import ORIGINAL
 
 
 def sections(tuned: Tuned) -> list[Section]:
     """How the pipelines were measured, a table of them, and the chosen one on the recording."""
-    rounds = ", ".join(f"{count} on {frames} frames" for count, frames in tuned.rounds)
-    timed = "simulated"
-    if tuned.timed_on_recording:
-        rounds += f"; finalists on {tuned.recording.frames} frames of the recording"
-        timed = "on the recording"
+    timed = "on the recording" if tuned.timed_on_recording else "simulated"
     facts = [
         f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}",
-        f"tried: {rounds}",
         f"errors: px of the camera image, simulated; time: CPU of a frame with contact, {timed}",
         *tuned.notes,
     ]
@@ -45,19 +41,14 @@ def sections(tuned: Tuned) -> list[Section]:
     for trial in tuned.trials:
         if trial.checks and _role(tuned, trial) == "CHOSEN":
             checks = [[CHECKS[name], f"{value:.3g}"] for name, value in trial.checks.items()]
-            found.append(Section("The chosen pipeline on the recording", tables=[Table(["", ""], checks)]))
+            table = Table(["check", "value"], checks)
+            found.append(Section("The chosen pipeline on the recording", tables=[table]))
     return found
 
 
 def lines(tuned: Tuned) -> Iterator[str]:
     """The sections as lines of text."""
-    for section in sections(tuned):
-        yield from ("", f"{section.title}:", *section.text.split("\n\n"))
-        for table in section.tables:
-            rows = [[str(cell) for cell in row] for row in (table.columns, *table.rows)]
-            widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-            for row in rows:
-                yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+    return markdown(sections(tuned))
 
 
 def _cell(interval: Interval | None, digits: int) -> str:
@@ -79,14 +70,11 @@ def as_json(tuned: Tuned) -> dict[str, Any]:
         "sensor": asdict(tuned.look),
         "error": tuned.goal.kind,
         "chosen": None if tuned.chosen is None else tuned.chosen.name,
-        "settings": None if tuned.chosen is None else dict(tuned.chosen.settings),
+        "settings": None if tuned.chosen is None else tuned.chosen.settings,
         "front": tuned.front,
         "words": tuned.notes,
         "candidates": [asdict(trial) for trial in tuned.trials],
     }
-
-
-_MISSING: Final = object()
 
 
 def pipeline_text(tuned: Tuned, file: Path, out: Path) -> str:
@@ -106,11 +94,10 @@ def pipeline_text(tuned: Tuned, file: Path, out: Path) -> str:
             f"--out: {file} names files relative to itself; required a path in the same folder, such as "
             f"{file.parent / out.name}"
         )
-    changes = [
-        change for key, value in tuned.chosen.settings if (change := _set(document, key, value)) is not None
-    ]
-    header = [f"Chosen by tactflow tune for {tuned.recording.source}, from {file.name}.", ""]
-    header += changes or ["No changes: the original pipeline was chosen."]
+    header = [f"Chosen by tactflow tune for {tuned.recording.source}, from {file.name}: {tuned.chosen.name}."]
+    for key, value in tuned.chosen.settings.items():
+        _set(document, key, value)
+        header.append(f"{key}: {'removed' if value is None else value}")
     header += ["", *lines(tuned)]
     body = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None)
     # The name of a recording may contain line breaks; all lines must stay comments.
@@ -118,21 +105,15 @@ def pipeline_text(tuned: Tuned, file: Path, out: Path) -> str:
     return f"{comments}\n\n{body}"
 
 
-def _set(document: dict[str, Any], key: str, value: Any) -> str | None:
-    """Set a value, or remove it if None; return a description of the change, None if there is none."""
+def _set(document: dict[str, Any], key: str, value: Any) -> None:
+    """Set a value of the pipeline file, or remove it if None. key : as `stages.preprocess.downsample`."""
     *parents, last = key.split(".")
     for parent in parents:
-        if document.get(parent) is None:
-            document[parent] = {}
+        document[parent] = document.get(parent) or {}
         document = document[parent]
-    before = document.get(last, _MISSING)
-    if value is None:
-        document.pop(last, None)
-        return None if before is _MISSING else f"{key}: removed"
     document[last] = value
-    if before is _MISSING:
-        return f"{key}: {value}"
-    return None if before == value else f"{key}: {value}, was {before}"
+    if value is None:
+        del document[last]
 
 
 def write_page(path: Path, tuned: Tuned) -> Path:
@@ -145,22 +126,23 @@ def write_page(path: Path, tuned: Tuned) -> Path:
 
 def _plot(tuned: Tuned) -> Any:
     """Plot time against error on logarithmic axes."""
-    kind = tuned.goal.kind
     drawing, axes = figure(size=(7.2, 4.4))
     axes.set(xscale="log", yscale="log")
     axes.set_xlabel("CPU time of a frame with contact, ms")
     axes.set_ylabel("error, px of the camera image")
+    colors = {ORIGINAL: COLORS[1]}
+    if tuned.chosen is not None:
+        colors[tuned.chosen.name] = COLORS[2]
     for trial in tuned.trials:
-        if trial.failure or not 0 < trial.of(kind) < math.inf or not trial.ms.value > 0:
+        if not 0 < trial.of(tuned.goal.kind) < math.inf or not trial.ms.value > 0:
             continue
-        error, role = trial.errors[kind], _role(tuned, trial)
-        color = COLORS[2] if role == "CHOSEN" else COLORS[1] if trial.name == DEFAULT else COLORS[6]
-        spans = [[[i.value - i.low], [i.high - i.value]] for i in (trial.ms, error)]
-        axes.errorbar(trial.ms.value, error.value, spans[1], spans[0], fmt="o", color=color, elinewidth=1)
-        if role == "CHOSEN" or trial.name == DEFAULT:
-            axes.annotate(
-                trial.name, (trial.ms.value, error.value), (5, 5), textcoords="offset points", fontsize=8
-            )
+        ms, error = trial.ms, trial.errors[tuned.goal.kind]
+        bars = [[[i.value - i.low], [i.high - i.value]] for i in (error, ms)]
+        color = colors.get(trial.name, COLORS[6])
+        axes.errorbar(ms.value, error.value, *bars, fmt="o", color=color, elinewidth=1)
+        if trial.name in colors:
+            place = (ms.value, error.value)
+            axes.annotate(trial.name, place, (5, 5), textcoords="offset points", fontsize=8)
     if tuned.goal.max_ms is not None:
         axes.axvline(tuned.goal.max_ms, color="black", linestyle="--")
     if tuned.goal.max_error is not None:

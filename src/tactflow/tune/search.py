@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -12,12 +12,11 @@ from typing import Final
 import numpy as np
 
 from tactflow.bench.scenes import Case
-from tactflow.engine.errors import ConfigError, SourceError
-from tactflow.engine.graph import Pipeline
-from tactflow.tune.measure import ANY, ERRORS, Trial, judge, mark_unsound, set_time, show_recording
+from tactflow.engine.errors import SourceError
+from tactflow.tune.measure import ANY, ERRORS, Trial, judge, mark_unsound, measure_on_recording
 from tactflow.tune.recording import Recording
 from tactflow.tune.sensor import Fitted, Look, fit
-from tactflow.tune.space import Candidate, candidates
+from tactflow.tune.space import ORIGINAL, Candidate
 
 FIRST: Final = (Case("press", 24),)
 """Simulated recordings for all candidates: one contact."""
@@ -36,8 +35,6 @@ budget, so that four of five draws stay within. The full distance is expensive: 
 gel without dots."""
 FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask.method"})
 """Settings that change nothing but the mean flow."""
-DEFAULT: Final = "as given"
-"""Name of the user's original pipeline."""
 
 
 @dataclass(frozen=True)
@@ -83,19 +80,17 @@ class Tuned:
     """Result of a search.
 
     trials : of the last round, best first. front : names on the Pareto front of time and error. chosen : None
-    if no candidate is within the budgets. notes : steps skipped for lack of time. rounds : candidates and
-    simulated frames of each round. timed_on_recording : whether times were measured on the recording or on
-    simulated frames.
+    if no candidate is within the budgets. notes : steps skipped for lack of time. timed_on_recording :
+    whether times were measured on the recording or on simulated frames.
     """
 
     recording: Recording
     look: Look
     goal: Goal
-    trials: list[Trial]
-    front: list[str]
-    chosen: Candidate | None
+    trials: list[Trial] = field(default_factory=list[Trial])
+    front: list[str] = field(default_factory=list[str])
+    chosen: Candidate | None = None
     notes: list[str] = field(default_factory=list[str])
-    rounds: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
     timed_on_recording: bool = False
 
 
@@ -103,20 +98,20 @@ class Tuned:
 class Search:
     """A search for the best pipeline.
 
-    file : the user's pipeline. sensor : name of one of several, or None. seconds : time budget, checked after
-    each group of the first round, each simulated recording, and every 20 frames of the recording. seed : for
-    simulated recordings and bootstrap intervals. say : called with progress messages.
+    seconds : time budget, checked after each group of the first round, each simulated recording, and every 20
+    frames of the recording. seed : for simulated recordings and bootstrap intervals. say : called with
+    progress messages.
     """
 
-    file: Path
     goal: Goal
-    sensor: str | None = None
     seconds: float = 120.0
     seed: int = 0
     say: Callable[[str], None] = lambda _: None
 
-    def run(self, recording: Recording, folder: Path) -> Tuned:
-        """Run the search. folder : for temporary files.
+    def run(self, known: Sequence[Candidate], recording: Recording, folder: Path) -> Tuned:
+        """Run the search.
+
+        known : the candidates, most expensive first. folder : for temporary files.
 
         Raises
         ------
@@ -124,47 +119,33 @@ class Search:
             No candidate detects the contacts of the simulated sensor.
         """
         self._began, self._folder = time.monotonic(), folder
-        look = fit(recording)
-        self.say(f"fitted simulator: {look}")
-        known = self._known(recording)
-        tuned = Tuned(recording, look, self.goal, [], [], None)
-        order = [0, 1, *(2 + np.random.default_rng(self.seed).permutation(len(known) - 2))]
-        tuned.trials = self._round([known[index] for index in order], FIRST, tuned, self.seed, GROUP)
+        tuned = Tuned(recording, fit(recording), self.goal)
+        self.say(f"fitted simulator: {tuned.look}")
+        # The others in random order, as the time may be over before all were tried.
+        first = [known[0], *(c for c in known[1:] if c.name == ORIGINAL)]
+        others = [c for c in known if c not in first]
+        order = np.random.default_rng(self.seed).permutation(len(others))
+        tuned.trials = self._round([*first, *(others[index] for index in order)], FIRST, tuned, GROUP)
         finalists = self._finalists(known, tuned.trials)
-        if not finalists:
-            raise SourceError(_no_success(tuned.trials, self.goal))
         if self._is_over(0.5):
             tuned.notes.append("out of time after the first round")
             names = {candidate.name for candidate in finalists}
             tuned.trials = [trial for trial in tuned.trials if trial.name in names]
         else:
-            tuned.trials = self._round(finalists, LAST, tuned, self.seed + 100, len(finalists))
-        if not any(math.isfinite(trial.of(self.goal.kind)) for trial in tuned.trials if trial.usable):
-            raise SourceError(_no_success(tuned.trials, self.goal))
-        self._show_recording(finalists, tuned)
+            tuned.trials = self._round(finalists, LAST, tuned, len(finalists))
+        running = {trial.name for trial in tuned.trials if trial.failure is None}
+        pipelines = {c.name: c.pipeline for c in finalists if c.name in running}
+        self.say(f"{len(pipelines)} candidates on {recording.frames} frames of the recording")
+        tuned.timed_on_recording = measure_on_recording(
+            pipelines, tuned.trials, recording, self.seed, self._is_over
+        )
+        if not tuned.timed_on_recording:
+            tuned.notes.append("out of time during the recording: times are of simulated frames")
         name = self._choice(tuned)
         tuned.chosen = next((candidate for candidate in finalists if candidate.name == name), None)
         tuned.front = front(tuned.trials, self.goal.kind)
         tuned.trials = self.goal.order(tuned.trials)
         return tuned
-
-    def _known(self, recording: Recording) -> list[Candidate]:
-        """The most expensive candidate, which is the baseline of comparisons, and all others.
-
-        The original is the first or the second of them; a candidate that is the same pipeline is left out.
-        """
-        original = Candidate(DEFAULT)
-        base, dots = original.load(self.file, self.sensor), recording.observation.dots
-        found = candidates(base, recording.size, None if dots is None else dots.pitch)
-        others = [candidate for candidate in found if not self._is_pipeline(candidate, base)]
-        most_expensive = [candidate for candidate in found[:1] if candidate in others]
-        return [*most_expensive, original, *others[len(most_expensive) :]]
-
-    def _is_pipeline(self, candidate: Candidate, pipeline: Pipeline) -> bool:
-        try:
-            return candidate.load(self.file, self.sensor).nodes == pipeline.nodes
-        except ConfigError:
-            return False
 
     def _is_over(self, share: float = 1.0) -> bool:
         """Whether a fraction of the time budget has passed."""
@@ -174,72 +155,50 @@ class Search:
         """Select the most expensive, the original, the best and the front."""
         runs = {trial.name for trial in trials if trial.failure is None}
         best = [trial.name for trial in self.goal.order(trials) if trial.usable][:FINALISTS]
-        chosen = {*(candidate.name for candidate in known[:2]), *best, *front(trials, self.goal.kind)}
+        chosen = {known[0].name, ORIGINAL, *best, *front(trials, self.goal.kind)}
         return [candidate for candidate in known if candidate.name in chosen & runs]
 
     def _round(
-        self, known: Sequence[Candidate], cases: Sequence[Case], tuned: Tuned, seed: int, size: int
+        self, known: Sequence[Candidate], cases: Sequence[Case], tuned: Tuned, size: int
     ) -> list[Trial]:
         """Evaluate candidates on simulated recordings, `size` of them in turns, until half of the budget has
         passed."""
-        frames = sum(case.frames for case in cases)
-        self.say(f"{len(known)} candidates on {frames} simulated frames")
-        rendered = [Fitted(tuned.look, case, self._folder, seed + index) for index, case in enumerate(cases)]
+        self.say(f"{len(known)} candidates on {sum(case.frames for case in cases)} simulated frames")
+        rendered = [Fitted(tuned.look, case, self._folder, self.seed + case.frames) for case in cases]
         trials: list[Trial] = []
         for start in range(0, len(known), size):
             if trials and self._is_over(0.5):
                 tuned.notes.append(f"out of time after {len(trials)} of {len(known)} candidates")
                 break
-            pipelines: dict[str, Pipeline] = {}
-            for candidate in known[start : start + size]:
-                try:
-                    pipelines[candidate.name] = candidate.load(self.file, self.sensor)
-                except ConfigError as error:
-                    trials.append(Trial(candidate.name, failure=str(error)))
+            pipelines = {candidate.name: candidate.pipeline for candidate in known[start : start + size]}
             trials += judge(pipelines, rendered, self.seed, self._is_over)
-        for recording in rendered:
-            recording.path.unlink(missing_ok=True)
         mark_unsound(trials)
         if not any("flow" in trial.errors for trial in trials):
-            changed = {candidate.name for candidate in known if dict(candidate.settings).keys() & FLOW}
+            changed = {candidate.name for candidate in known if candidate.settings.keys() & FLOW}
             for trial in trials:
                 if trial.name in changed and trial.usable:
                     trial.unsound = "its mean flow could not be judged: too few dots in the contact"
-        tuned.rounds.append((len(trials), frames))
+        kind = self.goal.kind
+        if not any(trial.usable and math.isfinite(trial.of(kind)) for trial in trials):
+            reasons = [trial.failure or trial.unsound for trial in trials if not trial.usable]
+            why = reasons[0] if reasons else f"none has a {ERRORS[kind]}"
+            raise SourceError(
+                f"no pipeline works on the simulated sensor: {why}; see tactflow doctor, and tactflow detect"
+            )
         return trials
-
-    def _show_recording(self, finalists: Sequence[Candidate], tuned: Tuned) -> None:
-        """Measure times on the recording instead of simulated frames, and compare candidates without
-        truth."""
-        if self._is_over():
-            tuned.notes.append("no time left for the recording: times are of simulated frames")
-            return
-        by_name = {trial.name: trial for trial in tuned.trials if trial.failure is None}
-        good = [candidate for candidate in finalists if candidate.name in by_name]
-        self.say(f"the recording: {len(good)} candidates, {tuned.recording.frames} frames")
-        pipelines = {candidate.name: candidate.load(self.file, self.sensor) for candidate in good}
-        times, checks, failures = show_recording(pipelines, tuned.recording, self._is_over)
-        tuned.timed_on_recording = bool(times)
-        if self._is_over():
-            missing = "comparisons are incomplete" if times else "times are of simulated frames"
-            tuned.notes.append(f"out of time during the recording: {missing}")
-        for name, trial in by_name.items():
-            trial.failure = failures.get(name)
-            trial.checks = checks.get(name, {})
-            if name in times and trial.failure is None:
-                set_time(trial, times[name], self.seed)
 
     def _choice(self, tuned: Tuned) -> str | None:
         """Name of the best candidate likely to be within the budgets, else of the best nominally within."""
-        goal, kind = self.goal, self.goal.kind
+        goal = self.goal
         bound = goal.error_limit(tuned.trials)
-        fits = [trial for trial in goal.order(tuned.trials) if trial.usable and goal.keeps(trial, bound)]
-        likely = [trial for trial in fits if _upper_error(trial, kind) <= bound]
-        if fits and not likely and goal.max_error is not None:
-            tuned.notes.append("the budget lies within the interval of the chosen pipeline's error")
-        picked = (likely or fits) if goal.max_error is not None else fits
+        picked = [trial for trial in goal.order(tuned.trials) if trial.usable and goal.keeps(trial, bound)]
+        if goal.max_error is not None:
+            likely = [trial for trial in picked if _upper_error(trial, goal.kind) <= bound]
+            if picked and not likely:
+                tuned.notes.append("the budget lies within the interval of the chosen pipeline's error")
+            picked = likely or picked
         # Keep the original unless the best is significantly faster.
-        same = [trial for trial in picked if trial.name == DEFAULT and trial.ms.value <= picked[0].ms.high]
+        same = [trial for trial in picked if trial.name == ORIGINAL and trial.ms.value <= picked[0].ms.high]
         return [*same, *picked][0].name if picked else None
 
 
@@ -258,14 +217,6 @@ def front(trials: Sequence[Trial], kind: str) -> list[str]:
             least = trial.of(kind)
             names.append(trial.name)
     return names
-
-
-def _no_success(trials: Sequence[Trial], goal: Goal) -> str:
-    reasons: Iterator[str] = (
-        trial.failure or trial.unsound for trial in trials if trial.failure or trial.unsound
-    )
-    why = next(reasons, f"none has a {ERRORS[goal.kind]}")
-    return f"no pipeline works on the simulated sensor: {why}; see tactflow doctor, and tactflow detect"
 
 
 def impossible(tuned: Tuned) -> str:

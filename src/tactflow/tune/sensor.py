@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -180,26 +180,20 @@ class Fitted(Rendered):
     """
 
     def __init__(self, look: Look, case: Case, folder: Path, seed: int) -> None:
-        self.case = case
+        self._look, self._rng = look, np.random.default_rng([seed, 0x7475])
         query = "&".join(part for part in (look.query, case.query, "noise=0", f"seed={seed}") if part)
-        self.scene = open_scene(f"{case.name}?frames={case.frames}&{query}")
-        self.path = folder / f"{case.label}-{seed}.npy"
-        width, height = look.size
-        shape = (case.frames, height, width, 3)
-        self.frames = np.lib.format.open_memmap(self.path, mode="w+", dtype=np.uint8, shape=shape)
-        rng = np.random.default_rng([seed, 0x7475])
-        for index in range(case.frames):
-            frame = light(look, self.scene, index)
-            if look.blur:
-                frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), look.blur), np.float32)
-            frame += np.float32(look.noise) * rng.standard_normal(frame.shape, dtype=np.float32)
-            self.frames[index] = rounded(frame)
-        self.frames.flush()
-        self._truths: dict[Any, list[Truth]] = {}
-        self._scale = width / SIZE[0], height / SIZE[1]
+        super().__init__(replace(case, query=query), folder, look.size)
+
+    def render(self, index: int) -> Image:
+        """The frame, with blur and noise."""
+        frame = light(self._look, self.scene, index)
+        if self._look.blur:
+            frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), self._look.blur), np.float32)
+        frame += np.float32(self._look.noise) * self._rng.standard_normal(frame.shape, dtype=np.float32)
+        return rounded(frame)
 
     def truths(self, mapping: PixelMapping) -> list[Truth]:
         """Like `Rendered.truths`, for a mapping from frames of the sensor's size."""
-        sx, sy = self._scale
+        sx, sy = np.divide(self._look.size, SIZE)
         shrink = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
         return super().truths(PixelMapping(SIZE, mapping.size, mapping.matrix @ shrink))

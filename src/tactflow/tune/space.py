@@ -12,14 +12,15 @@ from tactflow.config.overrides import from_settings
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 
+ORIGINAL: Final = "as given"
+"""Name of the user's own pipeline, whatever its settings."""
 MIN_SIDE: Final = 90
 """Minimum shorter side of the processed image, px: a contact of a tenth of it covers about 60 px."""
 MIN_PITCH: Final = 6.0
 """Minimum dot pitch, processed px; the smallest on a real gel is 7 (sts_torque160)."""
 
-Settings = Mapping[str, Any]
 DOWNSAMPLE: Final = "stages.preprocess.downsample"
-AXES: Final[Mapping[str, Mapping[str, Settings]]] = {
+AXES: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {
     "preprocess": {f"downsample {k}": {DOWNSAMPLE: k} for k in (1, 2, 4)},
     "difference": {m: {"stages.difference.method": m} for m in ("noise", "colour")},
     "fusion": {"fusion": {}, "no fusion": {"stages.fusion": None}},
@@ -31,46 +32,58 @@ contact's centre is three to eight times as large (scene `press`)."""
 
 
 class Candidate(NamedTuple):
-    """A pipeline to try: its name, and the settings that it changes in the user's file."""
+    """A pipeline to try, and the settings that it changes in the user's file."""
 
     name: str
-    settings: tuple[tuple[str, Any], ...] = ()
-
-    def load(self, file: Path, sensor: str | None = None) -> Pipeline:
-        """Load the pipeline. Raises ConfigError like `load_pipeline`."""
-        return load_pipeline(file, from_settings(dict(self.settings)), sensor=sensor)
+    settings: Mapping[str, Any]
+    pipeline: Pipeline
 
 
-def candidates(pipeline: Pipeline, size: tuple[int, int], pitch: float | None) -> list[Candidate]:
-    """All combinations of the alternatives for the stages of a pipeline, most expensive first.
+def candidates(
+    file: Path, size: tuple[int, int], pitch: float | None, sensor: str | None = None
+) -> list[Candidate]:
+    """The original, and all combinations of the alternatives for its stages, most expensive first.
+
+    Combinations that the pipeline file does not allow are left out.
 
     Parameters
     ----------
-    pipeline : the original. size : (width, height) before downsampling, px. pitch : of the dots, px; None
-        without dots.
+    file : the original. size : (width, height) before downsampling, px. pitch : of the dots, px; None
+        without dots. sensor : name of one of several, or None.
 
     Raises
     ------
     ConfigError : the pipeline has none of the stages.
 
-    >>> import tactflow
-    >>> [c.name for c in candidates(tactflow.load("markerless"), (400, 300), None)][:2]
-    ['downsample 1, noise', 'downsample 1, colour']
+    >>> from tactflow.config.shipped import find_pipeline
+    >>> [c.name for c in candidates(find_pipeline("markerless"), (400, 300), None)][:3]
+    ['downsample 1, noise', 'downsample 1, colour', 'as given']
     """
+    original = load_pipeline(file, sensor=sensor)
     # Only stages with the built-in implementation.
-    built_in = {id_ for id_, node in pipeline.nodes.items() if node.component.name == id_}
+    built_in = {id_ for id_, node in original.nodes.items() if node.component.name == id_}
     axes = [choices for stage, choices in AXES.items() if stage in built_in]
     if not axes:
-        raise ConfigError(f"{pipeline.file}: tune has no alternatives for any of its stages")
-    result = []
+        raise ConfigError(f"{file}: tune has no alternatives for any of its stages")
+    found = []
     for names in product(*axes):
         settings: dict[str, Any] = {}
         for choices, name in zip(axes, names, strict=True):
             settings |= choices[name]
-        if "flow_in_mask" not in pipeline.nodes:
+        if "flow_in_mask" not in original.nodes:
             settings.pop("stages.flow_in_mask.method", None)
         factor = settings.get(DOWNSAMPLE, 1)
         fits = min(size) / factor >= MIN_SIDE and (pitch is None or pitch / factor >= MIN_PITCH)
-        if fits or factor == 1:
-            result.append(Candidate(", ".join(names), tuple(settings.items())))
-    return result
+        if not fits and factor != 1:
+            continue
+        try:
+            pipeline = load_pipeline(file, from_settings(settings), sensor=sensor)
+        except ConfigError:
+            continue
+        if pipeline.nodes == original.nodes:
+            found.append(Candidate(ORIGINAL, {}, original))
+        else:
+            found.append(Candidate(", ".join(names), settings, pipeline))
+    if not any(candidate.name == ORIGINAL for candidate in found):
+        found.insert(1, Candidate(ORIGINAL, {}, original))
+    return found
