@@ -8,12 +8,11 @@ measured: they double, or increase fivefold, an error of the default pipeline on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.doctor import measures
 from tactflow.doctor.observation import Observation
@@ -94,19 +93,6 @@ def worst(findings: list[Finding]) -> Verdict:
     return "fault" if "fault" in verdicts else "warning" if "warning" in verdicts else "good"
 
 
-Curve = tuple[tuple[float, float], ...]
-"""(value, measured factor on an error)."""
-
-BLUR: Final[Curve] = ((0.09, 1), (0.13, 1.1), (0.2, 1.6), (0.28, 2.1), (0.35, 2.7), (0.41, 4.6), (0.47, 8.8))
-"""Blur in dot radii -> factor on the error of a dot's displacement."""
-NOISE: Final[Curve] = ((2, 1), (4, 1.3), (8, 2.3), (12, 3.5), (16, 4.9))
-"""Noise, grey levels -> factor on the error of a dot's displacement."""
-JPEG: Final[Curve] = ((2, 1.05), (10, 1.5), (20, 2.2), (37, 3.4), (69, 6.3))
-"""JPEG quantisation step, grey levels -> factor on the error of a dot's displacement."""
-BANDS: Final[Curve] = ((0.5, 1), (1.0, 1.05), (1.9, 1.3), (2.8, 8.5), (3.7, 21), (4.7, 86))
-"""Amplitude of bands, % -> factor on the error of the contact's centre."""
-CLIPPED: Final[Curve] = ((0, 1), (1.2, 1.7), (13, 5.4), (90, 4.1), (95, 32))
-"""Clipped share of the gel, % -> factor on the error of the contact's centre."""
 MAX_DOT_RADIUS: Final = 0.15
 """Largest plausible dot radius in pitches: blur makes dots look larger. 0.11 to 0.15 in simulated scenes."""
 CODEC_REPEATS: Final = 10.0
@@ -116,12 +102,6 @@ STEADY: Final = 0.35
 used to label the recordings of franka_mini."""
 MIN_FRAMES: Final = 3
 """Minimum number of frames for bands, and of untouched frames for drift."""
-
-
-def _growth(curve: Curve, value: float, error: str) -> str:
-    factor = float(np.interp(value, *np.array(curve).T))
-    least = "at least " if value > curve[-1][0] else ""
-    return f"{error} off {least}{factor:.2g} times as much (simulated sensor)"
 
 
 # The slowest cameras of such sensors have 25 frames/s; automatic exposure in the dark halves the rate.
@@ -202,7 +182,7 @@ def _clipping(observed: Observation) -> Measured:
     return Measured(
         share,
         f"{round(share, 2):.2g} % of the gel is clipped",
-        "a contact there has no shading: " + _growth(CLIPPED, share, "its centre is"),
+        "a contact there has no shading, and a wrong centre",
         "less exposure or gain, fixed instead of automatic; lamps that do not shine into the camera",
     )
 
@@ -217,7 +197,7 @@ def _focus(observed: Observation) -> Measured | str:
     if dots is not None:
         width = min(dots.dot_radius, MAX_DOT_RADIUS * dots.pitch)
         says += f", dots of radius {dots.dot_radius:.1f} px"
-        effect, limits = _growth(BLUR, blur / width, "displacements of dots are"), (0.28, 0.42)
+        effect, limits = "displacements of dots are less exact", (0.28, 0.42)
     advice = "focus the lens on the gel's surface, clean it; a shorter exposure if the gel moves fast"
     return Measured(blur, says, effect, advice, (limits[0] * width, limits[1] * width))
 
@@ -228,7 +208,7 @@ def _noise(observed: Observation) -> Measured:
     return Measured(
         noise,
         f"{noise:.1f} grey levels",
-        _growth(NOISE, noise, "displacements of dots are"),
+        "displacements of dots are less exact, and faint contacts are missed",
         "more light and less gain; a longer exposure as far as the rate allows it",
     )
 
@@ -243,7 +223,7 @@ def _banding(observed: Observation) -> Measured | str:
     return Measured(
         100.0 * amplitude,
         f"bands of {100 * amplitude:.1f} % of the light across the {axis}",
-        "bands are detected as contacts: " + _growth(BANDS, 100.0 * amplitude, "centres are"),
+        "bands are detected as contacts, and shift the centres of contacts",
         "lamps on direct current; otherwise exposure times of whole mains periods (10 or 8.33 ms), and no "
         "fluorescent light through the gel",
     )
@@ -262,16 +242,14 @@ def _light(observed: Observation) -> Measured:
     )
 
 
-# JPEG qualities of about 30 and 10.
+# JPEG qualities of about 30 and 10: the step is 11.5 at quality 50 (ITU-T T.81, table K.1).
 @check("compression", "grey levels", warning=18.0, fault=55.0)
 def _compression(observed: Observation) -> Measured:
-    step, says = observed.jpeg_step or 0.0, "no trace of JPEG"
-    if step:
-        says = f"JPEG of quality ~{measures.jpeg_quality(step):.0f}, steps of {step:.0f} grey levels"
+    step = observed.jpeg_step or 0.0
     return Measured(
         step,
-        says,
-        _growth(JPEG, step, "displacements of dots are") + "; outlines are quantised to blocks of 8 px",
+        f"JPEG with steps of {step:.0f} grey levels" if step else "no trace of JPEG",
+        "displacements of dots are less exact; outlines are quantised to blocks of 8 px",
         "a higher quality, or an uncompressed format (YUYV); record losslessly with tactflow record",
     )
 
@@ -296,10 +274,20 @@ def _dots(observed: Observation) -> Measured | str:
 # error of up to 0.05 px. Chosen by hand.
 @check("drift", "px", warning=0.15, fault=1.0)
 def _drift(observed: Observation) -> Measured | str:
-    late = [shift for number, shift in _at_rest(observed) if 2 * number >= observed.frames]
-    if len(late) < MIN_FRAMES:
+    first, second_half = observed.pairs[0].image, []
+    points = measures.points(first) if observed.dots is None else observed.dots.centers.astype(np.float32)
+    for pair in observed.pairs[1:]:
+        if 2 * pair.number < observed.frames:
+            continue
+        moved = measures.motion(first, pair.image, points)
+        # A reliable median needs ten points, and half of all.
+        if len(moved) >= max(10, len(points) / 2):
+            middle = np.median(moved, axis=0)
+            if np.percentile(np.hypot(*(moved - middle).T), 95) < STEADY:
+                second_half.append(middle)
+    if len(second_half) < MIN_FRAMES:
         return "too few untouched frames in the second half"
-    x, y = np.median(late[-max(MIN_FRAMES, len(late) // 3) :], axis=0)
+    x, y = np.median(second_half[-max(MIN_FRAMES, len(second_half) // 3) :], axis=0)
     drift = math.hypot(x, y)
     return Measured(
         drift,
@@ -307,19 +295,3 @@ def _drift(observed: Observation) -> Measured | str:
         f"every displacement, and the flow, is off by {drift:.2f} px",
         "fasten gel and camera; let the gel settle; take a new reference of the untouched gel",
     )
-
-
-def _at_rest(observed: Observation) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Frames with an untouched gel: number, and displacement (x, y) of the whole gel, px."""
-    first = observed.pairs[0].image
-    points = measures.points(first) if observed.dots is None else observed.dots.centers.astype(np.float32)
-    reference = measures.smooth(first)
-    for pair in observed.pairs[1:]:
-        moved = measures.motion(reference, measures.smooth(pair.image), points)
-        tracked = moved[np.isfinite(moved[:, 0])]
-        # A reliable median needs ten points, and half of all.
-        if len(tracked) < max(10, len(points) / 2):
-            continue
-        middle = np.median(tracked, axis=0)
-        if np.percentile(np.hypot(*(tracked - middle).T), 95) < STEADY:
-            yield pair.number, middle.astype(np.float64)

@@ -166,11 +166,15 @@ def _slope(gray: Gray) -> Gray:
 def jpeg_step(gray: Gray) -> float | None:
     """JPEG quantisation step of the lowest frequency, grey levels; None without JPEG.
 
-    gray : (H, W) float32, whole grey levels of one frame, possibly cropped: blocks may start at any pixel.
-    Their coefficients are multiples of the step (Z. Fan and R. L. de Queiroz, "Identification of bitmap
-    compression history", IEEE Trans. Image Processing 12, 2003).
+    gray : (H, W) float32, whole grey levels of one frame, not cropped. The coefficients of its blocks are
+    multiples of the step (Z. Fan and R. L. de Queiroz, "Identification of bitmap compression history", IEEE
+    Trans. Image Processing 12, 2003).
     """
-    waves = _coefficients(gray[_phase(gray.T) :, _phase(gray) :])
+    height, width = (side - side % BLOCK for side in gray.shape)
+    blocks = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    coefficients = scipy.fft.dctn(blocks, axes=(1, 3), norm="ortho")
+    # The lowest horizontal and vertical frequency.
+    waves = np.concatenate([coefficients[:, 0, :, 1].ravel(), coefficients[:, 1, :, 0].ravel()])
     found = None
     for step in np.arange(2.0, 100.0, 0.25):
         larger = waves[np.abs(waves) > step / 2]
@@ -180,34 +184,6 @@ def jpeg_step(gray: Gray) -> float | None:
         if np.cos(2 * np.pi * larger / step).mean() > 0.5:
             found = float(step)
     return found
-
-
-def jpeg_quality(step: float) -> float:
-    """JPEG quality, 1 to 100, whose standard tables have this step in grey levels.
-
-    The step is 11.5 at quality 50, the mean of 11 and 12 (ITU-T T.81, table K.1).
-
-    >>> jpeg_quality(11.5), jpeg_quality(23.0), jpeg_quality(2.3)
-    (50.0, 25.0, 90.0)
-    """
-    share = step / 11.5
-    return 50.0 / share if share > 1 else 100.0 - 50.0 * share
-
-
-def _phase(gray: Gray) -> int:
-    """Column, 0 to 7, at which blocks start: differences between neighbours are largest there."""
-    step = np.abs(np.diff(gray, axis=1))
-    excess = (step[:, 1:-1] - (step[:, :-2] + step[:, 2:]) / 2).mean(axis=0)
-    excess = excess[: len(excess) - len(excess) % BLOCK].reshape(-1, BLOCK)
-    return int(np.median(excess, axis=0).argmax() + 2) % BLOCK if len(excess) else 0
-
-
-def _coefficients(gray: Gray) -> NDArray[np.float32]:
-    """Coefficients (N,) of the lowest horizontal and vertical frequency of all blocks."""
-    height, width = (side - side % BLOCK for side in gray.shape)
-    blocks = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
-    waves = scipy.fft.dctn(blocks, axes=(1, 3), norm="ortho")
-    return np.concatenate([waves[:, 0, :, 1].ravel(), waves[:, 1, :, 0].ravel()])
 
 
 def bands(frames: Sequence[Gray]) -> tuple[float, str]:
@@ -270,34 +246,25 @@ def _empty_positions(detection: Detection) -> list[NDArray[np.float64]]:
 
 def points(image: Image) -> NDArray[np.float32]:
     """(N, 2) float32, px: up to 200 trackable points of a picture, at least 8 px apart."""
-    features = cv2.goodFeaturesToTrack(smooth(image), 200, 0.05, 8.0)
-    return (
-        np.zeros((0, 2), np.float32) if features is None else np.asarray(features.reshape(-1, 2), np.float32)
-    )
-
-
-def smooth(image: Image) -> Image:
-    """(H, W, 3) uint8 BGR to (H, W) uint8 for `motion`, blurred by 1.5 px against noise."""
-    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), 1.5), np.uint8)
+    found = cv2.goodFeaturesToTrack(_smooth(image), 200, 0.05, 8.0)
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2), np.float32)
 
 
 def motion(reference: Image, now: Image, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Displacements (N, 2), px, of points (N, 2) of a gray picture; NaN where tracking fails.
+    """Displacements (M, 2), px, of those of the points (N, 2) that are found again.
 
-    reference, now : (H, W) uint8. Each point is tracked to `now` and back, and must return to within 0.3 px.
+    reference, now : (H, W, 3) uint8. Each point is tracked to `now` and back, and must return to within
+    0.3 px.
     """
     if not len(points):
         return np.zeros((0, 2), np.float32)
-    ends, found = _tracked(reference, now, points)
-    back, found_back = _tracked(now, reference, ends)
-    moved = ends - points
-    moved[~(found & found_back & (np.hypot(*(back - points).T) < 0.3))] = np.nan
-    return np.asarray(moved, np.float32)
+    pictures, window = [_smooth(reference), _smooth(now)], (31, 31)
+    ends, found, _ = cv2.calcOpticalFlowPyrLK(*pictures, points, points.copy(), winSize=window)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(*pictures[::-1], ends, ends.copy(), winSize=window)
+    good = (found.ravel() == 1) & (found_back.ravel() == 1) & (np.hypot(*(back - points).T) < 0.3)
+    return np.asarray((ends - points)[good], np.float32)
 
 
-def _tracked(
-    reference: Image, now: Image, points: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Positions (N, 2) of points (N, 2) tracked to `now`, and whether tracking succeeded, (N,)."""
-    ends, found, _ = cv2.calcOpticalFlowPyrLK(reference, now, points, points.copy(), winSize=(31, 31))
-    return np.asarray(ends, np.float32).reshape(-1, 2), np.asarray(found).ravel() == 1
+def _smooth(image: Image) -> Image:
+    """(H, W) uint8 grey, blurred by 1.5 px against noise."""
+    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), 1.5), np.uint8)
