@@ -31,15 +31,11 @@ def test_values_of_many_frames_become_one_number() -> None:
         tally.add(displacement_rms=value)
     tally.percent(wrong_percent=[True, False, False, False])
     tally.within("flow", [0.5, -1.5], [1.0, 1.0])
-    # Offsets from hand labels: all are one pixel to the right, one is another two away.
-    tally.add(label_center_p50=[(1, 0), (1, 0), (1, 2)], label_center_p95=[(1, 0), (1, 0), (1, 2)])
     assert tally.errors() == {
         "displacement_rms": pytest.approx((25 / 3) ** 0.5),
         "wrong_percent": 25,
         "flow_within_one": 50,
         "flow_within_two": 100,
-        "label_center_p50": 0,
-        "label_center_p95": pytest.approx(1.8),
     }
 
 
@@ -69,7 +65,7 @@ def test_a_quantity_that_is_no_longer_measured_is_a_regression_unless_its_scene_
     assert line.endswith("no longer measured")
     assert len(worse(run(scene="cable", displacement_rms=0.02), stored)) == 1
     assert worse(run(scene="cable", displacement_rms=0.02), stored, {"cable"}) == []
-    assert worse(run(), run(scene="data:wedge_ball", found_percent=100.0)) == []
+    assert worse(run(), run(scene="data:mini_ball", dots_found=100.0)) == []
 
 
 @pytest.mark.parametrize("text", ["", "[1]", '{"schema": "other/1"}', '{"schema": "tactflow.bench/3"}'])

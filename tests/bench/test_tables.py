@@ -38,7 +38,6 @@ def result() -> BenchResult:
     made.add("pipeline", "default", "data:sts_640", gel, frames=296)
     made.add("pipeline", "markerless", "data:mini_box", {"line_angle_p50": 0.5}, frames=14)
     made.add("pipeline", "default", "data:mini_box", {"markers_false": 0.0}, frames=1)
-    made.add("pipeline", "default", "data:wedge_ball", {"found_percent": 95.0}, frames=300)
     made.failures["pipeline/classic/press"] = "no markers\nmore"
     return made
 
@@ -58,7 +57,6 @@ def test_every_kind_of_measurement_has_its_row(result: BenchResult) -> None:
     rows = [" ".join(line.split()) for line in lines if line.startswith("|")]
     assert "| fast | 0.55 | 5.5 | - | - | 0.2 (0.3) | - | 2 (3) |" in rows
     assert "| press | default | 1.5 | -, - | 0.01 | -, - | 0, 4, - | 0.97 | - | - | - |" in rows
-    assert "| wedge_ball | default | - | labelled contacts found, %: 95 |" in rows
     (gel,) = [row for row in rows if row.startswith("| sts_640 |")]
     assert "| chosen on | 296 | 165 | 97.6, 0 | - | - |" in gel
     (bare,) = [row for row in rows if row.startswith("| mini_box |")]

@@ -19,6 +19,7 @@ from tactflow.bench.lockstep import TimedResult, on_recording, with_params
 from tactflow.bench.pipelines import Bench, Judge
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import RECORDING
+from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 
 _VIDEOS = (".avi", ".mp4", ".m4v", ".gif")
@@ -85,6 +86,18 @@ GELS = (
     Gel("fingervision", "FingerVision, transparent skin", 26),
 )
 """Half of the sensors are for choosing constants, the others for reporting what comes of it."""
+
+
+def check(data: Path) -> None:
+    """Find out before a long run that there is nothing to measure.
+
+    Raises
+    ------
+    ConfigError
+        If the folder has no folder of gels.
+    """
+    if not (data / FOLDER).is_dir():
+        raise ConfigError(f"--data {data}: required a folder with the folder {FOLDER} in it")
 
 
 def measure_gels(bench: Bench, marked: tuple[str, Pipeline], bare: tuple[str, Pipeline], data: Path) -> None:

@@ -11,8 +11,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactflow.bench.metrics import distance
-
 Summary = Callable[[NDArray[np.float64]], Any]
 
 
@@ -21,15 +19,8 @@ def rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def beyond_offset(values: NDArray[np.float64], q: float) -> float:
-    """The q-th percentile of distances, px, after the median offset is taken out. values : x, y, x, y, ..."""
-    offsets = values.reshape(-1, 2)
-    return float(np.percentile(distance(offsets, np.median(offsets, axis=0)), q))
-
-
 P99 = partial(np.percentile, q=99)
 """99th percentile."""
-P50_OF_OFFSETS, P95_OF_OFFSETS = partial(beyond_offset, q=50), partial(beyond_offset, q=95)
 MEAN, MEDIAN, MOST, LEAST = np.mean, np.median, np.max, np.min
 """How values become one number."""
 
@@ -115,11 +106,6 @@ _ALL = [
     Quantity("depth_rms", "heights, RMS error over the greatest depth", "%", slack=0.3),
     *_within("depth", "greatest-depth errors"),
     Quantity("volume_error", "indented volume, error, mean", "%", slack=1.0),
-    Quantity("found_percent", "labelled contacts found", "%", MEAN, "higher", 100.0),
-    Quantity("label_center_p50", "centre against hand label, median", "px", P50_OF_OFFSETS, slack=0.1),
-    Quantity(
-        "label_center_p95", "centre against hand label, 95th percentile", "px", P95_OF_OFFSETS, slack=0.3
-    ),
     Quantity("outline_iou_p50", "outline by eye, IoU, median", "", MEDIAN, "higher", 1.0, slack=0.02),
     Quantity("outline_iou_min", "outline by eye, IoU, worst", "", LEAST, "higher", 1.0, slack=0.05),
     Quantity("label_distance_p50", "centre against labelled circle, median", "px", MEDIAN, slack=0.1),

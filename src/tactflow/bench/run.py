@@ -8,14 +8,14 @@ import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 
 import cv2
 
-from tactflow.bench import depth, gels, recordings
+from tactflow.bench import depth, gels
 from tactflow.bench.lockstep import on_recording
 from tactflow.bench.methods import measure_methods
 from tactflow.bench.pipelines import CLASSIC, Bench
@@ -30,7 +30,8 @@ from tactflow.engine.graph import Pipeline
 
 DEFAULT = "default"
 MARKERLESS = "markerless"
-WEDGE = "wedge"
+_MARKER_STAGES = frozenset({"tracker", "flow_in_mask", "visualize"})
+"""Ids of the stages that need markers."""
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, steps done, and steps in all."""
@@ -70,7 +71,7 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
         measured = ", ".join(known)
         raise ConfigError(f"--scene {', '.join(unknown)}: not among the scenes measured: {measured}")
     if plan.data is not None:
-        recordings.check(plan.data)
+        gels.check(plan.data)
     loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
     result, unit = BenchResult(quick=plan.quick, machine=machine()), CopyUnit()
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
@@ -88,7 +89,8 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
         if not plan.quick and plan.scenes is None:
             steps.append(("heights", partial(depth.measure_simulated, bench)))
         if plan.data is not None:
-            steps.append(("recordings", partial(_measure_recordings, bench, loaded, plan.data)))
+            pipelines = (DEFAULT, loaded[DEFAULT]), (MARKERLESS, _bare(loaded)[MARKERLESS])
+            steps.append(("real gels", partial(gels.measure_gels, bench, *pipelines, plan.data)))
         for number, (what, measure) in enumerate(steps):
             progress(what, number, len(steps))
             measure()
@@ -110,25 +112,16 @@ def measure_scene(bench: Bench, loaded: Pipelines, case: Case) -> None:
         bench.measure(suited, case.label, [(scene.path, partial(PipelineScore, scene))])
 
 
-def _measure_recordings(bench: Bench, loaded: Pipelines, data: Path) -> None:
-    """Measure on presses of a real ball, and on recordings of many labs."""
-    presses = data / "wedge_ball"
-    if (presses / "labels.csv").exists():
-        wedge = {name: pipeline for name, pipeline in loaded.items() if name == WEDGE}
-        recordings.measure_presses(bench, wedge | _marked(loaded), presses)
-    bare = (MARKERLESS, _bare(loaded)[MARKERLESS])
-    gels.measure_gels(bench, (DEFAULT, loaded[DEFAULT]), bare, data)
-
-
 def _marked(loaded: Pipelines) -> dict[str, Pipeline]:
     """The pipelines for gels with markers, on any camera."""
     return {n: p for n, p in loaded.items() if n != MARKERLESS and not _is_for_one_camera(p)}
 
 
 def _bare(loaded: Pipelines) -> dict[str, Pipeline]:
-    """The pipelines for gels without markers."""
+    """The pipelines for gels without markers: that of the script, without the stages that need them."""
     markerless = loaded.get(MARKERLESS) or load_pipeline(find_pipeline(MARKERLESS))
-    return {MARKERLESS: markerless, CLASSIC: recordings.without_markers(loaded[CLASSIC])}
+    nodes = {n: node for n, node in loaded[CLASSIC].nodes.items() if n not in _MARKER_STAGES}
+    return {MARKERLESS: markerless, CLASSIC: replace(loaded[CLASSIC], nodes=nodes)}
 
 
 def _is_for_one_camera(pipeline: Pipeline) -> bool:

@@ -74,7 +74,7 @@ def sections(result: BenchResult) -> list[Section]:
     )
     groups = dict.fromkeys(m.group for m in result.measured)
     found = [Section("Machine", summary), *(_methods(result, group) for group in groups)]
-    found += [_scenes(result), *_recordings(result), *_gels(result)]
+    found += [_scenes(result), *_gels(result)]
     if result.failures:
         rows = [[key, why.partition("\n")[0]] for key, why in result.failures.items()]
         found.append(Section("Failures", tables=[Table(["group/method/scene", "why"], rows)]))
@@ -110,17 +110,6 @@ def _scenes(result: BenchResult) -> Section:
     text = f"Time of a frame with contact, and mean errors. `{CLASSIC}` is the original script."
     table = Table(["scene", "pipeline", "ms", *SCENE_COLUMNS], rows)
     return Section("Whole pipelines, scene by scene", text, tables=[table])
-
-
-def _recordings(result: BenchResult) -> Iterator[Section]:
-    """One row for each pipeline on the recordings of the Wedge."""
-    rows = []
-    for m in result.measured:
-        if not m.simulated and m.recording not in {gel.folder for gel in GELS}:
-            errors = (f"{QUANTITIES[key].heading}: {_number(v)}" for key, v in m.errors.items())
-            rows.append([m.recording, m.method, *_cells(m, {}), "; ".join(errors)])
-    if rows:
-        yield Section("Real recordings", tables=[Table(["recording", "pipeline", "ms", "errors"], rows)])
 
 
 def _gels(result: BenchResult) -> Iterator[Section]:

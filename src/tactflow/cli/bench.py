@@ -9,7 +9,7 @@ from pathlib import Path
 from tactflow.bench.pipelines import CLASSIC
 from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import load_errors, regressions
-from tactflow.bench.run import DEFAULT, MARKERLESS, WEDGE, Plan, run_bench
+from tactflow.bench.run import DEFAULT, MARKERLESS, Plan, run_bench
 from tactflow.bench.tables import sections
 from tactflow.cli.options import refuse_output, writing
 from tactflow.cli.terminal import notes, progress_bar, say, show
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data",
         type=Path,
         metavar="DIR",
-        help="also measure on the real recordings in DIR (wedge_ball, gels)",
+        help="also measure on the recordings of real gels in DIR/gels",
     )
     add(
         "--json",
@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
 def packaged_files() -> dict[str, Path]:
     """Name -> file of the packaged pipelines that differ in more than settings, the default one first."""
-    return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, CLASSIC, MARKERLESS, WEDGE)}
+    return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, CLASSIC, MARKERLESS)}
 
 
 def _files(given: list[str]) -> dict[str, Path]:
