@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     failed.
     """
     from tactflow.sim import open_scene
-    from tactflow.sim.export import TRUTH_SUFFIXES, frames_kind, write_frames, write_truth
+    from tactflow.sim.export import TRUTH_SUFFIXES, frames_writer, write_frames, write_truth
 
     if args.list:
         _list()
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         scene = open_scene(args.name.removeprefix("sim:"))
         if args.out is not None:
-            frames_kind(args.out)
+            frames_writer(args.out)
     except ValueError as error:
         raise ConfigError(str(error)) from None
     if args.out is not None and not _replaces_pictures(args.out, args.overwrite):

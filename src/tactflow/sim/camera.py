@@ -6,6 +6,7 @@ Everything is closed-form or solved to machine precision, so that truth can be m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -20,6 +21,9 @@ Points = NDArray[np.float64]
 
 SIZE = (800, 600)
 """Width and height of every scene's frames, px."""
+CENTER = ((SIZE[0] - 1) / 2.0, (SIZE[1] - 1) / 2.0)
+HALF_DIAGONAL = math.hypot(*SIZE) / 2.0
+"""Centre of a frame, (x, y), and distance of its corners from it, px."""
 NOISE_UNIT = 4096.0
 """Integer steps of the noise bank per standard deviation."""
 _APERTURE_EDGE = 3.0
@@ -37,7 +41,6 @@ span / golden ratio visits all 2**22 offsets before repeating, and keeps any two
 class Camera:
     """Perspective followed by radial lens distortion, seen through a round aperture.
 
-    size : (width, height) of the raw frame, px.
     perspective : in [0, 0.4]; each lower corner of the gel moves inwards by this fraction of half the width
         and the whole gel shrinks a little, so that it appears as the trapezoid of a tilted camera. 0: none.
     distortion : in [-0.2, 0.4]; k of undistorted = distorted * (1 + k rho^2), rho = distance from the centre
@@ -45,7 +48,6 @@ class Camera:
     aperture_radius : radius of the round picture in a black frame, in half heights of the frame. 0: none.
     """
 
-    size: tuple[int, int] = SIZE
     perspective: float = 0.0
     distortion: float = 0.0
     aperture_radius: float = 0.0
@@ -56,19 +58,11 @@ class Camera:
         return self.perspective == 0.0 and self.distortion == 0.0
 
     @cached_property
-    def _center(self) -> Points:
-        return (np.array(self.size) - 1) / 2.0
-
-    @cached_property
-    def _half_diagonal(self) -> float:
-        return float(np.hypot(*self.size)) / 2.0
-
-    @cached_property
     def _homography(self) -> NDArray[np.float64]:
         """From the gel plane to the undistorted frame, 3 x 3."""
         if not self.perspective:
             return np.eye(3)
-        width, height = self.size
+        width, height = SIZE
         left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5
         inset_x, inset_y = 0.1 * self.perspective * width, 0.15 * self.perspective * height
         squeeze = self.perspective * width / 2.0
@@ -89,15 +83,15 @@ class Camera:
         """Gel coordinates (N, 2) float64 of raw pixel positions (N, 2)."""
         if self.identity:
             return np.array(raw, dtype=np.float64)
-        offset = (raw - self._center) / self._half_diagonal
+        offset = (raw - CENTER) / HALF_DIAGONAL
         offset *= 1.0 + self.distortion * np.sum(offset * offset, axis=-1, keepdims=True)
-        return project(self._inverse, offset * self._half_diagonal + self._center)
+        return project(self._inverse, offset * HALF_DIAGONAL + CENTER)
 
     def to_raw(self, gel: Points) -> Points:
         """Raw pixel positions (N, 2) float64 of gel coordinates (N, 2)."""
         if self.identity:
             return np.array(gel, dtype=np.float64)
-        offset = (project(self._homography, gel) - self._center) / self._half_diagonal
+        offset = (project(self._homography, gel) - CENTER) / HALF_DIAGONAL
         k = self.distortion
         if k:
             radius = np.sqrt(np.sum(offset * offset, axis=-1))
@@ -105,17 +99,17 @@ class Camera:
             for _ in range(_NEWTON_STEPS):
                 solved -= (solved * (1.0 + k * solved**2) - radius) / (1.0 + 3.0 * k * solved**2)
             offset *= np.divide(solved, radius, out=np.ones_like(radius), where=radius > 0)[..., None]
-        return np.asarray(offset * self._half_diagonal + self._center, dtype=np.float64)
+        return np.asarray(offset * HALF_DIAGONAL + CENTER, dtype=np.float64)
 
     def aperture(self, raw: Points) -> NDArray[np.float64]:
         """Fraction of light (N,), 0 to 1, at raw pixel positions (N, 2): 0 in the black frame."""
-        radius = self.aperture_radius * self.size[1] / 2.0 if self.aperture_radius else np.inf
-        inside = radius - np.hypot(raw[..., 0] - self._center[0], raw[..., 1] - self._center[1])
+        radius = self.aperture_radius * SIZE[1] / 2.0 if self.aperture_radius else np.inf
+        inside = radius - np.hypot(raw[..., 0] - CENTER[0], raw[..., 1] - CENTER[1])
         return np.asarray(0.5 + 0.5 * np.tanh(inside / _APERTURE_EDGE), dtype=np.float64)
 
     def sees(self, raw: Points) -> NDArray[np.bool_]:
         """(...) bool: whether raw positions (..., 2) lie in the frame and are lit."""
-        inside = np.all((raw >= -0.5) & (raw <= np.array(self.size) - 0.5), axis=-1)
+        inside = np.all((raw >= -0.5) & (raw <= np.array(SIZE) - 0.5), axis=-1)
         return np.asarray(inside & (self.aperture(raw) >= 0.5))
 
     def local_inverse(self, gel: Points) -> NDArray[np.float64]:

@@ -18,7 +18,6 @@ from tactflow.sim.scenes import Scene
 from tactflow.sim.truth import Truth
 from tactflow.system.files import completed
 
-VIDEO_SUFFIXES = (".avi", ".mkv")
 TRUTH_SUFFIXES = (".jsonl", ".npz", ".csv")
 Report = Callable[[int], None]
 _ARRAYS = ("contact_mask", "touching", "area", "depth", "position", "visible")
@@ -34,14 +33,9 @@ def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) 
 
     Raises ValueError for an unsupported suffix and OSError if the path is not writable.
     """
-    kind = frames_kind(path)
+    write = frames_writer(path)
     with completed(path) as partial:
-        if kind == "npy":
-            _write_npy(scene, partial, report)
-        elif kind == "video":
-            _write_video(scene, partial, report)
-        else:
-            _write_folder(scene, partial, report)
+        write(scene, partial, report)
 
 
 def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
@@ -63,16 +57,14 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
         {".jsonl": _write_jsonl, ".npz": _write_npz, ".csv": _write_forces}[suffix](scene, partial, report)
 
 
-def frames_kind(path: Path) -> str:
-    """`npy`, `video` or `folder`; raises ValueError for an unsupported suffix."""
-    suffix = path.suffix.lower()
-    if suffix == ".npy":
-        return "npy"
-    if suffix in VIDEO_SUFFIXES:
-        return "video"
-    if not suffix or path.is_dir():
-        return "folder"
-    raise ValueError(f"required frames as .npy, {', '.join(VIDEO_SUFFIXES)} or a folder, got {path.name!r}")
+def frames_writer(path: Path) -> Callable[[Scene, Path, Report], None]:
+    """The function that writes frames to such a path; raises ValueError for an unsupported suffix."""
+    writers = {".npy": _write_npy, ".avi": _write_video, ".mkv": _write_video, "": _write_folder}
+    if path.is_dir():
+        return _write_folder
+    if path.suffix.lower() not in writers:
+        raise ValueError(f"required frames as .npy, .avi, .mkv or a folder, got {path.name!r}")
+    return writers[path.suffix.lower()]
 
 
 def _write_npy(scene: Scene, path: Path, report: Report) -> None:

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.sim.camera import CENTER, HALF_DIAGONAL
 from tactflow.sim.gel import Press
 from tactflow.sim.shapes import Array
 
@@ -65,20 +66,13 @@ LIGHTS = {
 }  # fmt: skip
 
 
-def untouched_gel(
-    light: Light,
-    x: Array,
-    y: Array,
-    center: tuple[float, float],
-    half_diagonal: float,
-    dim: float = 1.0,
-) -> NDArray[np.float32]:
+def untouched_gel(light: Light, x: Array, y: Array, dim: float = 1.0) -> NDArray[np.float32]:
     """Grey levels (H, W, 3) float32, BGR, of the gel at rest, at gel coordinates x, y (H, W), px."""
     angle = np.radians(np.asarray(light.azimuth))
     image = np.empty((*x.shape, 3), np.float32)
     for channel in range(3):
-        along = (x - center[0]) * np.cos(angle[channel]) - (y - center[1]) * np.sin(angle[channel])
-        distance = (1.8 - along / half_diagonal) / 1.8
+        along = (x - CENTER[0]) * np.cos(angle[channel]) - (y - CENTER[1]) * np.sin(angle[channel])
+        distance = (1.8 - along / HALF_DIAGONAL) / 1.8
         image[..., channel] = light.level[channel] * dim * distance ** (-light.falloff * 1.4)
     return image
 
@@ -98,13 +92,21 @@ def _grain(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
     return grain[..., None]
 
 
+def _slopes(depth: Array, step: float) -> tuple[Array, Array]:
+    """Slopes (h, w) of the surface along x and y. depth : (h, w), px, sampled every `step` px."""
+    x, y = (
+        cv2.Sobel(depth, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+        for dx in (1, 0)
+    )
+    return np.asarray(x, np.float32), np.asarray(y, np.float32)
+
+
 def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
     """(h, w, 3) float32: shading of a deformed surface relative to rest, >= 0.
 
     depth : (h, w) float32, depth of the surface, px, sampled every `step` px.
     """
-    slope_x = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
-    slope_y = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+    slope_x, slope_y = _slopes(depth, step)
     upright = (1.0 - light.ambient) / np.sqrt(slope_x * slope_x + slope_y * slope_y + np.float32(1.0))
     channels = []
     for gain_x, gain_y in light.tilt():
@@ -194,8 +196,7 @@ def blotches(size: tuple[int, int], contrast: float, seed: int) -> Array:
 
 def highlight(depth: Array, step: float, strength: float) -> Array:
     """(h, w) float32 grey levels: specular reflection of a lamp on the slope that faces it."""
-    slope_x = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
-    slope_y = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+    slope_x, slope_y = _slopes(depth, step)
     off = (slope_x - np.float32(0.13)) ** 2 + (slope_y - np.float32(0.16)) ** 2
     return np.asarray(
         np.exp(off * np.float32(-1.0 / (2 * 0.035**2))) * np.float32(150.0 * strength), np.float32

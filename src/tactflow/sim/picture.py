@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.sim import camera as optics
 from tactflow.sim import gel, light, markers
-from tactflow.sim.camera import SIZE, Camera
+from tactflow.sim.camera import CENTER, HALF_DIAGONAL, SIZE, Camera
 from tactflow.sim.settings import Settings
 
 FIXED_POINT = markers.FIXED_POINT
@@ -142,16 +142,14 @@ class Painter:
         settings = self._settings
         width, height = SIZE
         raw_x, raw_y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-        center = ((width - 1) / 2.0, (height - 1) / 2.0)
-        half_diagonal = float(np.hypot(width, height)) / 2.0
         dim = 0.65 if settings.polarity == "bright" else 1.0
-        image = light.untouched_gel(self._light, raw_x, raw_y, center, half_diagonal, dim)
+        image = light.untouched_gel(self._light, raw_x, raw_y, dim)
         if settings.texture:
             image *= light.texture((height, width), settings.texture, settings.seed)
         if settings.specular:
             light.add_mirror_spots(image, raw_x, raw_y, settings.specular, settings.seed)
         if settings.vignette:
-            radius = ((raw_x - center[0]) ** 2 + (raw_y - center[1]) ** 2) / np.float32(half_diagonal**2)
+            radius = ((raw_x - CENTER[0]) ** 2 + (raw_y - CENTER[1]) ** 2) / np.float32(HALF_DIAGONAL**2)
             image *= (np.float32(1.0) - np.float32(settings.vignette) * radius)[..., None]
         if settings.perspective:
             image *= self._gel_window()

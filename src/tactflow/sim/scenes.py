@@ -64,7 +64,7 @@ class Scene:
     def __init__(self, name: str, programme: motion.Programme | None, settings: Settings) -> None:
         self.name = name
         self.settings = settings
-        self.camera = Camera(SIZE, settings.perspective, settings.distortion, settings.aperture)
+        self.camera = Camera(settings.perspective, settings.distortion, settings.aperture)
         self.layout = markers.layout(settings, SIZE)
         self._raw = PixelMapping.identity(SIZE)
         self._programme = programme
@@ -112,12 +112,6 @@ class Scene:
         presses, cycle = self._contact(self._moment(index))
         shown = ~self._hidden(cycle)
         return Truth(presses, self.camera, pixels, self.layout.rest, shown)
-
-    def markers(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Origin and position (N, 2) of the markers in frame `index`, raw px; faster than `truth`."""
-        rest = self.layout.rest
-        now = rest + gel.displacement(self.presses(index), rest)
-        return self.camera.to_raw(rest), self.camera.to_raw(now)
 
     def _hidden(self, cycle: int) -> NDArray[np.bool_]:
         """(N,) bool: markers invisible during contact number `cycle` (-1: no contact)."""

@@ -7,7 +7,8 @@ indenter reaches `d - gap` below the untouched surface of the gel.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -27,20 +28,18 @@ class Shape:
     the dilation, px.
     """
 
-    name: str
     gap: Callable[[Array, Array], Array]
     reach: float
     depth: float
     sources: NDArray[np.float64]
     spread: float
-    dilation: float = field(default=1.0)
 
-    def __post_init__(self) -> None:
-        # Normalise the largest displacement to 1.
+    @cached_property
+    def _largest_push(self) -> float:
+        """Largest displacement before scaling, px."""
         line = np.linspace(-self.reach, self.reach, 41)
         grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        largest = float(np.sqrt(np.max(np.sum(self._push(grid) ** 2, axis=1))))
-        object.__setattr__(self, "dilation", 1.0 / max(largest, 1e-12))
+        return max(float(np.sqrt(np.max(np.sum(self._push(grid) ** 2, axis=1)))), 1e-12)
 
     def _push(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         away = points[:, None, :] - self.sources[None, :, :]
@@ -54,7 +53,7 @@ class Shape:
         "FOTS: A Fast Optical Tactile Simulator for Sim2Real Learning of Tactile-Motor Robot Manipulation
         Skills", RA-L 2024).
         """
-        return self._push(points) * self.dilation
+        return self._push(points) * (1.0 / self._largest_push)
 
 
 def _segment(half_length: float, count: int) -> NDArray[np.float64]:
@@ -68,7 +67,7 @@ def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
         return np.asarray((x * x + y * y) * np.float32(0.5 / radius), dtype=np.float32)
 
     contact = float(np.sqrt(radius * depth))
-    return Shape("sphere", gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
+    return Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
 
 
 def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
@@ -80,7 +79,7 @@ def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
         return np.asarray(round_part + np.hypot(x, y) - np.sqrt(squared), dtype=np.float32)
 
     contact = float(np.sqrt(radius * depth))
-    return Shape("ball", gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
+    return Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
 
 
 def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0, bend: float = 0.0) -> Shape:
@@ -107,7 +106,7 @@ def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0,
         arc = sources[:, 0] * curvature
         sources = np.stack([np.sin(arc), 1.0 - np.cos(arc)], axis=1) / curvature
     contact = float(np.sqrt(radius * depth))
-    return Shape("cable", gap, half_length + 4 * contact, depth, sources, 1.3 * contact)
+    return Shape(gap, half_length + 4 * contact, depth, sources, 1.3 * contact)
 
 
 def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, lean: float = 0.0) -> Shape:
@@ -127,7 +126,7 @@ def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, l
         away = np.sqrt(beyond * beyond + across * across + np.float32(9.0)) - np.float32(rise)
         return np.asarray((away + across * np.float32(lean)) * np.float32(slope), dtype=np.float32)
 
-    return Shape("edge", gap, half_length + 150, depth, _segment(half_length, 12), 45.0)
+    return Shape(gap, half_length + 150, depth, _segment(half_length, 12), 45.0)
 
 
 def _flank(outside: Array) -> Array:
@@ -147,7 +146,7 @@ def box(
         return _flank(np.maximum(outside, 0))
 
     sources = _segment(max(half_width - half_height, 0.0), 5)
-    return Shape("box", gap, float(np.hypot(half_width, half_height)) + 70, depth, sources, 1.1 * half_height)
+    return Shape(gap, float(np.hypot(half_width, half_height)) + 70, depth, sources, 1.1 * half_height)
 
 
 def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape:
@@ -157,7 +156,7 @@ def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape
         across = np.hypot(x, y) - np.float32(radius)
         return np.asarray(across * across * np.float32(0.5 / tube), dtype=np.float32)
 
-    return Shape("ring", gap, radius + 3.8 * float(np.sqrt(tube * depth)), depth, np.zeros((1, 2)), radius)
+    return Shape(gap, radius + 3.8 * float(np.sqrt(tube * depth)), depth, np.zeros((1, 2)), radius)
 
 
 def _lookup(picture: Array, outside: float) -> Callable[[Array, Array], Array]:
@@ -197,7 +196,7 @@ def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Sha
         beyond = _flank(np.maximum(from_center - np.float32(radius - 10.0), 0))
         return np.asarray(np.where(from_center > radius - 10.0, 0, lower) + beyond, dtype=np.float32)
 
-    return Shape("coin", gap, radius + 90, depth, np.zeros((1, 2)), 0.8 * radius)
+    return Shape(gap, radius + 90, depth, np.zeros((1, 2)), 0.8 * radius)
 
 
 def block(half_width: float = 215.0, half_height: float = 135.0, depth: float = 12.0) -> Shape:
@@ -208,7 +207,7 @@ def block(half_width: float = 215.0, half_height: float = 135.0, depth: float = 
         groove = np.float32(0.5) - np.float32(0.5) * np.cos(x * np.float32(2 * np.pi / 43.0))
         return np.asarray(plain.gap(x, y) + np.float32(5.0) * groove**4, dtype=np.float32)
 
-    return Shape("block", gap, plain.reach, depth, plain.sources, plain.spread)
+    return Shape(gap, plain.reach, depth, plain.sources, plain.spread)
 
 
 def key(depth: float = 11.0) -> Shape:
@@ -226,7 +225,7 @@ def key(depth: float = 11.0) -> Shape:
     def gap(x: Array, y: Array) -> Array:
         return _flank(outside(x, y))
 
-    return Shape("key", gap, 290.0, depth, _segment(150.0, 7), 75.0)
+    return Shape(gap, 290.0, depth, _segment(150.0, 7), 75.0)
 
 
 def screw(
@@ -243,7 +242,7 @@ def screw(
         ridge = np.cos((x + np.float32(0.16) * y) * np.float32(2 * np.pi / thread))
         return np.asarray(smooth.gap(x, y) + np.float32(ridges) * (1 - ridge), dtype=np.float32)
 
-    return Shape("screw", gap, smooth.reach, depth, _segment(half_length, 12), smooth.spread)
+    return Shape(gap, smooth.reach, depth, _segment(half_length, 12), smooth.spread)
 
 
 def finger(depth: float = 26.0) -> Shape:
