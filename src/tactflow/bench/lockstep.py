@@ -135,11 +135,11 @@ def with_params(pipeline: Pipeline, stage: str, **params: Any) -> Pipeline:
     return replace(pipeline, nodes={**pipeline.nodes, stage: changed})
 
 
-def on_recording(pipeline: Pipeline, path: Path, **params: Any) -> Pipeline:
-    """The same pipeline reading another recording. params : further parameters of the capture stage."""
+def on_recording(pipeline: Pipeline, path: Path) -> Pipeline:
+    """The same pipeline reading another recording."""
     source = pipeline.source
     kept = source.params.model_dump(exclude_unset=True)
-    return with_params(pipeline, source.id, **{**kept, "source": str(path), **params})
+    return with_params(pipeline, source.id, **{**kept, "source": str(path)})
 
 
 def take_turns(
