@@ -285,7 +285,7 @@ def test_every_command_of_the_page_is_one() -> None:
     page = (REPOSITORY / "docs" / "batch.md").read_text()
     commands = re.findall(r"^tactflow (batch .*?)(?:  +#.*)?$", page, re.MULTILINE)
     assert len(commands) > 3
-    parser = make_parser(["batch"])
+    parser = make_parser("batch")
     for line in commands:
         words = shlex.split(line.replace("$SLURM_ARRAY_TASK_ID", "3"))
         assert parser.parse_args(words).out == Path("out"), line

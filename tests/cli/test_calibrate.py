@@ -91,15 +91,15 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert "it still fits" in capsys.readouterr().out
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
     told = capsys.readouterr().out
-    assert "with another sensor or light, or where something touches the gel at the start" in told
+    assert "with another sensor or light, or where something touches it at the start" in told
     assert "calibrate anew" in told
     # One press of another ball is no drift.
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:finger?frames=12") == 3
     told = capsys.readouterr().out
-    assert "1 press today" in told
-    assert "with a ball whose radius is not 2.375 mm" in told
+    assert "presses today, 1: " in told
+    assert "a ball whose radius is not 2.375 mm" in told
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:idle?frames=3") == 0
-    assert "no presses today, so depth is not looked at" in capsys.readouterr().out
+    assert "no presses today: to check the depth" in capsys.readouterr().out
 
 
 def test_a_printed_target_gives_the_scale(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tactflow.calibration.presses import Press, PressFinder
-from tactflow.cli.guide import Guide, judged
+from tactflow.cli.guide import Guide
 
 GEL = np.zeros((90, 90, 3), np.uint8)
 MASK = np.zeros((90, 90), np.uint8)
@@ -22,13 +22,16 @@ def finder(presses: list[Press], *, lasts: bool = False) -> PressFinder:
     return session
 
 
-def test_a_press_is_good_or_light_or_cut_off() -> None:
-    presses = [press(45, 45), press(20, 20), press(20, 70, radius=4), press(5, 45)]
-    assert judged(presses[:1], 0).startswith("good, radius 10 px; 8 of 9 parts of the gel have none yet")
-    assert judged(presses, 2) == "light, radius 4 px where 10 px is usual; press harder (u: undo)"
-    assert judged(presses, 3).startswith("cut off by the border of the picture at (5, 45)")
-    everywhere = [press(15 + 30 * column, 15 + 30 * row) for row in range(3) for column in range(3)]
-    assert judged(everywhere, 0) == "good, radius 10 px; all parts of the gel have one"
+def test_each_press_is_judged_and_the_next_place_is_named() -> None:
+    said: list[str] = []
+    guide = Guide(9, said.append)
+    guide(finder([]))
+    guide(finder([press(45, 45), press(20, 20), press(20, 70, radius=4), press(5, 45)]))
+    assert said[0] == "press 1 of 9: good, radius 10 px. Press the ball firmly at the upper left."
+    assert said[2].startswith(
+        "press 3 of 9: light, radius 4 px where 10 px is usual; press harder (u: undo). Press the ball"
+    )
+    assert said[3].startswith("press 4 of 9: cut off by the border of the picture at (5, 45)")
 
 
 def test_the_last_press_is_undone_and_the_session_ended_by_what_is_typed() -> None:
@@ -59,7 +62,7 @@ def test_the_last_press_is_undone_and_the_session_ended_by_what_is_typed() -> No
 def test_a_session_that_goes_on_says_where_it_stands() -> None:
     said: list[str] = []
     Guide(3, said.append)(finder([press(45, 45)]))
-    assert said == ["going on with 1 presses of before; 8 of 9 parts of the gel have none yet"]
+    assert said == ["saved presses so far: 1"]
 
 
 def test_presses_of_a_recording_beyond_those_that_are_wanted_are_counted_alone() -> None:

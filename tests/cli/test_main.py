@@ -54,7 +54,7 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "--max-fames=6"], "unrecognized arguments: --max-fames=6; did you mean --max-frames?"),
         (["check", "a.yaml", "b.yaml"], "unrecognized arguments: b.yaml"),
         (["run", "x.yaml", "--source", "1.png", __file__, "3.png"], "quote the pattern: --source 'FOLDER"),
-        (["run", "--stats-every", "0"], "required a time such as 90s, 2min or 1h, got '0'"),
+        (["run", "--hang-after", "0"], "required a time such as 90s, 2min or 1h, got '0'"),
         (["check", "--set"], "expected one argument"),
         (["schema", "sensor"], "invalid choice"),
         (["stages", "hul"], "there is no stage or sink 'hul'; did you mean hull?"),
@@ -189,17 +189,6 @@ def test_a_report_replaces_no_results(
     assert main([*command, "--jsonl", "a.jsonl", option, "./a.jsonl"]) == 3
     assert "a.jsonl" in capsys.readouterr().err
     assert '"frames"' not in Path("a.jsonl").read_text()
-
-
-def test_a_line_of_statistics_and_the_summary_are_printed_on_standard_error(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    source = ["--source", "sim:press?frames=60", "--set", "stages.capture.realtime=true"]
-    assert main(["run", *source, "--set", "sinks={}", "--stats-every", "0.3"]) == 0
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert " frames/s; " in err
-    assert " frames in " in err
 
 
 @pytest.mark.parametrize(("value", "code"), [("abc", 2), ("", 2), ("5kB", 2), ("10Mb", 0), ("1048576", 0)])

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from tactflow.api import Settings, ended_by_signals, load, make_runner
 from tactflow.calibration import force, presses, target
@@ -32,7 +31,7 @@ from tactflow.calibration.reference import Reference, read_reference, recordings
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
 from tactflow.cli.guide import Guide, typed_lines
 from tactflow.cli.options import add_overwrite, add_sensor, number, positive, refuse_output
-from tactflow.cli.terminal import notes, printable, say, typed
+from tactflow.cli.terminal import notes, say, show, typed
 from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
@@ -44,11 +43,11 @@ from tactflow.view.guided import Guiding
 from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
-"""Error on new presses over that in the file above which a calibration counts as drifted. By hand."""
+"""Error on new presses over that in the file above which a calibration counts as drifted."""
 LOOSE: Final = 0.02
-"""Relative error of a scale by pitch above which a better method is advised. Chosen by hand: grids of the
-simulator have less than 0.01, the rings of a TacTip 0.1 to 0.15."""
-# Chosen by hand: gels and balls have 1 to 100.
+"""Relative error of a scale by pitch above which a better method is advised: grids of the simulator have less
+than 0.01, the rings of a TacTip 0.1 to 0.15."""
+# Gels and balls have 1 to 100.
 _millimetres = number(float, 1e-3, 1e4, "millimetres from 0.001 to 10000")
 
 
@@ -94,12 +93,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option("--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only")
     option("--presses", type=positive, default=30, metavar="N", help="of a live source: enough presses (30)")
     option("--view", action="store_true", help="show the live page, which says where to press next")
-    _add_target_and_force(parser)
-
-
-def _add_target_and_force(parser: argparse.ArgumentParser) -> None:
-    """Declare the options about a printed target, and those of `calibrate force`."""
-    option = parser.add_argument
     option(
         "--target",
         metavar="PICTURE",
@@ -229,56 +222,49 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     session = _find_presses(_load(args, pipeline), guide)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
-        print(
-            printable(f"does not fit: {misfit}; name the pipeline that it was made with, or calibrate anew")
-        )
+        show([f"does not fit: {misfit}; name the pipeline that it was made with, or calibrate anew"])
         return 3
     unlike = calibration.unlikeness(session.untouched)
-    fits = unlike <= UNLIKE
-    print(
-        f"untouched gel: differs by {100 * unlike:.1f} % of its brightness; up to {100 * UNLIKE:.0f} % fits"
-    )
-    if not fits:
-        print("it also differs with another sensor or light, or where something touches the gel at the start")
+    limit = f"up to {100 * UNLIKE:.0f} % fits"
+    show([f"untouched gel: differs by {100 * unlike:.1f} % of its brightness; {limit}"])
+    fits = [unlike <= UNLIKE]
+    if unlike > UNLIKE:
+        show(["it also differs with another sensor or light, or where something touches it at the start"])
     if then is not None:
-        fits = _check_presses(calibration, then, session) and fits
+        fits.append(_check_presses(calibration, then, session))
     if args.csv is not None:
-        fits = _check_force(args, path, calibration.force, pipeline) and fits
-    print("it still fits" if fits else "it does not fit; if none of this explains it, calibrate anew")
-    return 0 if fits else 3
+        fits.append(_check_force(args, path, calibration.force, pipeline))
+    show(["it still fits" if all(fits) else "it does not fit; if none of this explains it, calibrate anew"])
+    return 0 if all(fits) else 3
 
 
 def _check_presses(calibration: Calibration, then: PhotometricEntry, session: Session) -> bool:
     """Print how well a calibration fits the presses of today; True where there are none."""
-    count = len(session.presses)
+    count, radius = len(session.presses), f"{then.ball_radius:g} mm"
     if calibration.slopes is None or not count:
-        print(
-            "no presses today, so depth is not looked at: show the untouched gel, then a ball of radius "
-            f"{then.ball_radius:g} mm"
+        show(
+            [f"no presses today: to check the depth, show the untouched gel, then a ball of radius {radius}"]
         )
         return True
     now = try_photometry(session, calibration.slopes, calibration.scale, then.ball_radius)
-    print(f"{count} {'press' if count == 1 else 'presses'} today: {_photometric_words(now)}")
-    print(f"when it was made: {_photometric_words(then.model_dump())}")
-    if now["normal_error"] <= WORSE * then.normal_error:
-        return True
-    print(
-        f"normals up to {WORSE * then.normal_error:.1f} degrees off fit. They are more off too with few "
-        f"presses, with a ball whose radius is not {then.ball_radius:g} mm, or where the source does not "
-        "begin with the untouched gel"
-    )
-    return False
+    limit = WORSE * then.normal_error
+    show([f"presses today, {count}: {_photometric_words(now)}"])
+    show([f"when it was made: {_photometric_words(then.model_dump())}"])
+    if now["normal_error"] > limit:
+        others = f"few presses, a ball whose radius is not {radius}, or no untouched gel at first"
+        show([f"normals up to {limit:.1f} degrees off fit; {others} also give larger errors"])
+    return now["normal_error"] <= limit
 
 
 def _check_force(
     args: argparse.Namespace, path: Path, entry: ForceEntry | None, pipeline: str | None
 ) -> bool:
-    """Print how right the force of a calibration is today; whether it still is."""
+    """Print the error of a calibration's force today; whether it is still small enough."""
     if entry is None:
         raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
     watched = _watch(_load(args, pipeline), path)
     now = force.try_force(entry, args.csv.name, watched, _read(args.csv, args.offset))
-    print(f"force: {now:.2f} N RMS from the gauge today; when it was made: {entry.press.rmse:.2f} N")
+    show([f"force: {now:.2f} N RMS from the gauge today; when it was made: {entry.press.rmse:.2f} N"])
     return now <= WORSE * entry.press.rmse
 
 
@@ -289,14 +275,13 @@ def _add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> in
         raise ConfigError(f"calibrate force: {path} has a force already; give --overwrite to replace it")
     if args.source is None:
         raise ConfigError(
-            "calibrate force: required --from, a recording with a CSV of the same name beside it"
+            "calibrate force: required --source, a recording with a CSV of the same name beside it"
         )
     pairs = {args.source: args.csv} if args.csv else recordings_with_csv(args.source)
     references = {source: _read(file, args.offset) for source, file in pairs.items()}
     watched = {}
     for source in references:
-        loaded = load(pipeline, source=source, sensor=args.sensor, settings={"calibration": None})
-        watched[source] = _watch(loaded, path)
+        watched[source] = _watch(_load(args, pipeline, source=source), path)
         touched = watched[source].touched
         say(f"{source}: {len(touched)} frames, {touched.sum()} of them with contact")
     fit = force.fit_force(watched, references)
@@ -345,13 +330,13 @@ def _print_lens(args: argparse.Namespace, words: Sequence[str]) -> int:
     if len(words) != 1:
         raise ConfigError("calibrate lens: required one folder, pattern or video with pictures of the target")
     printed = _target(args)
-    views: list[NDArray[np.float64]] = []
     reader = open_source(words[0])
     try:
-        while (read := reader.read()) is not None:
-            size = (read[0].shape[1], read[0].shape[0])
-            points = target.find_target(read[0], printed)
-            views += [] if points is None else [points]
+        views, size = [], (0, 0)
+        for image, *_ in iter(reader.read, None):
+            size = (image.shape[1], image.shape[0])
+            if (points := target.find_target(image, printed)) is not None:
+                views.append(points)
         if not views:
             raise ConfigError(_not_shown(printed, words[0]))
         fit = target.fit_lens(views, printed, size)
@@ -402,8 +387,8 @@ def _target(args: argparse.Namespace) -> target.Target:
 def _target_scale(args: argparse.Namespace, loaded: Pipeline) -> Scale:
     """Scale from `--target`, after the pipeline's own preprocess."""
     printed = _target(args)
-    pictured = load(loaded.file, source=args.target, sensor=args.sensor, settings={"calibration": None})
     images: list[Any] = []
+    pictured = _load(args, loaded.file, source=args.target)
     _run(pictured, lambda result, _: images.append(result.image), {"image": "preprocess"})
     points = target.find_target(images[0], printed) if images and images[0] is not None else None
     if points is None:
@@ -510,21 +495,24 @@ def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = 
 
 
 def _load(
-    args: argparse.Namespace, pipeline: str | None, settings: Settings = MappingProxyType({})
+    args: argparse.Namespace,
+    pipeline: str | None,
+    settings: Settings = MappingProxyType({}),
+    source: str | None = None,
 ) -> Pipeline:
-    """The pipeline without a calibration."""
+    """The pipeline without a calibration. source : default: --source."""
     settings = {"calibration": None, **settings}
-    return load(pipeline, source=args.source, sensor=args.sensor, settings=settings, realtime=args.realtime)
+    source = args.source if source is None else source
+    return load(pipeline, source=source, sensor=args.sensor, settings=settings, realtime=args.realtime)
 
 
 def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[str, Node]:
     """The live page as the pipeline sets it, or as it is by itself, made to guide."""
-    choices: tuple[Settings, ...] = ({}, {"sinks.view": {}})
-    for settings in choices:
-        for id_, node in _load(args, pipeline, settings).nodes.items():
-            if issubclass(node.component.cls, Guiding):
-                component = replace(node.component, cls=node.component.cls.through(guide))
-                return {id_: replace(node, component=component)}
+    own, added = _load(args, pipeline), _load(args, pipeline, {"sinks.view": {}})
+    for node in (*own.sinks, *added.sinks):
+        if issubclass(node.component.cls, Guiding):
+            component = replace(node.component, cls=node.component.cls.through(guide))
+            return {node.id: replace(node, component=component)}
     raise AssertionError("the sink view guides")
 
 

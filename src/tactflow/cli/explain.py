@@ -9,65 +9,49 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tactflow.cli.options import add_json, add_pipeline, load_plan
-from tactflow.cli.statistics import NodeStatistics, Statistics, milliseconds, saving, share
+from tactflow.cli.statistics import Statistics, milliseconds
 from tactflow.cli.terminal import show
 from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
 
-_COSTLY = 0.1
-"""Share of the total time above which a stage is drawn as a costly one. Chosen by hand."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `explain`."""
-    add_arguments_graph(parser)
-    add_json(parser)
-
-
-def add_arguments_graph(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `graph`."""
     add_pipeline(parser)
     parser.add_argument(
         "--stats",
         metavar="run.json",
         help="statistics of a run (tactflow run --stats), to show how often each stage ran and what it cost",
     )
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph for each stage and sink, or the same as JSON."""
-    if args.json:
-        pipeline, plan, statistics = _load(args)
-        about = {"file": pipeline.file, "sensor": pipeline.sensor, "segments": list(plan.segments)}
-        print(json.dumps(about | {"nodes": dict(_facts(pipeline, plan, statistics))}, indent=2))
-        return 0
-    show(explanation(*_load(args)))
-    return 0
-
-
-def run_graph(args: argparse.Namespace) -> int:
-    """Print the flowchart."""
-    show(mermaid(*_load(args)))
-    return 0
-
-
-def _load(args: argparse.Namespace) -> tuple[Pipeline, Plan, Statistics | None]:
     statistics = None if args.stats is None else Statistics.read(Path(args.stats))
-    return (*load_plan(args), statistics)
-
-
-def explanation(pipeline: Pipeline, plan: Plan, statistics: Statistics | None) -> Iterator[str]:
-    """Lines of the explanation."""
+    pipeline, plan = load_plan(args)
+    facts = dict(_facts(pipeline, plan, statistics))
+    if args.json:
+        about = {"file": pipeline.file, "sensor": pipeline.sensor, "segments": list(plan.segments)}
+        print(json.dumps(about | {"nodes": facts}, indent=2))
+        return 0
     skipping = "" if pipeline.skipping else ", skipping is off"
-    yield f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"
+    show([f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"])
     if statistics is not None:
-        yield from _run_lines(pipeline, statistics)
-    for id_, facts in _facts(pipeline, plan, statistics):
-        yield ""
-        yield f"{id_} ({facts.pop('at')})"
-        width = max(map(len, facts))
-        yield from (f"  {name.ljust(width)}  {text}" for name, text in facts.items())
+        show([_whole_run(statistics)])
+    for id_, texts in facts.items():
+        width = max(map(len, texts))
+        show(
+            ["", f"{id_} ({texts.pop('at')})", *(f"  {k.ljust(width)}  {text}" for k, text in texts.items())]
+        )
+    return 0
+
+
+def _whole_run(run: Statistics) -> str:
+    latency = f"latency p50 {milliseconds(run.latency_ms.p50)}, p99 {milliseconds(run.latency_ms.p99)}"
+    frames = f"{run.frames} frames in {run.wall_s:.1f} s, {run.dropped} dropped"
+    return f"the run: {frames}, {latency}, end: {run.end}"
 
 
 def _facts(
@@ -94,7 +78,8 @@ def _facts(
         name, origin = node.component.name, node.component.origin
         facts["is"] = name if ":" in name or name == origin else f"{name} ({origin})"
         if statistics is not None and not is_pruned:
-            facts["statistics"] = _cost(node, statistics)
+            entry = (statistics.stages | statistics.sinks).get(node.id)
+            facts["statistics"] = "not part of that run" if entry is None else str(entry)
         yield node.id, facts
 
 
@@ -152,55 +137,33 @@ def _sinks_behind(pipeline: Pipeline) -> dict[str, list[str]]:
     return behind
 
 
-def _run_lines(pipeline: Pipeline, statistics: Statistics) -> Iterator[str]:
-    """The run as a whole, and what skipping saved in all stages together."""
-    latency = statistics.latency_ms
-    yield (
-        f"the run: {statistics.frames} frames in {statistics.wall_s:.1f} s, {statistics.dropped} dropped, "
-        f"latency p50 {milliseconds(latency.p50)}, p99 {milliseconds(latency.p99)}, end: {statistics.end}"
-    )
-    kinds = {node.id: node.component.kind for node in pipeline.nodes.values()}
-    stages = [entry for id_, entry in statistics.stages.items() if kinds.get(id_) == "stage"]
-    saved = sum(entry.saved_ms for entry in stages)
-    total = saved + sum(entry.spent_ms for entry in stages)
-    if statistics.frames and total > 0:
-        yield f"all stages: {saving(saved, total, statistics.frames)}"
-        yield "            (saved = frames skipped x mean time of a run; of = that + the time spent)"
+def add_arguments_graph(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `graph`."""
+    add_pipeline(parser)
 
 
-def _cost(node: Node, statistics: Statistics) -> str:
-    entry = statistics.nodes.get(node.id)
-    if entry is None:
-        return "not part of that run"
-    if node.component.kind != "sink":
-        return str(entry)
-    # A sink in its own thread gets only the frames that it asked for.
-    times = "once" if entry.runs == 1 else f"{entry.runs} times"
-    cost = f", {milliseconds(entry.mean_ms)} each (p99 {milliseconds(entry.p99_ms)})" if entry.runs else ""
-    return f"written {times} in {statistics.frames} frames{cost}"
+def run_graph(args: argparse.Namespace) -> int:
+    """Print the flowchart."""
+    show(_mermaid(*load_plan(args)))
+    return 0
 
 
-def mermaid(pipeline: Pipeline, plan: Plan, statistics: Statistics | None) -> Iterator[str]:
+def _mermaid(pipeline: Pipeline, plan: Plan) -> Iterator[str]:
     """Lines of a flowchart: segments as boxes, the queues between them as thick arrows, gates dotted.
 
-    Stages that no sink needs stand outside, with a dashed outline. With statistics, nodes show how often they
-    ran, why not and how long a run took, and those that took more than a tenth of the time after the source
-    are filled.
+    Stages that no sink needs stand outside, with a dashed outline.
     """
     nodes = pipeline.nodes
-    entries = {} if statistics is None else {i: e for i, e in statistics.nodes.items() if i in nodes}
-    spent = {id_: entry.spent_ms for id_, entry in entries.items() if id_ != pipeline.source.id}
-    costly = [id_ for id_, time in spent.items() if time > _COSTLY * sum(spent.values())]
     names = {id_: f"n{index}" for index, id_ in enumerate(nodes)}
     boxes = {segment: f"s{index}" for index, segment in enumerate(plan.segments)}
     yield "flowchart LR"
     for segment, members in plan.segments.items():
         yield f'  subgraph {boxes[segment]}["segment {segment}"]'
         for id_ in members:
-            yield f"    {names[id_]}{_shape(nodes[id_], entries.get(id_))}"
+            yield f"    {names[id_]}{_shape(nodes[id_])}"
         yield "  end"
     for node in plan.pruned:
-        yield f"  {names[node.id]}{_shape(node, None)}:::pruned"
+        yield f"  {names[node.id]}{_shape(node)}:::pruned"
     for node in nodes.values():
         ports: dict[str, list[str]] = {}
         for ref in node.inputs.values():
@@ -215,21 +178,8 @@ def mermaid(pipeline: Pipeline, plan: Plan, statistics: Statistics | None) -> It
         yield f'  {boxes[link.producer]} ==>|"queue: {queue}"| {boxes[link.consumer]}'
     if plan.pruned:
         yield "  classDef pruned stroke-dasharray: 4"
-    if costly:
-        yield "  classDef costly fill:#fdd0a2,stroke:#d94801,color:#000"
-        yield f"  class {','.join(names[id_] for id_ in costly)} costly"
 
 
-def _shape(node: Node, entry: NodeStatistics | None) -> str:
+def _shape(node: Node) -> str:
     left, right = {"source": ("([", "])"), "stage": ("[", "]"), "sink": ("[/", "/]")}[node.component.kind]
-    lines = [node.id]
-    if entry is not None:
-        if entry.mean_ms is not None:
-            lines.append(milliseconds(entry.mean_ms))
-        if node.component.kind == "sink":
-            lines.append(f"{entry.runs} times")
-        elif entry.frames:
-            lines += [f"ran {share(entry.runs, entry.frames)}", *entry.reasons()]
-    # A quotation mark would end the label, and < begin a tag.
-    label = "<br/>".join(line.replace('"', "'").replace("<", "&lt;") for line in lines)
-    return f'{left}"{label}"{right}'
+    return f'{left}"{node.id}"{right}'

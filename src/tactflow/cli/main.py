@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Final, NoReturn
 
@@ -44,7 +44,6 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "cameras": ("cameras", "list the cameras that are plugged in, with names that stay the same"),
     "sim": ("sim", "write a simulated recording and its ground truth"),
     "schema": ("pipelines", "print the JSON Schema of the result message or of a pipeline file"),
-    "completion": ("completion", "print a script that completes commands, options and files in a shell"),
 }
 """Command -> module in `tactflow.cli`, and what the command does.
 
@@ -67,13 +66,10 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
         # Imported here: it reads YAML, which not every command does.
         from tactflow.system.redaction import shown_address
 
-        mistakes = error.mistakes if isinstance(error, ConfigError) else ()
-        if len(mistakes) > 1:
-            say(f"tactflow: {len(mistakes)} mistakes")
-            for mistake in mistakes:
-                say(shown_address(mistake))
-        else:
-            say(shown_address(f"tactflow: {error}"))
+        mistakes = error.mistakes if isinstance(error, ConfigError) else (str(error),)
+        first = f"{len(mistakes)} mistakes" if len(mistakes) > 1 else mistakes[0]
+        for text in (f"tactflow: {first}", *(mistakes if len(mistakes) > 1 else ())):
+            say(shown_address(text))
         return error.exit_code
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -90,10 +86,10 @@ def _check_environment() -> None:
             raise ConfigError(f"the environment variable {variable} is {value!r}; required: a number")
 
 
-def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:
+def make_parser(command: str | None) -> argparse.ArgumentParser:
     """The parser of the command line.
 
-    complete : the commands whose arguments it knows; their modules are imported.
+    command : the one whose arguments it knows; its module is imported.
     """
     parser = argparse.ArgumentParser(
         prog="tactflow",
@@ -104,18 +100,18 @@ def make_parser(complete: Collection[str]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tactflow {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, (module_name, summary) in COMMANDS.items():
-        command = subparsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
-        if name in complete:
+        subparser = subparsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        if name == command:
             module = import_module(f"tactflow.cli.{module_name}")
             suffix = "" if name == module_name else f"_{name}"
-            getattr(module, f"add_arguments{suffix}")(command)
-            command.set_defaults(run=getattr(module, f"run{suffix}"), parser=command)
+            getattr(module, f"add_arguments{suffix}")(subparser)
+            subparser.set_defaults(run=getattr(module, f"run{suffix}"), parser=subparser)
     return parser
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     command = next((word for word in argv if not word.startswith("-")), None)
-    parser = make_parser([command] if command in COMMANDS else [])
+    parser = make_parser(command)
     if command is not None and command not in COMMANDS:
         parser.error(f"there is no command {command}{did_you_mean(command, COMMANDS, 'there are ')}")
     args, unknown = parser.parse_known_args(argv)

@@ -64,12 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--stats", metavar="PATH", help="write run statistics as JSON at exit")
     parser.add_argument(
-        "--stats-every",
-        type=seconds,
-        metavar="SECONDS",
-        help="a line on standard error every so often: rate, drops, latency, and what each stage cost since",
-    )
-    parser.add_argument(
         "--trace",
         metavar="FILE",
         help="write what each thread did when, as Chrome trace events; open it at ui.perfetto.dev",
@@ -146,10 +140,7 @@ def _run_all(
 
 def _options(args: argparse.Namespace) -> list[str]:
     """The options of this run for the process of every sensor, except those about sinks and files."""
-    words = []
-    for option, value in (("--max-frames", args.max_frames), ("--stats-every", args.stats_every)):
-        if value is not None:
-            words += [option, str(value)]
+    words = [] if args.max_frames is None else ["--max-frames", str(args.max_frames)]
     flags = (("--realtime", args.realtime), ("--quiet", args.quiet), ("--check", args.check))
     return words + [flag for flag, is_set in flags if is_set]
 
@@ -200,7 +191,7 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
             logger.warning("%s", warning)
         if runner.plan.idle:
             logger.info("not run, as no sink needs it: %s", ", ".join(node.id for node in runner.plan.idle))
-        with run_progress(runner, args.stats_every, shown=not args.quiet) as on_progress:
+        with run_progress(runner, shown=not args.quiet) as on_progress:
             result = runner.run(on_progress)
         code = 0 if result.exit_code == INTERRUPTED and len(caught) == 1 else result.exit_code
         if result.error is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
@@ -12,72 +11,40 @@ from tactflow.engine.errors import ConfigError
 _FAILURES = ("error", "disabled")
 """Reasons for not running that are failures: what they left out is not saved."""
 
-_WORDS = {"no_demand": "not wanted"}
-
 
 class NodeStatistics(BaseModel):
     """What one stage or sink did in a run.
 
     runs : frames it ran on. skips : reason -> frames it did not run on. total_ms : time of all runs.
-    p50_ms, p99_ms : time of a run; None where unknown.
+    p50_ms, p99_ms : time of a run; None without one.
     """
 
     runs: int
     skips: dict[str, int]
-    total_ms: float | None = None
+    total_ms: float
     p50_ms: float | None
     p99_ms: float | None
 
-    @property
-    def frames(self) -> int:
-        """Frames that reached it."""
-        return self.runs + sum(self.skips.values())
-
-    @property
-    def mean_ms(self) -> float | None:
-        """Mean time of a run."""
-        return self.total_ms / self.runs if self.runs and self.total_ms is not None else None
-
-    @property
-    def skipped(self) -> int:
-        """Frames that it could skip; those on which it failed do not count."""
-        return sum(count for reason, count in self.skips.items() if reason not in _FAILURES)
-
-    @property
-    def saved_ms(self) -> float:
-        """Time that skipping saved: frames skipped x mean time of a run."""
-        return self.skipped * (self.mean_ms or 0.0)
-
-    @property
-    def spent_ms(self) -> float:
-        """Time of all runs; 0 where unknown."""
-        return self.total_ms or 0.0 if self.runs else 0.0
-
-    def reasons(self) -> list[str]:
-        """Each reason for not running with its share, the most frequent first."""
-        ordered = sorted(self.skips.items(), key=lambda item: -item[1])
-        return [
-            f"{share(count, self.frames)} {_WORDS.get(reason, reason.replace('_', ' '))}"
-            for reason, count in ordered
-            if count
-        ]
-
     def __str__(self) -> str:
         """How often it ran and why not, time of a run, and what skipping saved per frame."""
-        if not self.frames:
+        frames = self.runs + sum(self.skips.values())
+        if not frames:
             return "never reached by a frame"
-        reasons = self.reasons()
-        parts = [
-            f"ran {share(self.runs, self.frames)}" + (f", skipped {', '.join(reasons)}" if reasons else "")
-        ]
-        if self.p50_ms is not None:
-            mean = "" if self.mean_ms is None else f"mean {milliseconds(self.mean_ms)}, "
-            parts.append(f"a run: {mean}p50 {milliseconds(self.p50_ms)}, p99 {milliseconds(self.p99_ms)}")
-        if self.skipped and self.mean_ms is not None:
-            parts.append(saving(self.saved_ms, self.saved_ms + self.spent_ms, self.frames))
-        elif self.skipped and not self.runs:
-            parts.append("saved: unknown, as it never ran")
-        return "; ".join(parts)
+        text = f"ran {share(self.runs, frames)}"
+        skips = sorted(self.skips.items(), key=lambda item: -item[1])
+        reasons = [f"{share(count, frames)} {reason.replace('_', ' ')}" for reason, count in skips if count]
+        if reasons:
+            text += f", skipped {', '.join(reasons)}"
+        if not self.runs:
+            return text
+        mean = self.total_ms / self.runs
+        p50, p99 = milliseconds(self.p50_ms), milliseconds(self.p99_ms)
+        text += f"; a run: mean {milliseconds(mean)}, p50 {p50}, p99 {p99}"
+        saved = mean * sum(count for reason, count in skips if reason not in _FAILURES)
+        if saved:
+            of = milliseconds((saved + self.total_ms) / frames)
+            text += f"; saved {milliseconds(saved / frames)} of {of} a frame"
+        return text
 
 
 class Latency(BaseModel):
@@ -95,7 +62,7 @@ class Statistics(BaseModel):
     wall_s: float
     end: str
     stages: dict[str, NodeStatistics]
-    sinks: dict[str, NodeStatistics] = {}
+    sinks: dict[str, NodeStatistics]
     latency_ms: Latency
 
     @classmethod
@@ -110,11 +77,6 @@ class Statistics(BaseModel):
                 f"--stats {path}: not a statistics file; tactflow run --stats writes one"
             ) from None
 
-    @property
-    def nodes(self) -> Mapping[str, NodeStatistics]:
-        """Id of a stage or sink -> its statistics."""
-        return {**self.sinks, **self.stages}
-
 
 def share(part: int, whole: int) -> str:
     """A share in percent; 0 % and 100 % only where that is exact.
@@ -126,11 +88,6 @@ def share(part: int, whole: int) -> str:
     if 0 < percent < 1:
         return "<1 %"
     return ">99 %" if 99 < percent < 100 else f"{percent:.0f} %"
-
-
-def saving(saved_ms: float, all_ms: float, frames: int) -> str:
-    """`saved 38.0 ms of 41.0 ms a frame`."""
-    return f"saved {milliseconds(saved_ms / frames)} of {milliseconds(all_ms / frames)} a frame"
 
 
 def milliseconds(value: float | None) -> str:

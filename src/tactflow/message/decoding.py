@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
-from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, MarkerStatus, Scale, Slip
+from tactflow.message.encoding import FLOW_DETAILS, STATUS_NAMES
+from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, Scale, Slip
 
 T = TypeVar("T")
 
-_STATUS = {status.name.lower(): int(status) for status in MarkerStatus}
 _UNKNOWN = float("nan")
 
 
@@ -23,17 +24,18 @@ def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str,
     Raises KeyError, TypeError or ValueError for what is no result message.
     """
     skipped = {str(port): str(reason) for port, reason in message["skipped"].items()}
-    contact = message["contact"]
-    parts = () if contact is None else tuple(map(_contact, message.get("contacts", ())))
     values: dict[str, Any] = {
-        "contact": None if contact is None else _contact(contact, parts if len(parts) > 1 else ()),
+        "contact": _optional(_contact, message["contact"]),
         "flow": _optional(_flow, message["flow"]),
         "markers": _optional(_markers, message["markers"]),
         "scale": _optional(_scale, message.get("scale")),
-        "depth": None if contact is None or contact.get("depth_mm") is None else _depth(contact),
+        "depth": _optional(_depth, message["contact"]),
         "slip": _optional(_slip, message.get("slip")),
         "force": _optional(_force, message.get("force")),
     }
+    parts = tuple(map(_contact, message.get("contacts", ())))
+    if values["contact"] is not None and len(parts) > 1:
+        values["contact"] = replace(values["contact"], separate=parts)
     absent = {port: Absent(skipped.get(port, "none")) for port, value in values.items() if value is None}
     return values | absent, skipped
 
@@ -42,17 +44,30 @@ def _optional(decode: Callable[[Any], T], value: Any) -> T | None:
     return None if value is None else decode(value)
 
 
-def _contact(contact: Any, separate: tuple[Contact, ...] = ()) -> Contact:
+def _numbers(value: Any) -> Any:
+    """A number, or a tuple of numbers; None where it is not known."""
+    return tuple(map(_numbers, value)) if isinstance(value, list | tuple) else _optional(float, value)
+
+
+def _pair(pair: Any) -> tuple[float, float]:
+    x, y = pair
+    return float(x), float(y)
+
+
+def _points(points: Any) -> NDArray[np.float64]:
+    return np.array(points, np.float64).reshape(-1, 2)
+
+
+def _contact(contact: Any) -> Contact:
     return Contact(
         area=float(contact["area"]),
         center=_pair(contact["center"]),
-        angle=_optional(float, contact.get("angle")),
-        slope=_optional(float, contact.get("slope")),
+        angle=_optional(float, contact["angle"]),
+        slope=_optional(float, contact["slope"]),
         hull=_points(contact["hull"]),
-        ellipse=_optional(_ellipse, contact.get("ellipse")),
+        ellipse=_optional(_ellipse, contact["ellipse"]),
         confidence=float(contact.get("confidence", 0.0)),
         evidence=contact.get("evidence", "light"),
-        separate=separate,
     )
 
 
@@ -60,21 +75,19 @@ def _ellipse(ellipse: Any) -> Ellipse:
     return Ellipse(_pair(ellipse["center"]), _pair(ellipse["axes"]), _optional(float, ellipse["angle"]))
 
 
-def _depth(contact: Any) -> Depth:
-    return Depth(
-        heights=np.zeros((0, 0), np.float32),
-        greatest=float(contact["depth_mm"]),
-        greatest_stderr=_optional(float, contact.get("depth_mm_stderr")),
-        volume=float(contact["volume_mm3"]),
-        volume_stderr=_optional(float, contact.get("volume_mm3_stderr")),
+def _depth(contact: Any) -> Depth | None:
+    if contact.get("depth_mm") is None:
+        return None
+    depth, depth_stderr, volume, volume_stderr = (
+        _numbers(contact.get(key))
+        for key in ("depth_mm", "depth_mm_stderr", "volume_mm3", "volume_mm3_stderr")
     )
+    return Depth(np.zeros((0, 0), np.float32), depth, depth_stderr, volume, volume_stderr)
 
 
 def _flow(flow: Any) -> Flow:
-    numbers = ("rotation", "divergence", "residual", "rotation_stderr", "divergence_stderr", "shear_stderr")
-    values: dict[str, Any] = {key: _optional(_pair, flow.get(key)) for key in ("mean", "stderr", "shear")}
-    values |= {key: _optional(float, flow.get(key)) for key in numbers}
-    return Flow(count=int(flow["count"]), **values)
+    details = {key: _numbers(flow.get(key)) for key in FLOW_DETAILS}
+    return Flow(_optional(_pair, flow["mean"]), int(flow["count"]), **details)
 
 
 def _markers(markers: Any) -> Markers:
@@ -82,7 +95,7 @@ def _markers(markers: Any) -> Markers:
     return Markers(
         origin=_points(markers["origin"]),
         position=_points(markers["position"]),
-        status=np.array([_STATUS[name] for name in status], np.uint8),
+        status=np.array([STATUS_NAMES.index(name) for name in status], np.uint8),
         # None becomes NaN: unknown.
         stderr=np.array(markers.get("stderr", [None] * len(status)), np.float64),
     )
@@ -97,18 +110,4 @@ def _slip(slip: Any) -> Slip:
 
 
 def _force(force: Any) -> Force:
-    (x, y, z), (x_stderr, y_stderr, z_stderr) = force["value"], force["stderr"]
-    return Force(
-        (_optional(float, x), _optional(float, y), float(z)),
-        (_optional(float, x_stderr), _optional(float, y_stderr), float(z_stderr)),
-        bool(force["in_range"]),
-    )
-
-
-def _pair(pair: Any) -> tuple[float, float]:
-    x, y = pair
-    return float(x), float(y)
-
-
-def _points(points: Any) -> NDArray[np.float64]:
-    return np.array(points, np.float64).reshape(-1, 2)
+    return Force(_numbers(force["value"]), _numbers(force["stderr"]), bool(force["in_range"]))

@@ -14,10 +14,16 @@ from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus, S
 
 if TYPE_CHECKING:
     from tactflow.message.result import Result
+    from tactflow.vision.flow.displacement_field import DisplacementField
 
 SCHEMA = "tactflow.frame/1"
 STATUS_NAMES = tuple(status.name.lower() for status in sorted(MarkerStatus))
 """The word for each value of `MarkerStatus`."""
+FLOW_DETAILS = (
+    *("stderr", "rotation", "divergence", "residual"),
+    *("rotation_stderr", "divergence_stderr", "shear_stderr", "shear"),
+)
+"""Attributes of `Flow` that only a detailed message has."""
 _EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
 """What `skipped` of a message may name: the ports that every message has, and the reference."""
 
@@ -40,41 +46,22 @@ def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
     if scale is not None:
         message["scale"] = {"mm_per_px": (scale.x, scale.y), "origin": scale.origin}
     if result.slip is not None:
-        message["slip"] = {
-            "slipping": bool(result.slip.slipping),
-            "stick_ratio": result.slip.stick_ratio,
-        }
+        message["slip"] = _attributes(result.slip, "slipping", "stick_ratio")
     if result.force is not None:
-        force = result.force
-        message["force"] = {"value": force.value, "stderr": force.stderr, "in_range": bool(force.in_range)}
+        message["force"] = _attributes(result.force, "value", "stderr", "in_range")
     if field:
-        found = result.field
-        message["field"] = (
-            None
-            if found is None
-            else {
-                "first": found.grid.first,
-                "spacing": found.grid.spacing,
-                "displacement": found.displacement,
-                "stderr": found.stderr,
-            }
-        )
+        message["field"] = None if result.field is None else _field(result.field)
     return {name: _finite(part, name) for name, part in message.items()}
 
 
+def _attributes(part: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(part, name) for name in names}
+
+
 def _contact(contact: Contact, scale: Scale | None, depth: Depth | None, detail: bool) -> dict[str, Any]:
-    ellipse = contact.ellipse
-    message: dict[str, Any] = {
-        "area": contact.area,
-        "center": contact.center,
-        "angle": contact.angle,
-        "slope": contact.slope,
-        "hull": contact.hull,
-        "ellipse": None
-        if ellipse is None
-        else {"center": ellipse.center, "axes": ellipse.axes, "angle": ellipse.angle},
-        "evidence": contact.evidence,
-    }
+    message = _attributes(contact, "area", "center", "angle", "slope", "hull", "ellipse", "evidence")
+    if contact.ellipse is not None:
+        message["ellipse"] = _attributes(contact.ellipse, "center", "axes", "angle")
     if scale is not None:
         message |= {"center_mm": scale.point(contact.center), "area_mm2": scale.area(contact.area)}
     if detail:
@@ -90,27 +77,24 @@ def _contact(contact: Contact, scale: Scale | None, depth: Depth | None, detail:
 
 
 def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
-    message: dict[str, Any] = {"mean": flow.mean, "count": int(flow.count)}
+    message = _attributes(flow, "mean", "count")
     if scale is not None:
         message["mean_mm"] = None if flow.mean is None else scale.vector(flow.mean)
         if detail and flow.mean is not None and flow.stderr is not None:
             message["mean_mm_stderr"] = scale.vector_stderr(flow.mean, flow.stderr)
     if detail:
-        for key in (
-            *("stderr", "rotation", "divergence", "residual"),
-            *("rotation_stderr", "divergence_stderr", "shear_stderr", "shear"),
-        ):
-            message[key] = getattr(flow, key)
+        message |= _attributes(flow, *FLOW_DETAILS)
     return message
 
 
 def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
-    message: dict[str, Any] = {
-        "origin": markers.origin,
-        "position": markers.position,
-        "status": [STATUS_NAMES[value] for value in markers.status.tolist()],
-    }
+    message = _attributes(markers, "origin", "position")
+    message["status"] = [STATUS_NAMES[value] for value in markers.status.tolist()]
     return message | {"stderr": markers.stderr} if detail else message
+
+
+def _field(field: DisplacementField) -> dict[str, Any]:
+    return _attributes(field.grid, "first", "spacing") | _attributes(field, "displacement", "stderr")
 
 
 def _finite(value: Any, name: str) -> Any:
