@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -183,7 +184,11 @@ def test_one_ctrl_c_ends_the_look_at_the_source_and_the_next_one_ends_the_comman
     def signalled(_: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("tactflow.cli.doctor._progress", lambda frames: signalled(0) if frames == 5 else None)
+    @contextmanager
+    def progress_bar(_: str) -> Iterator[Callable[..., None]]:
+        yield lambda description: signalled(0) if description == "5 frames" else None
+
+    monkeypatch.setattr("tactflow.cli.doctor.progress_bar", progress_bar)
     words = ["doctor", "--source", "sim:idle?frames=20"]
     with ending_handled(interrupt):
         assert main(words) == 0

@@ -134,13 +134,10 @@ def test_separate_contacts_are_listed_and_nothing_is_an_empty_list() -> None:
     assert build_message(TICK, Results())["contacts"] == []
 
 
-def test_without_a_processed_image_the_size_is_that_of_the_raw_one() -> None:
-    assert build_message(TICK, Results())["size"] == [800, 600]
-
-
-def test_reasons_for_skipping_are_passed_on() -> None:
+def test_without_a_processed_image_the_size_is_that_of_the_raw_one_and_reasons_are_passed_on() -> None:
     tick = Tick(TICK.frame, skipped={"contact": "no_contact", "flow": "no_contact"})
     message = build_message(tick, Results())
+    assert message["size"] == [800, 600]
     assert message["skipped"] == {"contact": "no_contact", "flow": "no_contact"}
     VALIDATOR.validate(message)
 
@@ -179,8 +176,7 @@ def test_numbers_arrive_as_they_were(rows: list[tuple[float, float, float, float
 @pytest.mark.parametrize(
     "field",
     ["t", "contact.area", "contact.center", "contact.angle", "contact.slope", "contact.hull",
-     "contact.ellipse.axes", "contact.confidence", "flow.mean", "flow.rotation", "markers.origin",
-     "markers.position"],
+     "contact.ellipse.axes", "flow.mean", "flow.rotation", "markers.origin", "markers.stderr"],
 )  # fmt: skip
 def test_a_number_that_is_not_finite_is_refused_by_name(field: str, bad: float) -> None:
     tick, contact, flow, markers = TICK, CONTACT, FLOW, MARKERS
@@ -196,17 +192,11 @@ def test_a_number_that_is_not_finite_is_refused_by_name(field: str, bad: float) 
     elif first == "flow":
         flow = replace(FLOW, **{rest: (bad, 1.0) if rest == "mean" else bad})
     else:
-        markers = replace(MARKERS, **{rest: points})
+        # NaN stands for an unknown standard error.
+        bad_errors = np.array([math.inf, 0.0, bad])
+        markers = replace(MARKERS, **{rest: bad_errors if rest == "stderr" else points})
     with pytest.raises(ValueError, match=field):
         encode_message(result_of(tick, Results(None, contact, flow, markers)), detail=True)
-
-
-def test_an_infinite_standard_error_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"markers\.stderr"):
-        encode_message(
-            result_of(TICK, Results(None, None, None, replace(MARKERS, stderr=np.array([np.inf, 0, 0])))),
-            detail=True,
-        )
 
 
 def _changed(path: str, value: Any) -> dict[str, Any]:
@@ -226,36 +216,17 @@ def _changed(path: str, value: Any) -> dict[str, Any]:
     ("path", "value"),
     [
         ("schema", "tactflow.frame/2"),
-        ("schema", ...),
-        ("sensor", 1),
         ("seq", -1),
-        ("seq", 1.5),
-        ("t", "now"),
         ("t", None),
-        ("size", [300]),
-        ("size", [300, 400, 3]),
         ("size", [0, 400]),
         ("contact", ...),
-        ("contact", {}),
-        ("contact.area", -1.0),
         ("contact.angle", -90.0),
-        ("contact.angle", 90.1),
-        ("contact.angle", ...),
-        ("contact.center", [1.0]),
         ("contact.hull", [[1.0, 2.0, 3.0]]),
-        ("contact.ellipse", {"center": [1, 2]}),
         ("contact.ellipse.axes", [1.0, 0.0]),
         ("contact.extra", 1),
-        ("contact.confidence", None),
-        ("flow.count", -1),
         ("flow.mean", [1.0, None]),
-        ("flow.extra", 1),
         ("markers.status", ["seen"]),
-        ("markers.position", [[1.0, None]]),
-        ("markers.extra", []),
-        ("skipped", None),
         ("skipped", {"flow": 1}),
-        ("extra", 1),
     ],
 )
 def test_the_schema_refuses_what_the_contract_does_not_say(path: str, value: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
 from tactflow.sinks.jsonl import Jsonl
+from tests.clock import until
 from tests.sinks.full_disk import disk_full_after
 
 IMAGE = np.zeros((3, 4, 3), np.uint8)
@@ -113,11 +113,19 @@ def test_closing_twice_or_without_opening_is_harmless(tmp_path: Path) -> None:
     assert not sink.wants()
 
 
-def test_standard_output_gets_every_line_at_once(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
+def test_standard_output_gets_every_line_at_once(capfdbinary: pytest.CaptureFixture[bytes]) -> None:
     sink = opened("-", flush=60.0)
     assert sink.wants()
     write(sink, range(2))
-    assert [json.loads(line)["seq"] for line in capsysbinary.readouterr().out.splitlines()] == [0, 1]
+    out = b""
+
+    def all_are_there() -> bool:
+        nonlocal out
+        out += capfdbinary.readouterr().out
+        return out.count(b"\n") == 2
+
+    until(all_are_there)
+    assert [json.loads(line)["seq"] for line in out.splitlines()] == [0, 1]
     sink.close()
-    sys.stdout.write("still open")
-    assert capsysbinary.readouterr().out == b"still open"
+    print("still open", flush=True)
+    assert capfdbinary.readouterr().out == b"still open\n"

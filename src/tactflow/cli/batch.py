@@ -6,6 +6,7 @@ import argparse
 import os
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -25,7 +26,7 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.report import Section, write_report
 from tactflow.system.signals import INTERRUPTED, ending_handled
 
-_LONGEST = 200
+LONGEST = 200
 """Letters of a message in a list of many: two lines of a terminal."""
 
 
@@ -84,7 +85,11 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "parquet":
         require_pyarrow()
     file, words = _pipeline_and_sources(args.words)
-    _refuse_several_sensors(args, file)
+    sensors = sensor_names(file, args.overrides)
+    if len(sensors) > 1 and args.sensor is None:
+        raise ConfigError(
+            f"{file} has the sensors {', '.join(sensors)}; a recording is of one: give --sensor {sensors[0]}"
+        )
     requests = [resolved(file, args.overrides, args.sensor, args.format)]
     if args.compare is not None:
         requests.append(resolved(find_pipeline(args.compare), [], args.sensor, args.format))
@@ -169,7 +174,9 @@ class _Call:
                 failed += outcome.status != "done"
                 frames += outcome.frames
                 if outcome.status != "done":
-                    self._say(f"failed: {outcome.name}: {_in_short(outcome)}")
+                    reason = (outcome.error or "").partition("\n")[0]
+                    reason = textwrap.shorten(reason, LONGEST, placeholder=" ...")
+                    self._say(f"failed: {outcome.name}: {reason}")
                 text = f"{done} of {total}, {failed} failed, {frames} frames"
                 update(completed=done, description=text)
 
@@ -208,14 +215,6 @@ def _pipeline_and_sources(words: Sequence[str]) -> tuple[Path, Sequence[str]]:
     return file, rest
 
 
-def _refuse_several_sensors(args: argparse.Namespace, file: Path) -> None:
-    names = sensor_names(file, args.overrides)
-    if len(names) > 1 and args.sensor is None:
-        raise ConfigError(
-            f"{file} has the sensors {', '.join(names)}; a recording is of one: give --sensor {names[0]}"
-        )
-
-
 def _closing(result: Result, done_before: int) -> Iterator[str]:
     """The summary at the end."""
     failed, outcomes = result.failed, result.outcomes.values()
@@ -227,12 +226,6 @@ def _closing(result: Result, done_before: int) -> Iterator[str]:
     warnings = [o.warnings.partition("\n")[0] for o in outcomes if o.warnings and o.status == "done"]
     if warnings:
         yield f"{len(warnings)} done with warnings: {warnings[0]}; the table of runs has all"
-
-
-def _in_short(outcome: Outcome) -> str:
-    """Why a recording failed, in a line; the table and the page have all of it."""
-    text = (outcome.error or "").partition("\n")[0]
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
 
 
 def _shard(text: str) -> tuple[int, int]:

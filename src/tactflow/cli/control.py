@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from tactflow.cli.options import add_endpoint, add_json, seconds, writing
-from tactflow.cli.terminal import show, typed
+from tactflow.cli.terminal import show, show_json, typed
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
@@ -51,9 +50,9 @@ def run(args: argparse.Namespace) -> int:
     except RuntimeError as error:
         raise StageError(f"control: {error}") from None
     if args.json:
-        print(json.dumps(answer))
+        show_json(answer)
     elif "stats" in answer:
-        print(json.dumps(answer["stats"], indent=2))
+        show_json(answer["stats"])
     else:
         show([f"{answer['state']['sensor']}: {answer['message']}"])
     return 0

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
-import orjson
 from numpy.typing import NDArray
 
-from tactflow.cli.options import add_json, add_overwrite, refuse_output, writing
-from tactflow.cli.terminal import printable
+from tactflow.cli.options import add_json, add_overwrite, number, refuse_output, writing
+from tactflow.cli.terminal import printable, show_json
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
@@ -22,8 +23,11 @@ from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
 
+_index = number(int, 0, math.inf, "a whole number from 0")
 SHOWN: Final = 0.25
-"""Score of the runner-up, relative to that of the marks, above which it is shown. Chosen by hand."""
+"""Score of the runner-up, relative to that of the marks, above which it is shown."""
+IN_JSON: Final = ("centers", "polarity", "dot_radius", "pitch")
+"""Attributes of the detected marks, px of the picture that was looked at."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,14 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--picture", type=Path, metavar="FILE", help="write what was found and why, to look at or to send"
     )
     add_overwrite(parser)
-    parser.add_argument("--frame", type=int, default=0, metavar="N", help="which frame, the first is 0")
+    parser.add_argument("--frame", type=_index, default=0, metavar="N", help="which frame, the first is 0")
     parser.add_argument("--rotate", type=int, default=0, choices=(0, 90, 180, 270), help="as in preprocess")
     parser.add_argument(
         "--downsample", type=int, default=1, choices=(1, 2, 4, 8, 16), help="as in preprocess"
     )
     parser.add_argument("--dot", type=float, metavar="PX", help="radius of a mark, if it is known")
     parser.add_argument("--polarity", default="auto", choices=("auto", "dark", "bright"), help="of the marks")
-    parser.add_argument("--all", action="store_true", help="look everywhere, also where no gel seems to be")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -56,13 +59,11 @@ def run(args: argparse.Namespace) -> int:
     if (args.first is None) == (args.source is None):
         raise ConfigError("required one source: tactflow detect --source SRC")
     source = args.source or args.first
-    if args.frame < 0:
-        raise ConfigError(f"--frame: required 0 or more, got {args.frame}")
     if args.picture is not None:
         refuse_output("--picture", args.picture, overwrite=args.overwrite, suffixes=(".png", ".jpg"))
     image = _frame(source, args.frame)
     image = Preprocessor(image.shape[1::-1], rotate=args.rotate, downsample=args.downsample)(image)
-    valid = None if args.all else valid_area(image)
+    valid = valid_area(image)
     marks: Detection | None = None
     try:
         marks = detect_markers(image, dot_radius=args.dot, polarity=args.polarity, valid=valid)
@@ -75,21 +76,18 @@ def run(args: argparse.Namespace) -> int:
     title = f"{source}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
     without = 0.0 if valid is None else float(np.mean(valid == 0))
     if without > 0:
-        lines.append(f"dim: {100 * without:.0f} % of the picture show no gel; --all looks there, too")
+        lines.append(f"dim: {100 * without:.0f} % of the picture show no gel")
     text = "\n".join(map(printable, [title, *lines]))
-    print(orjson.dumps(_as_json(marks, lines)).decode() if args.json else text)
+    if args.json:
+        found = {} if marks is None else {key: getattr(marks, key) for key in IN_JSON}
+        show_json({"centers": [], "polarity": None, **found, "notes": lines})
+    else:
+        print(text)
     if args.picture is not None:
         picture = draw_detection(image, marks, text, rival=rival, valid=valid)
         with writing(f"--picture {args.picture}"), completed(args.picture) as partial:
             partial.write_bytes(cv2.imencode(args.picture.suffix.lower(), picture)[1].tobytes())
     return 0 if marks is not None else StageError.exit_code
-
-
-def _as_json(marks: Detection | None, lines: Sequence[str]) -> dict[str, Any]:
-    """The marks in px of the picture that was looked at, and what is said about them."""
-    found = {} if marks is None else {"dot_radius": marks.dot_radius, "pitch": marks.pitch}
-    centers = [] if marks is None else marks.centers.tolist()
-    return {"centers": centers, "polarity": marks and marks.polarity, **found, "notes": lines}
 
 
 def _near_rival(marks: Detection) -> Candidate | None:
@@ -123,15 +121,13 @@ def _best(spots: Candidate | None, what: str = "best") -> Iterator[str]:
         yield f"magenta: {what}, {spots}; {closed}; score {spots.score:.1f}"
 
 
-def _frame(source: str, number: int) -> NDArray[np.uint8]:
+def _frame(source: str, index: int) -> NDArray[np.uint8]:
     """One frame of a source."""
     reader = open_source(source)
     try:
-        count = 0
-        while (frame := reader.read()) is not None:
-            if count == number:
-                return frame[0]
-            count += 1
-        raise SourceError(f"{source}: --frame {number} is beyond its {count} frames, counted from 0")
+        frame = next(islice(iter(reader.read, None), index, None), None)
     finally:
         reader.close()
+    if frame is None:
+        raise SourceError(f"{source}: has no frame {index}, counted from 0")
+    return frame[0]

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import textwrap
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import orjson
-
 from tactflow.cli.options import add_json, seconds
-from tactflow.cli.terminal import show
+from tactflow.cli.terminal import progress_bar, show, show_json
 from tactflow.engine.errors import StageError
 from tactflow.sources import KINDS
 from tactflow.system.signals import ending_handled, interrupt
@@ -57,9 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from tactflow.doctor import examine, observe, worst
 
     # The first signal ends only the look at the source.
-    with ending_handled(interrupt):
-        seen = observe(args.source, args.seconds, _progress)
-    _progress(0)
+    with ending_handled(interrupt), progress_bar("0 frames") as update:
+        seen = observe(args.source, args.seconds, lambda count: update(description=f"{count} frames"))
     findings = examine(seen)
     verdict = worst(findings)
     title = f"{seen.description}: {seen.frames} frames looked at"
@@ -73,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         _write_page(args.html, title, summary, seen, findings)
     if args.json:
         facts = {"source": seen.source, "frames": seen.frames, "verdict": verdict}
-        print(orjson.dumps({**facts, "checks": [asdict(finding) for finding in findings]}).decode())
+        show_json({**facts, "checks": findings})
     else:
         show([title, *(line for finding in findings for line in _lines(finding)), summary])
     return StageError.exit_code if verdict == "fault" else 0
@@ -98,9 +93,3 @@ def _write_page(path: Path, title: str, summary: str, seen: Observation, finding
     ]
     table = Table(["", "check", "measured", "effect", "what to change"], rows)
     write_report(path, title, [Section(summary, pictures=[picture(seen.pairs[0].image)], tables=[table])])
-
-
-def _progress(frames: int) -> None:
-    """Tell on a terminal how many frames came; 0 clears the line."""
-    if sys.stderr.isatty() and frames % 10 == 0:
-        print(f"\r{frames} frames ..." if frames else "\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -4,13 +4,12 @@ pipeline as a Mermaid flowchart."""
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 from tactflow.cli.options import add_json, add_pipeline, load_plan
 from tactflow.cli.statistics import Statistics, milliseconds
-from tactflow.cli.terminal import show
+from tactflow.cli.terminal import show, show_json
 from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
@@ -34,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     facts = dict(_facts(pipeline, plan, statistics))
     if args.json:
         about = {"file": pipeline.file, "sensor": pipeline.sensor, "segments": list(plan.segments)}
-        print(json.dumps(about | {"nodes": facts}, indent=2))
+        show_json(about | {"nodes": facts})
         return 0
     skipping = "" if pipeline.skipping else ", skipping is off"
     show([f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"])

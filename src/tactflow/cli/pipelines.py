@@ -9,7 +9,7 @@ import time
 from importlib.resources import files
 
 from tactflow.cli.options import add_json, add_pipeline, add_quiet, load_plan
-from tactflow.cli.terminal import say, show, table
+from tactflow.cli.terminal import say, show, show_json, table
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if args.name is not None:
         print(find_pipeline(args.name).read_text(encoding="utf-8"), end="")
     elif args.json:
-        print(json.dumps(described_pipelines(), indent=2))
+        show_json(described_pipelines())
     else:
         show(table(list(described_pipelines().items())))
     return 0
@@ -66,7 +66,7 @@ def run_check(args: argparse.Namespace) -> int:
             pipeline.sensor: {"stages": [*pipeline.nodes], "warnings": [*pipeline.warnings, *plan.warnings]}
             for pipeline, plan in valid.values()
         }
-        print(json.dumps({"mistakes": mistakes, "sensors": parts}, indent=2))
+        show_json({"mistakes": mistakes, "sensors": parts})
         return ConfigError.exit_code if mistakes else 0
     if mistakes:
         raise ConfigError(*mistakes)
@@ -114,7 +114,7 @@ def run_schema(args: argparse.Namespace) -> int:
         from tactflow.config.schema import pipeline_schema
 
         schema = pipeline_schema(catalogue()[0])
-    print(json.dumps(schema, indent=2))
+    show_json(schema)
     return 0
 
 

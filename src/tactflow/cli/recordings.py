@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from tactflow.cli.options import add_overwrite, add_quiet, refuse_output, writing
+from tactflow.cli.options import add_overwrite, add_quiet, number, refuse_output, writing
 from tactflow.cli.terminal import notes, progress_bar, say
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.recording import missing_packages
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 EXPORTS = "tactflow.exports"
 """Group of entry points: name of a format -> function that writes a dataset. It is called with a folder to
 fill, `(name, results)` of each recording, and `fps`, `task` and `pictures` as keywords."""
-FASTEST = 1000
-"""Highest frame rate of a dataset, Hz; cameras of gels are slower. Chosen by hand."""
+_frame_rate = number(int, 1, 1000, "1 to 1000 frames a second")
 
 
 def add_arguments_export(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +39,9 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pipeline", metavar="PIPELINE", help="what finds contact and flow (default: as `tactflow run`)"
     )
-    parser.add_argument("--fps", type=int, help="of the dataset (default: that of the first recording)")
+    parser.add_argument(
+        "--fps", type=_frame_rate, help="of the dataset (default: that of the first recording)"
+    )
     parser.add_argument(
         "--task", default="touch", help="what is done, in words: the dataset keeps it (default: touch)"
     )
@@ -57,16 +58,13 @@ def run_export(args: argparse.Namespace) -> int:
 
     Raises
     ------
-    ConfigError : there is no such format, the folder is there already, or the frame rate is invalid. Nothing
-        was written.
+    ConfigError : there is no such format, or the folder is there already. Nothing was written.
     TactflowError : as `tactflow run`; nothing is left behind.
     """
     exporter = _exporter(args.format)
     if args.out.exists():
         raise ConfigError(f"--out: {args.out} is already there; give another folder")
-    fps = _rate(args.recordings[0]) if args.fps is None else args.fps
-    if not 1 <= fps <= FASTEST:
-        raise ConfigError(f"--fps: required 1 to {FASTEST}, got {fps}")
+    fps = args.fps or _rate(args.recordings[0])
     started: list[str] = []
     try:
         with notes(), writing(args.out), completed(args.out) as folder:
@@ -140,6 +138,9 @@ def run_repair(args: argparse.Namespace) -> int:
         If a path is wrong (nothing was written). SourceError if the file cannot be read or is not an MCAP
         file. StageError if the copy cannot be written.
     """
+    from tactflow.recording.records import NotARecordingError
+    from tactflow.recording.repair import repair
+
     problem = missing_packages()
     if problem is not None:
         raise ConfigError(problem)
@@ -150,26 +151,20 @@ def run_repair(args: argparse.Namespace) -> int:
     if out.exists() and out.samefile(path):
         raise ConfigError(f"--out: {out} is the file to repair; name another one")
     refuse_output("--out", out, overwrite=args.overwrite)
-    with writing(f"--out {out}"):
-        summary = _repair(path, out, shown=not args.quiet)
-    if not args.quiet:
-        say(summary)
-    return 0
-
-
-def _repair(path: Path, out: Path, *, shown: bool) -> str:
-    """Write the copy, unless the file is whole; says what was done."""
-    from tactflow.recording.records import NotARecordingError
-    from tactflow.recording.repair import repair
-
-    with completed(out) as copy, progress_bar(path.name, path.stat().st_size, shown=shown) as update:
+    bar = progress_bar(path.name, path.stat().st_size, shown=not args.quiet)
+    with writing(f"--out {out}"), completed(out) as copy, bar as update:
         try:
             result = repair(path, copy, lambda done: update(completed=done))
         except NotARecordingError as error:
             raise SourceError(f"{path}: {error}") from None
+        summary = f"{out}: {result.messages} messages; {path} stays as it is"
+        if result.lost:
+            summary += f"; {result.lost} bytes of it belonged to nothing intact"
         if result.finished:
             copy.unlink()
-            return f"{path}: is whole already, nothing to repair ({result.messages} messages)"
-        copy.chmod(path.stat().st_mode & 0o777)
-    lost = f", {result.lost} bytes belonged to nothing intact" if result.lost else ""
-    return f"{out}: {result.messages} messages{lost}; {path} stays as it is"
+            summary = f"{path}: is whole already, nothing to repair ({result.messages} messages)"
+        else:
+            copy.chmod(path.stat().st_mode & 0o777)
+    if not args.quiet:
+        say(summary)
+    return 0

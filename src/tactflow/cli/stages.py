@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import inspect
-import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
 from tactflow.cli.options import add_json
-from tactflow.cli.terminal import say, show, table
+from tactflow.cli.terminal import say, show, show_json, table
 from tactflow.config.document import shown
 from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, names, resolve
@@ -46,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     for problem in problems:
         say(f"tactflow: warning: {problem}")
     if args.json:
-        print(json.dumps([*map(_as_json, components)], indent=2))
+        show_json([*map(_as_json, components)])
         return 0
     if args.name is not None:
         print("\n".join(details(components[0])))

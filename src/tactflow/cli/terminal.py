@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
+import orjson
+
 
 def printable(line: str) -> str:
     """One line from files, cameras and the network, without characters that control a terminal.
@@ -34,6 +36,12 @@ def typed(*words: str) -> str:
 def show(lines: Iterable[str]) -> None:
     """Print results, one line each, on standard output."""
     print("\n".join(map(printable, lines)))
+
+
+def show_json(value: object) -> None:
+    """Print a result as JSON on standard output: dicts, lists, dataclasses, arrays."""
+    options = orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS
+    print(orjson.dumps(value, option=options).decode())
 
 
 def say(text: str) -> None:

@@ -8,10 +8,8 @@ import tempfile
 import time
 from pathlib import Path
 
-import orjson
-
 from tactflow.cli.options import add_json, add_overwrite, add_sensor, number, refuse_output, seconds, writing
-from tactflow.cli.terminal import notes, printable, say, show, typed
+from tactflow.cli.terminal import notes, printable, say, show, show_json, typed
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
@@ -89,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         search = Search(goal, args.budget - (time.monotonic() - began), args.seed, say)
         tuned = search.run(known, recording, folder)
     if args.json:
-        print(orjson.dumps(report.as_json(tuned), option=orjson.OPT_NON_STR_KEYS).decode())
+        show_json(report.as_json(tuned))
     else:
         show(report.lines(tuned))
     if page is not None:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
 import os
-import select
+import queue
 import sys
+import threading
 import time
-from collections import deque
 from contextlib import suppress
-from io import BytesIO, UnsupportedOperation
-from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,39 +21,17 @@ from tactflow.system.outputs import cannot_write, refuse_interference
 log = logging.getLogger("tactflow")
 
 LOOK_EVERY = 0.1
-"""Time between two looks whether to go on waiting for a reader, s. Chosen by hand."""
+"""Time between two looks whether to go on waiting for a reader, s."""
 LINGER = 1.0
 """Time to deliver the last lines to a reader who is not waited for any more, s; as the ZeroMQ sink's."""
 MOST_WAITING = 1000
-"""Lines kept for a reader that takes none: 17 s at 60 Hz, 6 MB with 60 markers each. Chosen by hand."""
-
-
-if sys.platform == "win32":
-    _CHUNK = 512
-
-    def _open_pipe(path: Path) -> int:
-        return os.open(path, os.O_WRONLY)
-
-    def _writable(_number: int, _seconds: float) -> bool:
-        return True
-
-else:
-    _CHUNK = select.PIPE_BUF
-
-    def _open_pipe(path: Path) -> int:
-        """Open a pipe for writing; raises ENXIO instead of waiting while it has no reader."""
-        number = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
-        os.set_blocking(number, True)
-        return number
-
-    def _writable(number: int, seconds: float) -> bool:
-        poll = select.poll()
-        poll.register(number, select.POLLOUT)
-        return bool(poll.poll(round(seconds * 1000)))
+"""Lines kept for a reader that takes none: 17 s at 60 Hz, 6 MB with 60 markers each."""
+LONGEST_LINE = 1 << 24
+"""Upper bound of a line, bytes: one with a displacement field has some 100 kB."""
 
 
 class LineStream:
-    """Writes whole lines to a pipe or standard output, or keeps them for a slow reader.
+    """Writes whole lines to a pipe or standard output from a thread of its own, at the pace of the reader.
 
     In a live run, the oldest beyond `MOST_WAITING` lines are dropped; otherwise the reader is waited for.
 
@@ -72,41 +47,70 @@ class LineStream:
     def __init__(self, path: str, control: Control | None = None) -> None:
         self.delivered = self.dropped = 0
         self.ended = False
-        self._control = control
         self._name = "standard output" if path == "-" else path
-        self._lines: deque[bytes] = deque()
+        self._control = control
         self._sent = 0
-        self._file: BinaryIO = sys.stdout.buffer if path == "-" else self._open(expanded(path))
+        self._lines: queue.Queue[bytes | None] = queue.Queue(MOST_WAITING)
+        self._error: OSError | None = None
+        self._opened = threading.Event()
+        # A daemon: to open or write a pipe may take for ever.
+        self._thread = threading.Thread(target=self._deliver, args=(path,), daemon=True)
+        self._thread.start()
+        if not self._opened.wait(LOOK_EVERY):
+            log.info("%s: waits for a reader", path)
+        while not self._opened.wait(LOOK_EVERY) and not self.ended:
+            self.ended = self._is_hurried()
+        self._raise_error()
 
-    def _open(self, path: Path) -> BinaryIO:
-        for attempt in count():
-            try:
-                return os.fdopen(_open_pipe(path), "wb", buffering=0)
-            except OSError as error:
-                if error.errno != errno.ENXIO or not path.is_fifo():
-                    raise cannot_write(path, error) from error
-            if attempt == 0:
-                log.info("%s: waits for a reader", path)
-            if self._hurried():
-                break
-            time.sleep(LOOK_EVERY)
-        self.ended = True
-        return BytesIO()
+    def _deliver(self, path: str) -> None:
+        """Body of the thread."""
+        try:
+            # Not the buffer of standard output, which Python could not flush at exit while a write hangs.
+            number = sys.stdout.fileno() if path == "-" else os.open(expanded(path), os.O_WRONLY)
+            self._opened.set()
+            with os.fdopen(number, "wb", buffering=0, closefd=path != "-") as file:
+                while (line := self._lines.get()) is not None:
+                    while line:
+                        line = line[file.write(line) or 0 :]
+                    self.delivered += 1
+        except OSError as error:
+            if path == "-" and isinstance(error, BrokenPipeError | ConnectionResetError):
+                discard_output(sys.stdout)
+            else:
+                self._error = error
+            self.ended = True
+        finally:
+            self._opened.set()
 
-    def _live(self) -> bool:
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            kept = f"the {self.delivered} lines written before are complete" if self.delivered else ""
+            raise cannot_write(self._name, self._error, kept) from self._error
+
+    def _is_live(self) -> bool:
         source = None if self._control is None else self._control.source
         return source is not None and source.live
 
-    def _hurried(self) -> bool:
+    def _is_hurried(self) -> bool:
         return self._control is not None and self._control.hurried
 
     def send(self, line: bytes) -> None:
-        """Add a line, without its end, and write what the reader takes."""
-        self._lines.append(line + b"\n")
-        self._write(0.0)
-        while len(self._lines) > MOST_WAITING:
-            # The rest of a line that was begun has to follow.
-            del self._lines[1 if self._sent else 0]
+        """Add a line, without its end; wait while the reader of a recording takes none."""
+        while not self.ended:
+            waits = not (self._is_live() or self._is_hurried())
+            try:
+                self._lines.put(line + b"\n", waits, LOOK_EVERY)
+            except queue.Full:
+                if not waits:
+                    self._drop_oldest()
+                continue
+            self._sent += 1
+            return
+        self._raise_error()
+
+    def _drop_oldest(self) -> None:
+        with suppress(queue.Empty):
+            self._lines.get_nowait()
             if not self.dropped:
                 log.warning("%s: its reader is too slow: lines are dropped", self._name)
             self.dropped += 1
@@ -116,53 +120,21 @@ class LineStream:
 
         Also raises StageError if the reader did not take all lines of a recording.
         """
-        try:
-            if not self.ended:
-                self._write(LINGER)
-                self.dropped += len(self._lines)
-            if self.dropped and not self._live():
-                raise StageError(
-                    f"{self._name}: its reader took only {self.delivered} lines before the run was stopped; "
-                    f"{self.dropped} more are lost"
-                )
-        finally:
-            if self._file is not sys.stdout.buffer:
-                with suppress(OSError):
-                    self._file.close()
-
-    def _write(self, patience: float) -> None:
-        """Write what the reader takes; where nobody waits for it, for `patience` s at most."""
-        until = time.monotonic() + patience
-        try:
-            while self._lines:
-                if not self._takes_more(0.0):
-                    if (self._live() or self._hurried()) and time.monotonic() >= until:
-                        return
-                    self._takes_more(LOOK_EVERY)
-                    continue
-                line = self._lines[0]
-                self._sent += self._file.write(line[self._sent : self._sent + _CHUNK])
-                self._file.flush()
-                if self._sent >= len(line):
-                    self._lines.popleft()
-                    self._sent = 0
-                    self.delivered += 1
-        except OSError as error:
-            if self._file is sys.stdout.buffer and error.errno in (errno.EPIPE, errno.ECONNRESET):
-                self.ended = True
-                discard_output(sys.stdout)
-                return
-            kept = f"the {self.delivered} lines written before are complete"
-            raise cannot_write(self._name, error, kept) from error
-
-    def _takes_more(self, seconds: float) -> bool:
-        """Whether a write of up to `_CHUNK` bytes returns at once, perhaps with an error."""
-        try:
-            number = self._file.fileno()
-        except (UnsupportedOperation, ValueError):
-            # A program has replaced standard output by something of its own.
-            return True
-        return _writable(number, seconds)
+        until = time.monotonic() + LINGER
+        while self._thread.is_alive() and not self.ended:
+            with suppress(queue.Full):
+                self._lines.put(None, timeout=LOOK_EVERY)
+            self._thread.join(LOOK_EVERY)
+            if (self._is_live() or self._is_hurried()) and time.monotonic() > until:
+                break
+        self._raise_error()
+        if not self.ended:
+            self.dropped = self._sent - self.delivered
+        if self.dropped and not self._is_live():
+            raise StageError(
+                f"{self._name}: its reader took only {self.delivered} lines before the run was stopped; "
+                f"{self.dropped} more are lost"
+            )
 
 
 class LineFile:
@@ -242,13 +214,9 @@ def _complete_last_line(file: BinaryIO, path: Path) -> int:
 
     Raises StageError if the file ends with something else: that is not ours to cut off.
     """
-    end = start = file.seek(0, os.SEEK_END)
-    tail = b""
-    while start > 0 and b"\n" not in tail:
-        step = min(start, 65536)
-        start = file.seek(start - step)
-        tail = file.read(step) + tail
-    rest = tail[tail.rfind(b"\n") + 1 :]
+    end = file.seek(0, os.SEEK_END)
+    file.seek(max(0, end - LONGEST_LINE))
+    rest = file.read().rpartition(b"\n")[2]
     if not rest:
         return end
     try:
