@@ -63,14 +63,3 @@ def test_every_parameter_of_a_built_in_is_described(component: object) -> None:
     assert component.cls.__doc__
     for name, field in component.params.model_fields.items():
         assert field.description, name
-
-
-def test_a_broken_class_in_an_own_file_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copy(PARTS, tmp_path / "parts.py")
-    monkeypatch.chdir(tmp_path)
-    assert main(["stages", "./parts.py:Bare"]) == 2
-    assert "parameter image has no annotation" in capsys.readouterr().err
-    assert main(["stages", "./parts.py"]) == 2
-    assert "has several classes" in capsys.readouterr().err

@@ -50,19 +50,6 @@ def test_a_ctrl_c_in_a_block_that_fails_is_handled_after_it() -> None:
     assert handled == [signal.SIGINT]
 
 
-def test_the_exit_code_stands_wherever_the_signal_came(tmp_path: Path) -> None:
-    # Seen to end by SIGINT in CPython 3.11 where a KeyboardInterrupt itself is raised.
-    (tmp_path / "ending.py").write_text("""
-import sys
-from tactflow.system.signals import Interrupted
-try:
-    exec("raise Interrupted")
-except KeyboardInterrupt:
-    sys.exit(7)
-""")
-    assert subprocess.run([sys.executable, "-m", "ending"], cwd=tmp_path, check=False).returncode == 7
-
-
 def interrupted(folder: Path, words: list[str], *numbers: int) -> tuple[int, str]:
     """Exit code and standard error of a program that gets signals.
 
