@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -55,8 +53,3 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(StageError, match=r"report\.html: cannot be written: "):
         written(tmp_path / "file")
-
-
-def test_matplotlib_is_imported_only_for_a_plot() -> None:
-    code = "import sys, tactflow.report; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

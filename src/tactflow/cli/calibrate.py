@@ -93,6 +93,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option("--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only")
     option("--presses", type=positive, default=30, metavar="N", help="of a live source: enough presses (30)")
     option("--view", action="store_true", help="show the live page, which says where to press next")
+    _add_target_and_force(parser)
+
+
+def _add_target_and_force(parser: argparse.ArgumentParser) -> None:
+    """Declare the options about a printed target, and those of `calibrate force`."""
+    option = parser.add_argument
     option(
         "--target",
         metavar="PICTURE",

@@ -91,7 +91,12 @@ def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipe
 
 
 def number(kind: type[float], least: float, most: float, required: str) -> Callable[[str], float]:
-    """A type of argparse: an `int` or `float` within limits. required : what the complaint asks for."""
+    """A type of argparse: an `int` or `float` within limits. required : what the complaint asks for.
+
+    >>> number(float, 0.1, 100.0, "a length")("1e300")
+    Traceback (most recent call last):
+    argparse.ArgumentTypeError: required a length, got '1e300'
+    """
 
     def parse(text: str) -> float:
         try:
@@ -116,8 +121,8 @@ def seconds(text: str) -> float:
     argparse.ArgumentTypeError
         If the text is not a length of time.
 
-    >>> seconds("90s"), seconds("1.5min")
-    (90.0, 90.0)
+    >>> seconds("90s"), seconds("1.5min"), seconds("1h")
+    (90.0, 90.0, 3600.0)
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z]*)", text.strip())
     if match is None or match[2] not in UNITS or float(match[1]) <= 0:

@@ -232,9 +232,9 @@ def _write_report(option: str, path: str, lines: Iterable[str]) -> bool:
                 file.writelines(f"{line}\n" for line in lines)
         except OSError as error:
             problem = f"cannot be written: {error.strerror or error}"
-            if not is_device(path):
-                with suppress(OSError):
-                    os.truncate(path, 0)
+            # A device cannot be truncated.
+            with suppress(OSError):
+                os.truncate(path, 0)
     if problem is not None:
         say(f"tactflow: {option} {path}: {problem}")
     return problem is None

@@ -14,8 +14,8 @@ the wrong order. Different words are less similar: threads and radius 0.62, dept
 def closest(word: str, candidates: Iterable[str]) -> str | None:
     """The candidate a misspelled word most likely means, or None; upper case does not matter.
 
-    >>> closest("min_aera", ["min_area", "method"])
-    'min_area'
+    >>> closest("min_aera", ["min_area", "method"]), closest("HULL", ["hull"]), closest("threads", ["radius"])
+    ('min_area', 'hull', None)
     """
     lowered = {candidate.lower(): candidate for candidate in candidates}
     found = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=MISSPELLED)
@@ -26,6 +26,9 @@ def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: 
     """`; did you mean X?` for a misspelled word, else the list of candidates, if there are any.
 
     otherwise : how the list begins.
+
+    >>> did_you_mean("hul", ["hull", "capture"]), did_you_mean("zzz", ["hull", "capture"])
+    ('; did you mean hull?', '; known: hull, capture')
     """
     candidates = list(candidates)
     guess = closest(word, candidates)
