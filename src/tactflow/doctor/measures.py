@@ -258,11 +258,11 @@ def motion(reference: Image, now: Image, points: NDArray[np.float32]) -> NDArray
     """
     if not len(points):
         return np.zeros((0, 2), np.float32)
-    pictures, window = [_smooth(reference), _smooth(now)], (31, 31)
-    ends, found, _ = cv2.calcOpticalFlowPyrLK(*pictures, points, points.copy(), winSize=window)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(*pictures[::-1], ends, ends.copy(), winSize=window)
-    good = (found.ravel() == 1) & (found_back.ravel() == 1) & (np.hypot(*(back - points).T) < 0.3)
-    return np.asarray((ends - points)[good], np.float32)
+    before, after, window = _smooth(reference), _smooth(now), (31, 31)
+    ends, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, points.copy(), winSize=window)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, ends, points.copy(), winSize=window)
+    good = (np.ravel(found) == 1) & (np.ravel(found_back) == 1) & (np.hypot(*(back - points).T) < 0.3)
+    return np.asarray(np.subtract(ends, points)[good], np.float32)
 
 
 def _smooth(image: Image) -> Image:
