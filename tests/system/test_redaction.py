@@ -50,6 +50,10 @@ def test_a_pipeline_is_handed_on_without_its_secrets(text: str) -> None:
         ["run", "--source", f"ftp://me:{SECRET}@camera/1"],
         ["run", "--set", f"stages.capture.source=ftp://me:{SECRET}@camera/1"],
         ["run", "--set", f"sinks.jsonl={{token: {SECRET}}}"],
+        ["run", "--source", f"rtsp://127.0.0.1:{SECRET}/word@camera/1"],
+        ["run", f"rtsp://me:{SECRET}@camera/1"],
+        ["run", "one.yaml", f"rtsp://me:{SECRET}@camera/1"],
+        ["repair", f"http://camera/{SECRET}"],
         ["batch", f"rtsp://me:{SECRET}@camera/1", "--out", "unused"],
     ],
 )
@@ -76,3 +80,5 @@ def test_what_is_no_secret_stays() -> None:
     text = "stages: {capture: {source: 'http://camera:81'}}\nsinks: {view: {token: null, path: 'ipc:///tmp/a'}}\n"
     assert without_secrets(text) == text
     assert public_address("/data/press@2x.avi") == "/data/press@2x.avi"
+    hidden = public_address("no stream at http://camera/1: no answer")
+    assert public_address(hidden) == hidden == "no stream at http://camera/...: no answer"

@@ -10,8 +10,9 @@ from importlib import import_module
 from typing import Final, NoReturn
 
 from tactflow import __version__
-from tactflow.cli.terminal import say
+from tactflow.cli.terminal import printable, say
 from tactflow.engine.errors import ConfigError, TactflowError
+from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.spelling import closest, did_you_mean
 
@@ -63,9 +64,6 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
         before_run()
         return int(args.run(args))
     except TactflowError as error:
-        # Imported here: it reads YAML, which not every command does.
-        from tactflow.system.redaction import shown_address
-
         mistakes = error.mistakes if isinstance(error, ConfigError) else (str(error),)
         first = f"{len(mistakes)} mistakes" if len(mistakes) > 1 else mistakes[0]
         for text in (f"tactflow: {first}", *(mistakes if len(mistakes) > 1 else ())):
@@ -86,12 +84,17 @@ def _check_environment() -> None:
             raise ConfigError(f"the environment variable {variable} is {value!r}; required: a number")
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        super().error(shown_address(printable(message)))
+
+
 def make_parser(command: str | None) -> argparse.ArgumentParser:
     """The parser of the command line.
 
     command : the one whose arguments it knows; its module is imported.
     """
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="tactflow",
         description="From camera frames of a tactile sensor to contact geometry and marker flow.",
         epilog="'tactflow COMMAND --help' explains one command.",

@@ -167,8 +167,9 @@ def _stream_hint(url: str) -> str:
     try:
         parts = urlsplit(url)
         port = parts.port
-    except ValueError as error:
-        return f"the address is not valid: {error}"
+    except ValueError:
+        # Python's own message repeats what may be a password with a slash.
+        return "the address is not valid; in a password, write / as %2F and @ as %40"
     if parts.scheme == "udp":
         return f"does anything send MPEG-TS to port {port or '(no port given)'} of this machine?"
     host = f"{parts.hostname or '(no host given)'}{f':{port}' if port else ''}"

@@ -7,9 +7,8 @@ import re
 from collections.abc import Iterator
 from typing import Any, Final
 
-import yaml
-
-_ADDRESS = re.compile(r"\b(?!ipc:|file:)([A-Za-z][A-Za-z0-9+.-]*://)(\S*)")
+# With a single slash: what `pathlib` makes of an address that is given in place of a file.
+_ADDRESS = re.compile(r"\b((?!ipc:|file:)[A-Za-z][A-Za-z0-9+.-]*://|(?:https?|rtsps?|udp|tcp):/)(\S*)")
 SHOW: Final = "TACTFLOW_SHOW_ADDRESSES"
 """The environment variable that lets messages on the terminal show addresses as they were given."""
 _KEYS = ("token", "password")
@@ -36,10 +35,13 @@ def _scheme_and_host(address: re.Match[str]) -> str:
     behind = address[2][len(rest) :]  # belongs to the sentence or the YAML around the address
     front = re.split(r"[/?#;]", rest, maxsplit=1)[0]
     host = front.rpartition("@")[2]
+    if rest in (host, f"{host}/"):
+        # Nothing to hide, or hidden already.
+        return address[0]
     if "@" in rest[len(front) :]:
         # A password may hold a slash, so what stands in front of it is not known to be the host.
         return f"{scheme}...{behind}"
-    return f"{scheme}{host}{'' if rest == front else '/...'}{behind}"
+    return f"{scheme}{host}/...{behind}"
 
 
 def public_setting(text: str) -> str:
@@ -57,6 +59,9 @@ def without_secrets(text: str) -> str:
     >>> print(without_secrets("{source: rtsp://me:pass@camera/1, token: abc, host: null}"))
     {source: rtsp://camera/..., token: removed, host: null}
     """
+    # Imported here: it takes a while, and most messages hold no pipeline.
+    import yaml
+
     try:
         document = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError):
