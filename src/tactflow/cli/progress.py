@@ -30,11 +30,10 @@ def summary(result: RunResult, runner: Runner) -> str:
     # The error itself has been printed already.
     end = "error" if result.error is not None else stats["end"]
     lines = [f"{_frames(stats['frames'])} in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({end})"]
-    # The last stage that decides is the one whose decision the results carry.
-    decisions = [s for name, s in stats["signals"].items() if name.endswith(".touching")]
-    if decisions:
-        touching = decisions[-1]
-        lines.append(f"contacts: {touching['rises']} ({_frames(touching['true'])} with contact)")
+    # Of several, the last one is what the results carry.
+    contacts = [s for name, s in stats["signals"].items() if name.endswith(".contact")]
+    if contacts:
+        lines.append(f"contacts: {contacts[-1]['rises']} ({_frames(contacts[-1]['true'])} with contact)")
     latency = stats["latency_ms"]
     if latency["p50"] is not None:
         lines.append(f"latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")

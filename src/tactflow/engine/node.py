@@ -18,6 +18,9 @@ from tactflow.engine.stats import NodeStats, SignalStats
 Slots = Mapping[tuple[str, str], int]
 """(node id, port name) of every output -> its place in a tick's table of values, from 1."""
 
+CONTACT = "contact"
+"""The output that statistics count although it is not boolean: what results report as contact."""
+
 UNCONNECTED = 0
 """The place in that table that always holds None, for optional inputs that are connected to nothing."""
 
@@ -55,7 +58,7 @@ class RunningNode:
     ----------
     instance : of the class; `sink` or `stage` is the same object, the other is None.
     slots : where its outputs go. gates : each with the slot of its signal.
-    signals : output port -> (slot, how often it was true).
+    signals : output port -> (slot, how often it was true); of a `contact`, how often there was one.
     makers, signal_makers : nodes of the same segment that make its inputs, and the signals of its gates.
     pulled : index of the last tick in which it was evaluated. disabled : it failed and is not called again.
     last : the outputs of its last run, for gates that repeat them and for inputs that come again.
@@ -80,7 +83,7 @@ class RunningNode:
         self.signals = {
             port.name: (slot, SignalStats())
             for slot, port in zip(self.slots, ports.outputs, strict=True)
-            if isinstance(port_type(port.annotation), SignalPort)
+            if port.name == CONTACT or isinstance(port_type(port.annotation), SignalPort)
         }
         self.makers: list[RunningNode] = []
         self.signal_makers: list[RunningNode] = []
@@ -200,12 +203,13 @@ class RunningNode:
             self._read_signals(tick)
 
     def _read_signals(self, tick: TickState) -> None:
-        for slot, signal in self.signals.values():
+        for port, (slot, signal) in self.signals.items():
             value = tick.values[slot]
-            if not isinstance(value, Absent):
+            is_there = not isinstance(value, Absent)
+            if is_there and port != CONTACT:
                 # NumPy's True is not Python's, which gates look for.
-                tick.values[slot] = value = bool(value)
-            signal.add(value is True)
+                tick.values[slot] = is_there = bool(value)
+            signal.add(is_there)
 
 
 def _outputs(result: Any, count: int) -> Sequence[Any]:

@@ -86,7 +86,10 @@ class NodeStats:
 
 @dataclass(slots=True)
 class SignalStats:
-    """How often a boolean port was True, and how often it rose. last : its value in the last tick."""
+    """How often a boolean port was True, or there was a contact, and how often that began.
+
+    last : its value in the last tick.
+    """
 
     true: int = 0
     rises: int = 0
