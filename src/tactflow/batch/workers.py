@@ -51,7 +51,7 @@ class Workers(Protocol):
 
 
 class LocalProcesses:
-    """Processes on this machine. count : number of processes."""
+    """Processes on this machine. count : number of processes. Raises StageError if the system has none."""
 
     def __init__(self, count: int) -> None:
         self.description = f"{count} {'process' if count == 1 else 'processes'}"
@@ -63,8 +63,14 @@ class LocalProcesses:
         # Not fork: this process has threads, and OpenCV may hold locks.
         context = multiprocessing.get_context("spawn")
         # The queues of a pool start multiprocessing's resource tracker.
-        with starting_children():
-            return ProcessPoolExecutor(self.slots, context, initializer=_begin)
+        try:
+            with starting_children():
+                return ProcessPoolExecutor(self.slots, context, initializer=_begin)
+        except OSError as error:
+            raise StageError(
+                f"worker processes cannot be started: {error.strerror or error}; on Linux, /dev/shm must be "
+                "there and writable"
+            ) from error
 
     def submit(self, task: Task) -> Future[Outcome]:
         """See `Workers.submit`."""
