@@ -29,7 +29,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cached_property
+from functools import cache, cached_property
 from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
@@ -104,8 +104,7 @@ class Kernel(Generic[P, R]):
             if not found.stats.cache_hits:
                 files.sign()
         except (OSError, RuntimeError) as error:
-            text = "%s: compiled in each run, for it cannot be kept on disk (set NUMBA_CACHE_DIR): %s"
-            logging.getLogger("tactflow").warning(text, self.__name__, error)
+            _warn_of_disk((isinstance(error, OSError) and error.strerror) or "no folder can be written to")
             found = numba.njit(self._signature, **_OPTIONS)(self.plain)
         found.disable_compile()
         if not found.stats.cache_hits:
@@ -145,6 +144,13 @@ class _StoredCode:
         """Keep the checksum of what has been written."""
         with suppress(OSError):
             self._checksum.write_text(self._sum())
+
+
+@cache
+def _warn_of_disk(reason: str) -> None:
+    """Say once, not for each loop, that compiled code cannot be kept."""
+    text = "loops are compiled in each run, since they cannot be kept on disk (set NUMBA_CACHE_DIR): %s"
+    logging.getLogger("tactflow").warning(text, reason)
 
 
 def _writable(value: object) -> object:
