@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -58,6 +59,9 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["stages", "hul"], "there is no stage or sink 'hul'; did you mean hull?"),
         (["stages", "./nowhere.py:A"], "cannot read ./nowhere.py"),
         (["warmup", "nowhere.yaml"], "there is no file nowhere.yaml"),
+        (["run", "sim:press"], "there is no file sim:press, and no pipeline"),
+        (["run", "sim:press"], "a recording or a stream is given by --source"),
+        (["run", "data/film.avi"], "there is no file data/film.avi; a camera, a recording"),
         (["run", "--max-frames", "none"], "required a whole number"),
         (["explain", "--stats", "nowhere.json"], "nowhere.json: cannot be read"),
     ],
@@ -187,10 +191,12 @@ def test_a_limit_on_which_opencv_would_abort_is_refused(
 
 def test_no_name_of_a_file_forges_a_line_of_the_messages(capsys: pytest.CaptureFixture[str]) -> None:
     for mark in ("\n", "\r", "\u2028", "\u2029", "\x85", "\u202e", "\x1b["):
-        assert main(["run", "--source", f"left{mark}tactflow: INFO: all frames delivered"]) == 4
-        lines = capsys.readouterr().err.splitlines()
-        assert [line for line in lines if line.startswith("tactflow: ")] == lines[:1]
-        assert not any(letter in "".join(lines) for letter in "\x1b\u202e")
+        name = f"left{mark}tactflow: INFO: all frames delivered"
+        for words, code in ((["run", "--source", name], 4), (["run", "a.yaml", name], 2), ([name], 2)):
+            assert main(words) == code
+            lines = capsys.readouterr().err.splitlines()
+            assert not any(line.startswith("tactflow: INFO") for line in lines)
+            assert not any(letter in "".join(lines) for letter in "\x1b\u202e")
 
 
 def test_a_shipped_pipeline_is_printed_to_be_changed(
@@ -229,12 +235,10 @@ def test_the_summary_counts_what_the_results_say(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # Worn dots: the light alone finds more contact than light and dots together.
-    assert (
-        main(["run", "default", "--source", "sim:worn?frames=60", "--set", "sinks={}", "--jsonl", "a.jsonl"])
-        == 0
-    )
-    touched = sum(
-        json.loads(line)["contact"] is not None for line in Path("a.jsonl").read_text().splitlines()
-    )
-    assert f"({touched} frames with contact)" in capsys.readouterr().err
+    # Stages before `hull` see contacts that are too small for it.
+    command = ["run", "default", "--source", "sim:press?frames=60", "--set", "stages.hull.min_area=2000"]
+    assert main([*command, "--set", "sinks={}", "--jsonl", "a.jsonl"]) == 0
+    touched = [json.loads(line)["contact"] is not None for line in Path("a.jsonl").read_text().splitlines()]
+    begun = sum(now and not before for before, now in pairwise([False, *touched]))
+    assert begun > 0
+    assert f"contacts: {begun} ({sum(touched)} frames with contact)" in capsys.readouterr().err

@@ -13,6 +13,8 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
 from tactflow.system.files import read_limited
 
+SOURCE_OPTION = "a camera, a recording or a stream is given by --source"
+"""Advice for what is not the name of a pipeline."""
 Keys = tuple[str | int, ...]
 """Where a value stands in a document: keys of mappings and indices of lists, from the root."""
 
@@ -167,13 +169,14 @@ def read_document(path: Path) -> Document:
     """
     if path.is_dir():
         raise ConfigError(f"{path} is a folder; required: a pipeline file (YAML)")
+    hint = "" if path.suffix in (".yaml", ".yml") else f"; {SOURCE_OPTION}"
     try:
         data = read_limited(path)
     except FileNotFoundError:
-        raise ConfigError(f"there is no file {path}") from None
+        raise ConfigError(f"there is no file {path}{hint}") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise ConfigError(f"cannot read {path}: {reason}") from None
+        raise ConfigError(f"cannot read {path}: {reason}{hint}") from None
     document = Document(str(path), line=1)
     text = data.decode("utf-8-sig", "replace")
     document.lines = text.splitlines()

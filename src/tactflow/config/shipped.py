@@ -7,6 +7,7 @@ from importlib.resources import as_file, files
 from itertools import takewhile
 from pathlib import Path
 
+from tactflow.config.document import SOURCE_OPTION
 from tactflow.engine.errors import ConfigError
 from tactflow.system.spelling import closest
 
@@ -48,7 +49,7 @@ def find_pipeline(name: str | None) -> Path:
         advice = f"; did you mean {close}?" if close else "."
         raise ConfigError(
             f"there is no file {name}, and no pipeline of that name comes with tactflow{advice} "
-            f"Those that do: {', '.join(known)} (tactflow pipelines)"
+            f"Those that do: {', '.join(known)} (tactflow pipelines); {SOURCE_OPTION}"
         )
     return path
 
