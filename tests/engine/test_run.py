@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -12,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from tactflow.engine import run
 from tactflow.engine.run import Runner, RunResult
 from tactflow.system.signals import INTERRUPTED
 from tests.clock import PATIENCE, until
@@ -211,22 +212,17 @@ def test_switching_skipping_off_runs_every_stage_in_every_frame(toy_runner: Make
         assert seen(runner, name) == list(range(20))
 
 
-def test_only_what_a_sink_wants_is_computed_but_memory_is_kept(toy_runner: MakeRunner) -> None:
+@pytest.mark.parametrize("wants_any", [True, False])
+def test_only_what_a_sink_wants_is_computed_but_memory_is_kept(
+    toy_runner: MakeRunner, wants_any: bool
+) -> None:
     runner = toy_runner(sinks={"out": {"use": "Collect", "max_rate": 10}})
+    runner.pipeline.nodes["out"].component.cls.wanted = wants_any
     result = ran(runner)
-    assert seen(runner, "out") == [0, 5, 10, 15]
-    assert seen(runner, "join") == [0, 5, 10, 15]
+    wanted = [0, 5, 10, 15] if wants_any else []
+    assert seen(runner, "out") == seen(runner, "join") == wanted
     assert seen(runner, "total") == list(range(20)), "a stateful stage sees every accepted frame"
-    assert result.stats["stages"]["join"]["skips"] == {"no_demand": 16}
-
-
-def test_with_no_one_interested_only_stateful_stages_run(toy_runner: MakeRunner) -> None:
-    runner = toy_runner()
-    type_of_sink: Any = runner.pipeline.nodes["out"].component.cls
-    type_of_sink.wanted = False
-    ran(runner)
-    assert seen(runner, "join") == []
-    assert seen(runner, "total") == list(range(20))
+    assert result.stats["stages"]["join"]["skips"] == {"no_demand": 20 - len(wanted)}
 
 
 def test_a_stage_that_no_sink_needs_is_not_built_and_the_user_is_told(toy_runner: MakeRunner) -> None:
@@ -414,28 +410,6 @@ def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
     assert f"  in {where.co_filename}:{where.co_firstlineno}\n" in str(result.error)
 
 
-@pytest.mark.parametrize(
-    ("when", "words"),
-    [
-        ("built", "cannot be opened: SystemExit: 7"),
-        ("called", "quitter failed at frame 3: SystemExit: 7"),
-        ("closed", "closing failed: 7"),
-    ],
-)
-def test_a_stage_that_exits_is_named_and_the_others_are_closed(
-    toy_runner: MakeRunner, when: str, words: str
-) -> None:
-    quitter = {"use": "Quitter", "when_it_is": when}
-    runner = toy_runner({"quitter": quitter, "heavy": {"in": {"level": "quitter"}}})
-    result = runner.run()
-    assert result.exit_code == 3
-    assert "quitter" in str(result.error)
-    assert words in str(result.error)
-    assert {node.instance.closed for node in runner.nodes.values()} == {1}
-    assert runner.source is not None
-    assert runner.source.closed == 1  # type: ignore[attr-defined]
-
-
 # -- live -------------------------------------------------------------------------------------------------
 
 
@@ -466,22 +440,37 @@ def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunn
     assert link["drops"] + link["delivered"] == link["offered"] == 300
 
 
-@pytest.mark.parametrize(("refused", "priority"), [(None, "real-time"), ("no right", "ordinary")])
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has these priorities")
+@pytest.mark.parametrize(
+    ("platform", "refused", "words"),
+    [
+        ("linux", None, "live frames go first: their threads have real-time priority"),
+        (
+            "linux",
+            "no right",
+            "not granted: no right; root has the right, others get it with the limit rtprio",
+        ),
+        ("darwin", None, "not granted: there is none on darwin"),
+    ],
+)
 def test_threads_that_live_frames_wait_for_go_first_where_that_is_asked_for(
+    platform: str,
     refused: str | None,
-    priority: str,
+    words: str,
     toy_runner: MakeRunner,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    given: list[set[str]] = []
+    given: set[tuple[str, int, int]] = set()
 
-    def ask(threads: list[int]) -> str | None:
-        names = {thread.native_id: thread.name for thread in threading.enumerate()}
-        given.append({names.get(id_, str(id_)) for id_ in threads})
-        return refused
+    def schedule(thread: int, policy: int, param: Any) -> None:
+        if refused:
+            raise PermissionError(1, refused)
+        names = {running.native_id: running.name for running in threading.enumerate()}
+        given.add((names.get(thread, str(thread)), policy, param.sched_priority))
 
-    monkeypatch.setattr(run, "ask_for_realtime", ask)
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    monkeypatch.setattr("tactflow.engine.priority.sys", SimpleNamespace(platform=platform))
     sinks = {
         "out": {"use": "Collect"},
         "far": {"use": "ThreadedCollect"},
@@ -491,15 +480,18 @@ def test_threads_that_live_frames_wait_for_go_first_where_that_is_asked_for(
     live = {"capture": {"realtime": True, "pause": 0.01, "reader": 4711}}
     with caplog.at_level("INFO", logger="tactflow"):
         result = ran(toy_runner(live, sinks, realtime_priority=True))
-    assert result.stats["priority"] == priority
-    assert given == [{"tactflow-capture", "tactflow-compute", "tactflow-far", "4711"}]
-    assert ("go first" if refused is None else "not granted: no right") in caplog.text
+    granted = platform == "linux" and not refused
+    assert words in caplog.text
+    assert result.stats["priority"] == ("real-time" if granted else "ordinary")
+    urgent = ("tactflow-capture", "tactflow-compute", "tactflow-far", "4711") if granted else ()
+    # The lowest of its kind; what the threads start stays ordinary.
+    assert given == {(name, os.SCHED_RR | os.SCHED_RESET_ON_FORK, 1) for name in urgent}
 
 
 def test_nobody_goes_first_unasked_or_on_a_recording(
     toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "ask_for_realtime", lambda threads: pytest.fail(f"asked for {threads}"))
+    monkeypatch.setattr(os, "sched_setscheduler", lambda thread, *_: pytest.fail(f"asked for {thread}"))
     ran(toy_runner({"capture": {"realtime": True}}))
     ran(toy_runner(realtime_priority=True))
 
@@ -586,7 +578,8 @@ def test_a_slow_stage_may_finish_what_waits_after_a_stop(
 ) -> None:
     monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 1.0)
     queue = {"capacity": 8, "when_full": "block"}
-    runner = toy_runner({"join": {"seconds": 0.02, "segment": "slow", "queue": queue}})
+    slow = {"join": {"seconds": 0.02, "segment": "slow", "queue": queue}, "capture": {"frames": 10_000}}
+    runner = toy_runner(slow)
 
     def clock() -> float:
         """As if the stage took 0.2 s for a frame, and nothing else any time."""

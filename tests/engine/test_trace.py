@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,53 +13,46 @@ from tactflow.engine.run import Runner
 from tactflow.engine.trace import Trace
 
 Event = dict[str, Any]
-MakeRunner = Callable[..., Runner]
-SEGMENTS = {"heavy": {"segment": "apart"}}
+Traced = tuple[Runner, list[Event], dict[int, list[Event]]]
 
 
 @pytest.fixture
-def run(toy_runner: MakeRunner, tmp_path: Path) -> tuple[Runner, list[Event]]:
-    """A run in several threads and its trace, read back from the file."""
-    runner = toy_runner(SEGMENTS)
+def traced(toy_runner: Callable[..., Runner]) -> Traced:
+    """A run in several threads, the events of its trace, and those of each track."""
+    runner = toy_runner({"heavy": {"segment": "apart"}})
     runner.trace = Trace("tactflow toy")
     assert runner.run().exit_code == 0
-    (tmp_path / "trace.json").write_text("\n".join(runner.trace.lines()))
-    document = json.loads((tmp_path / "trace.json").read_text())
-    assert document["displayTimeUnit"] in ("ms", "ns")
-    return runner, document["traceEvents"]
-
-
-def by_track(events: list[Event]) -> dict[int, list[Event]]:
-    found = defaultdict(list)
+    events = json.loads("\n".join(runner.trace.lines()))["traceEvents"]
+    tracks = defaultdict(list)
     for event in events:
         if event["ph"] != "M":
-            found[event["tid"]].append(event)
-    return found
+            tracks[event["tid"]].append(event)
+    return runner, events, tracks
 
 
-def test_every_event_has_what_the_format_requires(run: tuple[Runner, list[Event]]) -> None:
-    _, events = run
-    required = {"M": {"name", "args"}, "X": {"name", "ts", "dur", "tid"}}
-    arrow = {"name", "cat", "id", "ts", "tid"}
-    for event in events:
-        assert required.get(event["ph"], arrow) | {"pid"} <= set(event)
-        assert event["ph"] in "MXsf"
-        assert event.get("ts", 0) >= 0
-        assert event.get("dur", 0) >= 0
+def slices_around(moment: Event, track: list[Event]) -> list[str]:
+    """The slices of frames in which a moment lies."""
+    frames = [event for event in track if event["ph"] == "X" and event["name"].startswith("frame")]
+    return [frame["name"] for frame in frames if frame["ts"] <= moment["ts"] <= frame["ts"] + frame["dur"]]
 
 
-def test_each_thread_has_a_named_track(run: tuple[Runner, list[Event]]) -> None:
-    runner, events = run
+def test_each_thread_has_a_named_track_with_a_slice_for_each_run_of_each_stage(traced: Traced) -> None:
+    runner, events, tracks = traced
     names = {e["tid"]: e["args"]["name"] for e in events if e["name"] == "thread_name"}
     assert sorted(names.values()) == sorted(runner.plan.segments)
-    assert set(by_track(events)) == set(names)
+    assert set(tracks) == set(names)
+    assert all(event["pid"] == 1 and event["ph"] in "MXsf" for event in events)
     assert [e["args"]["name"] for e in events if e["name"] == "process_name"] == ["tactflow toy"]
+    slices = [event for event in events if event["ph"] == "X"]
+    for name, entry in runner.snapshot()["stages"].items():
+        assert [event["name"] for event in slices].count(name) == entry["runs"]
+    skipped = [event["args"]["skipped"] for event in slices if "skipped" in event["args"]]
+    assert any(reasons.get("gated") == "idle" for reasons in skipped)
 
 
-def test_times_grow_along_a_track_and_slices_nest(run: tuple[Runner, list[Event]]) -> None:
-    _, events = run
-    for track in by_track(events).values():
-        assert [e["ts"] for e in track] == sorted(e["ts"] for e in track)
+def test_times_grow_along_a_track_and_slices_nest(traced: Traced) -> None:
+    for track in traced[2].values():
+        assert [event["ts"] for event in track] == sorted(event["ts"] for event in track)
         open_until: list[float] = []
         for event in (e for e in track if e["ph"] == "X"):
             while open_until and open_until[-1] <= event["ts"]:
@@ -71,37 +63,16 @@ def test_times_grow_along_a_track_and_slices_nest(run: tuple[Runner, list[Event]
             open_until.append(end)
 
 
-def test_each_arrow_has_both_ends_within_the_slices_of_one_frame(run: tuple[Runner, list[Event]]) -> None:
-    runner, events = run
-    tracks = by_track(events)
-    ends: dict[str, dict[str, tuple[Event, str]]] = {"s": {}, "f": {}}
-    for event in events:
-        if event["ph"] in ends:
-            inside = [
-                e["name"]
-                for e in tracks[event["tid"]]
-                if e["ph"] == "X"
-                and e["name"].startswith("frame")
-                and e["ts"] <= event["ts"] <= e["ts"] + e["dur"]
-            ]
-            assert len(inside) == 1
-            assert event["id"] not in ends[event["ph"]]
-            ends[event["ph"]][event["id"]] = event, inside[0]
-    assert ends["s"].keys() == ends["f"].keys()
+def test_each_arrow_has_both_ends_within_the_slices_of_one_frame(traced: Traced) -> None:
+    runner, events, tracks = traced
+    starts, ends = ({e["id"]: e for e in events if e["ph"] == phase} for phase in "sf")
+    assert starts.keys() == ends.keys()
     # 20 frames through every link.
-    assert len(ends["s"]) == 20 * len(runner.plan.links)
-    for number, (start, frame) in ends["s"].items():
-        arrival, arrived_frame = ends["f"][number]
-        assert arrived_frame == frame
-        assert arrival["ts"] >= start["ts"]
-        assert arrival["tid"] != start["tid"]
-        assert arrival["bp"] == "e"
-
-
-def test_a_slice_stands_for_each_run_of_each_stage(run: tuple[Runner, list[Event]]) -> None:
-    runner, events = run
-    slices = [e["name"] for e in events if e["ph"] == "X"]
-    for name, entry in runner.snapshot()["stages"].items():
-        assert slices.count(name) == entry["runs"]
-    skipped = [e["args"]["skipped"] for e in events if e["ph"] == "X" and "skipped" in e["args"]]
-    assert any(reasons.get("gated") == "idle" for reasons in skipped)
+    assert len(starts) == 20 * len(runner.plan.links) == sum(e["ph"] == "s" for e in events)
+    for number, start in starts.items():
+        end = ends[number]
+        (frame,) = slices_around(start, tracks[start["tid"]])
+        assert slices_around(end, tracks[end["tid"]]) == [frame]
+        assert end["ts"] >= start["ts"]
+        assert end["tid"] != start["tid"]
+        assert end["bp"] == "e"

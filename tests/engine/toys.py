@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -227,30 +226,6 @@ class LateTick(Counted, Sink):
 
     def write(self, number: Number | None, total: Number, tick: Tick) -> None:
         self.rows.append((tick.frame.seq, number and number.value, total.value))
-
-
-class Quitter(Counted, Stage):
-    """Ends the program where it should only complain: when it is built, called or closed."""
-
-    class Params(Counted.Params):
-        when_it_is: str = "built"
-
-    def __init__(self, params: Params) -> None:
-        super().__init__(params)
-        self.exits = params.when_it_is
-        self.leave("built")
-
-    def leave(self, now: str) -> None:
-        if self.exits == now:
-            sys.exit(7)
-
-    def process(self, level: Number) -> Number:
-        self.leave("called")
-        return level
-
-    def close(self) -> None:
-        super().close()
-        self.leave("closed")
 
 
 class Vandal(Counted, Stage):

@@ -13,9 +13,7 @@ from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node
 
 
-def describe_failure(
-    node: Node, frame: Frame, values: Sequence[Any], error: Exception | SystemExit
-) -> StageError:
+def describe_failure(node: Node, frame: Frame, values: Sequence[Any], error: Exception) -> StageError:
     """An error that says which node failed on which frame, where in its code, and with what inputs.
 
     values : of its inputs, in the order of its ports.

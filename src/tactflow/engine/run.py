@@ -246,7 +246,7 @@ class Runner:
             raise kind(f"{node.id} ({node.mark}): {error}") from error
         except TactflowError:
             raise
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             place = traceback.extract_tb(error.__traceback__)[-1]
             raise kind(
                 f"{node.id} ({node.mark}): cannot be opened: {type(error).__name__}: {error}\n"
@@ -342,7 +342,7 @@ class Runner:
     def _close_part(self, node_id: str, instance: Part) -> None:
         try:
             instance.close()
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             self.fail(StageError(f"{node_id}: closing failed: {error}"), error)
 
     # -- the source's thread ------------------------------------------------------------------------------

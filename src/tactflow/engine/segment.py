@@ -190,7 +190,7 @@ class Segment:
         began = perf_counter()
         try:
             outputs = node(inputs, tick)
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             self._failed(node, tick, inputs, error)
             return
         ended = perf_counter()
@@ -211,9 +211,7 @@ class Segment:
         else:
             self.run.retake_reference()
 
-    def _failed(
-        self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception | SystemExit
-    ) -> None:
+    def _failed(self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception) -> None:
         node.stats.errors += 1
         policy = node.node.on_error
         failure = describe_failure(node.node, tick.frame, inputs, error)
