@@ -40,7 +40,6 @@ CASES = [
     ("file", 'sensor: "a§\x01b"', "#x0001 .. not allowed"),
     ("top", "sensor: a\n§sensor: b", "sensor: duplicate key .. line 1, column 1"),
     ("source", "  §yes: {}", "a key must be text .. quotes"),
-    ("top", "§stagse: {}", "stagse: unknown key .. did you mean stages?"),
     ("file", "§sensor: main", "stages: required, but not given .. id -> stage"),
     ("file", "stages:\n  §- capture\nSINK", "stages: should be a mapping .. got a list"),
     ("file", "§stages: {}\nSINK", "no source of frames .. capture"),
@@ -57,34 +56,17 @@ CASES = [
         "  prepare: {use: @Prepare, queue: {when_full: §lates}}",
         "when_full: should be 'block', 'latest' or 'drop_oldest' .. did you mean latest?",
     ),
-    (
-        "source",
-        "  prepare: {use: @Prepare, on_error: §ignore}",
-        "on_error: should be 'stop', 'skip_frame' or 'disable', got 'ignore'",
-    ),
     ("source", "  prepare: {use: @Prepare, §max_rate: 5}", "stages.prepare.max_rate: unknown parameter"),
-    ("source", "  h: {use: §captur}", "no stage called captur .. did you mean capture?"),
     ("source", "  §teleport:", "stages.teleport: there is no stage called teleport .. ./file.py:Class"),
     ("source", "  §jsonl:", "jsonl is under stages: but belongs under sinks:"),
     ("source", "sinks:\n  out: {use: §@Prepare}", "is a stage; it belongs under stages:"),
     ("source", "  a: {use: §'./nowhere.py:A'}", "cannot read ./nowhere.py .. No such file"),
     ("source", "  a: {use: §@Prepar}", "no class Prepar .. did you mean Prepare?"),
     ("prepare", "  a: {use: §@Bare}", "Bare.process .. parameter image has no annotation"),
-    (
-        "compare",
-        "  outline:\n    use: @Outline\n    §min_aera: 5",
-        "stages.outline.min_aera: unknown parameter; did you mean min_area?",
-    ),
     ("prepare", "  §a: {use: @Needy}", "stages.a.path: required, but not given"),
-    ("source", "  p: {use: @Prepare, gamma: §high}", "stages.p.gamma: should be a valid number, got 'high'"),
     ("source", "  p: {use: @Prepare, gamma: §yes}", "should be a valid number, got true"),
     ("source", "  p: {use: @Prepare, gamma: §.nan}", "should be a finite number"),
     ("source", "  p:\n    use: @Prepare\n    gamma:§", "got nothing"),
-    (
-        "source",
-        "  p: {use: @Prepare, method: §pyramide}",
-        "should be 'area' or 'pyramid', got 'pyramide'; did you mean pyramid?",
-    ),
     (
         "source",
         "  p:\n    use: @Prepare\n    corners:\n      - [1, 2]\n      - [3, §x]",
@@ -222,8 +204,11 @@ def test_a_mistake_is_reported_at_its_place(
     out, err = capsys.readouterr()
     assert out == ""
     assert "Traceback" not in err
-    found = next((part for part in err.splitlines() if f"bad.yaml:{line}:{column}  " in part), None)
-    assert found is not None, err
+    found, *below = err[err.index(f"bad.yaml:{line}:{column}  ") :].splitlines()
+    lines = (before + after).splitlines()
+    if line <= len(lines):
+        # The caret stands under the mistake.
+        assert len(below[0]) - below[1].index("^") == len(lines[line - 1]) - column + 1
     for part in words.split(" .. "):
         assert part in found
 
@@ -252,14 +237,6 @@ def test_all_mistakes_come_at_once_in_the_order_of_the_file(
     places = re.findall(r"^bad\.yaml:(\d+):\d+  ", err, re.MULTILINE)
     assert places == ["1", "5", "5", "5", "6"]
     assert err.startswith("tactflow: 5 mistakes\n")
-
-
-def test_the_caret_stands_under_the_mistake(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "bad.yaml").write_text(pipeline("  p: {use: @Prepare, gamma: 9}", "source"))
-    main(["check", "bad.yaml"])
-    _, shown, caret = capsys.readouterr().err.splitlines()
-    assert caret.strip() == "^"
-    assert shown[caret.index("^")] == "9"
 
 
 def test_bytes_that_are_not_utf8_have_a_place(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,9 +31,7 @@ def places(validator: Draft202012Validator, text: str) -> list[str]:
     return [error.json_path for error in validator.iter_errors(yaml.safe_load(text))]
 
 
-@pytest.mark.parametrize(
-    "path", [*sorted(ROOT.glob("pipelines/*.yaml")), ROOT / "pipeline.yaml"], ids=lambda p: p.stem
-)
+@pytest.mark.parametrize("path", PIPELINES, ids=lambda p: p.stem)
 def test_every_shipped_pipeline_fits_the_schema(path: Path, validator: Draft202012Validator) -> None:
     assert places(validator, path.read_text()) == []
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tactflow.fleet.heartbeat import HANG_AFTER, MAX_INTERVAL, Progress, Watchdog
+from tactflow.fleet.heartbeat import HANG_AFTER, MAX_INTERVAL, Watchdog, progress_of
 from tactflow.fleet.supervisor import FIRST_PAUSE, GIVE_UP_AFTER, GOOD_RUN, LONGEST_PAUSE, Member, Supervisor
 from tactflow.system.signals import ending_handled
 
@@ -166,7 +166,7 @@ def test_to_start_a_sensor_has_time_whatever_it_may_take_for_a_frame(tmp_path: P
 
 def test_there_is_progress_when_every_thread_is_in_another_call_or_waits() -> None:
     calls = {"compute": 1, "heavy": 1}
-    progress = Progress(lambda: dict(calls))
+    progress = progress_of(lambda: dict(calls))
     assert progress()
     calls["compute"] += 1
     assert not progress(), "the other one is in the same call"

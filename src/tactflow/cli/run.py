@@ -25,7 +25,7 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
 from tactflow.engine.trace import TRACE_BEGINS, Trace
-from tactflow.fleet.heartbeat import HANG_AFTER, Progress, start_heartbeat
+from tactflow.fleet.heartbeat import HANG_AFTER, progress_of, start_heartbeat
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.system.files import is_device, next_name
@@ -180,7 +180,7 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     if args.end_with_stdin:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
     if args.sign_of_life is not None:
-        start_heartbeat(args.sign_of_life, Progress(runner.calls))
+        start_heartbeat(args.sign_of_life, progress_of(runner.calls))
     with notes(), ended_by_signals(runner) as caught:
         for option, path in _reports(args).items():
             problem = _report_problem(option, path)

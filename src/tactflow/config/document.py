@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +86,10 @@ class Document:
     def _marks(self, keys: Keys) -> tuple[Mark, Mark]:
         return self.marks.get(keys) or (self.mark(*keys[:-1]),) * 2
 
-    def set(self, keys: Keys, value: Any, mark: Mark) -> None:
+    def set(self, keys: Keys, value: Any, mark: Mark, key_mark: Mark | None = None) -> None:
         """Replace a value, or add it with the mappings around it.
+
+        mark, key_mark : of the value, and of a new key where that has another.
 
         Raises
         ------
@@ -106,20 +107,10 @@ class Document:
         place = (*place, _index(parent, keys[-1], place))
         parent[place[-1]] = value
         place = created or place
-        key_mark, _ = self.marks.get(place, (mark, mark))
-        self._replace(place, {(): (key_mark, mark)})
-
-    def copy(self, source: Keys, target: Keys) -> None:
-        """Put a value at another key of a mapping; it keeps its place."""
-        self.mapping(*target[:-1])[str(target[-1])] = self.get(*source)
-        size = len(source)
-        parts = {keys[size:]: mark for keys, mark in self.marks.items() if keys[:size] == source}
-        self._replace(target, parts | {(): self._marks(source)})
-
-    def _replace(self, place: Keys, marks: Mapping[Keys, tuple[Mark, Mark]]) -> None:
-        """Set the marks of a value that replaces another, and of its parts: from it on, by their keys."""
-        others = {keys: mark for keys, mark in self.marks.items() if keys[: len(place)] != place}
-        self.marks = others | {(*place, *keys): mark for keys, mark in marks.items()}
+        known, _ = self.marks.get(place, (key_mark or mark, mark))
+        # What was inside the old value is gone.
+        self.marks = {keys: marks for keys, marks in self.marks.items() if keys[: len(place)] != place}
+        self.marks[place] = known, mark
 
     def report(self, keys: Keys, message: str, *, at_key: bool = False) -> None:
         """Record a mistake in a value, or in its key."""

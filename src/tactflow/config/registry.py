@@ -182,15 +182,10 @@ def _failure(what: str, error: BaseException, file: str | None = None) -> str:
 
 def code_place(trace: TracebackType | None, file: str | None = None) -> str | None:
     """`file:line` of the last frame of a traceback (in `file` if given) that is not the import system's."""
-    frames = [f for f in traceback.extract_tb(trace) if not f.filename.startswith("<frozen")]
-    frames = [
-        f for f in frames if f.filename != __file__ and not f.filename.endswith("importlib/__init__.py")
-    ]
-    inside = [f for f in frames if f.filename == file]
-    if not frames:
-        return None
-    last = (inside or frames)[-1]
-    return f"{last.filename}:{last.lineno}"
+    own = ("<frozen", __file__, str(importlib.__file__))
+    frames = [frame for frame in traceback.extract_tb(trace) if not frame.filename.startswith(own)]
+    frames = [frame for frame in frames if frame.filename == file] or frames
+    return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else None
 
 
 def _find_class(module: ModuleType, name: str, section: Section) -> type:

@@ -54,14 +54,16 @@ def select(document: Document, chosen: str | None) -> str:
 
 def _lay_over(document: Document, change: Keys, target: Keys) -> None:
     """Put a value of `sensors:` over the one of the file; mappings are merged."""
-    value = document.get(*change)
-    if value is None and len(target) > 1 and document.has(*target):
-        del document.mapping(*target[:-1])[str(target[-1])]
-    elif isinstance(value, dict) and isinstance(document.get(*target), dict):
+    value, mark, key_mark = document.get(*change), document.mark(*change), document.key_mark(*change)
+    if isinstance(value, dict):
+        if not isinstance(document.get(*target), dict):
+            document.set(target, {}, mark, key_mark)
         for key in value:
             _lay_over(document, (*change, key), (*target, key))
+    elif value is None and len(target) > 1 and document.has(*target):
+        del document.mapping(*target[:-1])[str(target[-1])]
     else:
-        document.copy(change, target)
+        document.set(target, value, mark, key_mark)
 
 
 def _filled_in(value: Any, name: str) -> Any:

@@ -22,31 +22,30 @@ MAX_INTERVAL = 1.0
 """Longest time counted between two checks, s: a supervisor that was stopped itself has missed heartbeats."""
 
 
-class Progress:
-    """Tells whether every thread has made progress since the last time that all had.
+def progress_of(calls: Callable[[], Mapping[str, int]]) -> Callable[[], bool]:
+    """Whether every thread has made progress since the last time that all had, as a function.
 
     calls : returns thread -> number of its current call; waiting threads are left out.
 
     >>> numbers = {"compute": 1}
-    >>> progress = Progress(lambda: dict(numbers))
+    >>> progress = progress_of(lambda: dict(numbers))
     >>> progress(), progress()
     (True, False)
     >>> numbers["compute"] += 1
     >>> progress()
     True
     """
+    before: Mapping[str, int] = {}
 
-    def __init__(self, calls: Callable[[], Mapping[str, int]]) -> None:
-        self._calls = calls
-        self._before: Mapping[str, int] = {}
-
-    def __call__(self) -> bool:
-        """Whether no current call was already running when the answer was last yes."""
-        calls = self._calls()
-        advanced = self._before.items().isdisjoint(calls.items())
+    def progress() -> bool:
+        nonlocal before
+        now = calls()
+        advanced = before.items().isdisjoint(now.items())
         if advanced:
-            self._before = calls
+            before = now
         return advanced
+
+    return progress
 
 
 def start_heartbeat(path: Path, progress: Callable[[], bool]) -> None:
@@ -86,16 +85,15 @@ class Watchdog:
         """Longest silence that is accepted now, s."""
         return self._timeout if self._started else max(self._timeout, HANG_AFTER)
 
-    def expired(self, now: float) -> bool:
-        """Check for a heartbeat; returns whether the silence is too long."""
+    def expired(self, now: float, *, blocked: bool = False) -> bool:
+        """Check for a heartbeat; returns whether the silence is too long.
+
+        blocked : the process may wait for its supervisor, so the time since the last check does not count.
+        """
         file = status(str(self.path))
         touched = None if file is None else file.st_mtime_ns
-        self.silent += min(now - self._checked, MAX_INTERVAL)
+        self.silent += 0.0 if blocked else min(now - self._checked, MAX_INTERVAL)
         self._checked = now
         if touched != self._touched:
             self._touched, self.silent, self._started = touched, 0.0, True
         return self.silent > self.timeout
-
-    def skip(self, now: float) -> None:
-        """Do not count the time since the last check."""
-        self._checked = now

@@ -156,14 +156,11 @@ class Supervisor:
 
     def _hangs(self, member: Member) -> bool:
         """Whether the heartbeat of a process has stopped."""
-        watchdog, now = member.watchdog, self._clock()
-        if self._results.locked() or self._messages.locked():
-            # It may be blocked by our own reader.
-            watchdog.skip(now)
-            return False
-        hangs = watchdog.expired(now)
+        # It may be blocked by our own reader.
+        blocked = self._results.locked() or self._messages.locked()
+        hangs = member.watchdog.expired(self._clock(), blocked=blocked)
         if hangs:
-            self._say(member, f"has hung for {watchdog.timeout:g} s and is killed")
+            self._say(member, f"has hung for {member.watchdog.timeout:g} s and is killed")
         return hangs
 
     def _last_code(self, member: Member, code: int) -> int:
