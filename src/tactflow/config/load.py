@@ -57,7 +57,6 @@ def load_pipeline(
         for override in source_values:
             apply(document, override, source.keys)
     for draft in drafts:
-        draft.settings = document.mapping(*draft.keys)
         draft.params = _params(draft, document)
     calibration = _calibration(document, path.parent)
     _check_files(drafts, path, calibration, document)
@@ -119,7 +118,7 @@ def _drafts(document: Document, directory: Path) -> list[Draft]:
     drafts: dict[str, Draft] = {}
     for section in _SECTIONS:
         for id_ in document.mapping(section):
-            draft = Draft(id_, section, document.key_mark(section, id_), document.mapping(section, id_))
+            draft = Draft(id_, section, document.key_mark(section, id_))
             if id_ in drafts:
                 first = drafts[id_]
                 taken = f"the id {id_} is taken by {dotted(first.keys)} ({first.mark})"
@@ -132,12 +131,13 @@ def _drafts(document: Document, directory: Path) -> list[Draft]:
 
 def _resolve(draft: Draft, directory: Path, document: Document) -> None:
     """Find the class of a stage or sink."""
-    use = draft.settings.get("use", draft.id)
+    is_named = document.has(*draft.keys, "use")
+    place = (*draft.keys, "use") if is_named else draft.keys
+    use = document.get(*place) if is_named else draft.id
     if not isinstance(use, str):
         return
-    place = (*draft.keys, "use") if "use" in draft.settings else draft.keys
     # From the command line, and in a packaged pipeline, a loose file lies in the current folder.
-    own = is_packaged(directory) or ("use" in draft.settings and not document.mark(*place).line)
+    own = is_packaged(directory) or (is_named and not document.mark(*place).line)
     try:
         draft.component = resolve(use, draft.section, *([Path()] if own else []), directory)
     except ConfigError as error:
@@ -223,7 +223,7 @@ def _check_needs(drafts: Sequence[Draft], document: Document) -> None:
             if draft.inputs.get(port) is None:
                 what = f"{getattr(draft.params, name)} needs {port}, which no stage gives"
                 place = (*draft.keys, name)
-                document.report(place, f"{what}; add a stage that does", at_key=name not in draft.settings)
+                document.report(place, f"{what}; add a stage that does", at_key=not document.has(*place))
 
 
 def _node(draft: Draft, entry: Entry, document: Document) -> Node:
@@ -241,7 +241,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
         Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
         for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
     ]
-    marked = [key for key in ("segment", "queue") if key in draft.settings]
+    marked = [key for key in ("segment", "queue") if document.has(*draft.keys, key)]
     return Node(
         id=draft.id,
         component=draft.component,

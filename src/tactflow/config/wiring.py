@@ -18,7 +18,7 @@ from tactflow.system.spelling import did_you_mean
 class Draft:
     """A stage or sink of the file before its inputs are connected.
 
-    mark : of its key. settings : what stands under it.
+    mark : of its key.
     component : None when `use` could not be resolved; what depends on it is then not judged.
     params : None when they are wrong.
     inputs, gates : filled by `connect`; for each gate the port, and the signal that says what closed means.
@@ -28,7 +28,6 @@ class Draft:
     id: str
     section: Section
     mark: Mark
-    settings: dict[str, Any]
     component: Component | None = None
     params: StageParams | None = None
     inputs: dict[str, Ref | None] = field(default_factory=dict)
@@ -133,7 +132,7 @@ class _Wiring:
 
     def connect_gates(self, draft: Draft, component: Component) -> None:
         place: Keys = (*draft.keys, "when")
-        when = draft.settings.get("when")
+        when = self._document.get(*place)
         if when is None:
             return
         if component.kind == "source":

@@ -18,6 +18,8 @@ from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline, Queue
 
 CAPTURE = "capture"
 COMPUTE = "compute"
+Demand = frozenset[str] | None
+"""Ids of the sinks that need a node; None where it is needed in every tick."""
 BLOCK_CAPACITY = 4
 """Frames that may wait in front of a segment of stages: enough to even out uneven ones. Chosen by hand."""
 
@@ -57,6 +59,29 @@ class Plan:
         """The segment that runs a node."""
         return next(name for name, nodes in self.segments.items() if node_id in nodes)
 
+    def roots(self, segment: str) -> dict[str, Demand]:
+        """What a segment evaluates of itself: its sinks, stages that remember, and what other segments take.
+
+        Gates of other segments are assumed to be open: too much may be computed, never too little.
+        """
+        demand: dict[str, Demand] = dict.fromkeys(self.pipeline.nodes, frozenset())
+        found: dict[str, Demand] = {}
+        # Every input comes before its user, so that going backwards all users of a node are known.
+        for node in reversed(list(self.pipeline.nodes.values())):
+            if node in self.pruned:
+                continue
+            own: Demand = frozenset({node.id} if node.component.kind == "sink" else ())
+            own = None if remembers(node, self.pipeline) else own
+            demand[node.id] = need = _both(demand[node.id], own)
+            is_inside = node.id in self.segments[segment]
+            if is_inside and own != frozenset():
+                found[node.id] = need
+            for maker in dependencies(node):
+                demand[maker] = _both(demand[maker], need)
+                if maker in self.segments[segment] and not is_inside:
+                    found[maker] = _both(found.get(maker, frozenset()), need)
+        return {id_: found[id_] for id_ in self.segments[segment] if id_ in found}
+
     @property
     def idle(self) -> list[Node]:
         """Stages that no sink needs, without those that wait for a sink: perhaps a mistake."""
@@ -79,19 +104,8 @@ def remembers(node: Node, pipeline: Pipeline) -> bool:
     return node.component.memory == "stateful" or repeats
 
 
-def demand(pipeline: Pipeline) -> dict[str, frozenset[str] | None]:
-    """Node -> the sinks that need it; None where it is needed in every tick, for a stage that remembers."""
-    needs: dict[str, frozenset[str] | None] = {}
-    # Every input comes before its user, so that going backwards all users of a node are known.
-    for id_, node in reversed(list(pipeline.nodes.items())):
-        own = frozenset({id_}) if node.component.kind == "sink" else frozenset[str]()
-        before = needs.get(id_, frozenset())
-        need = None if before is None or remembers(node, pipeline) else before | own
-        needs[id_] = need
-        for maker in dependencies(node):
-            so_far = needs.get(maker, frozenset[str]())
-            needs[maker] = None if so_far is None or need is None else so_far | need
-    return needs
+def _both(first: Demand, second: Demand) -> Demand:
+    return None if first is None or second is None else first | second
 
 
 def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:

@@ -20,7 +20,6 @@ from tactflow.engine.failure import describe_failure
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.link import Link
 from tactflow.engine.node import RunningNode, TickState
-from tactflow.engine.plan import demand, dependencies, remembers
 from tactflow.engine.trace import Track
 
 if TYPE_CHECKING:
@@ -91,7 +90,8 @@ class Segment:
             node.makers = _of(mine, [ref.node for ref in node.node.inputs.values() if ref])
             if node.gates:
                 node.signal_makers = _of(mine, [gate.signal.node for gate in node.node.gates])
-        self._roots = _roots(run, mine)
+        roots = run.plan.roots(name)
+        self._roots = [(mine[id_], sinks) for id_, sinks in roots.items() if id_ in mine]
         self._data_sinks = [n for n in self.nodes if n.sink is not None and not n.sink.observer]
         self.inputs: list[Link[TickState]] = []
         self.outputs: list[tuple[Link[TickState], frozenset[str] | None]] = []
@@ -277,19 +277,3 @@ class Segment:
 def _of(mine: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode]:
     """Those of the nodes that are among `mine`, each once."""
     return [mine[id_] for id_ in dict.fromkeys(ids) if id_ in mine]
-
-
-def _roots(run: Runner, mine: Mapping[str, RunningNode]) -> list[tuple[RunningNode, frozenset[str] | None]]:
-    """Sinks, stages that remember, and what other segments take; each with the sinks that need it, or None.
-
-    Gates of other segments are assumed to be open: too much may be computed, never too little.
-    """
-    pipeline = run.plan.pipeline
-    needs = demand(pipeline)
-    roots = [id_ for id_, node in mine.items() if node.sink or remembers(node.node, pipeline)]
-    exported: dict[str, frozenset[str] | None] = {id_: needs[id_] for id_ in roots}
-    for consumer in run.nodes.values():
-        for maker in dependencies(consumer.node) & mine.keys() if consumer.id not in mine else ():
-            before, need = exported.get(maker, frozenset[str]()), needs[consumer.id]
-            exported[maker] = None if before is None or need is None else before | need
-    return [(mine[id_], sinks) for id_, sinks in exported.items()]

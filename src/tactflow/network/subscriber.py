@@ -30,6 +30,10 @@ OPTIONS: dict[int, int | bytes] = {
     zmq.HEARTBEAT_TIMEOUT: 6000,
 }
 
+BACKLOG = 10_000
+"""Messages that may wait until they are read, nearly three minutes at 60 Hz and some 140 MB; what comes then
+is lost, and counted. Chosen by hand."""
+
 LONGEST_MESSAGE = 16 << 20
 """Longest message, bytes; one with 140 dots has about 14,000. The connection to a publisher that sends a
 longer one is closed before memory is taken for it. Chosen by hand."""
@@ -50,8 +54,6 @@ class Subscriber(Connection):
         messages are received in turn.
     timeout : s without any message after which waiting ends in a TimeoutError, 1e6 at most; None waits for
         ever.
-    backlog : messages that may wait until they are read; what comes then is lost, and counted. 10,000 are
-        nearly three minutes at 60 Hz, and some 140 MB.
     keys : the subscriber's folder that `tactflow keys new` makes, where the publisher asks for keys.
 
     Attributes
@@ -63,7 +65,7 @@ class Subscriber(Connection):
 
     Raises
     ------
-    ValueError : the endpoint is no address, the folder has no keys, timeout or backlog is out of range.
+    ValueError : the endpoint is no address, the folder has no keys, or the timeout is out of range.
 
     Examples
     --------
@@ -78,14 +80,10 @@ class Subscriber(Connection):
         sensor: str | None = None,
         latest: bool = False,
         timeout: float | None = None,
-        backlog: int = 10_000,
         keys: str | Path | None = None,
     ) -> None:
         if timeout is not None and not 0 <= timeout <= LONGEST_WAIT:
             raise ValueError(f"timeout: required None or 0 to {LONGEST_WAIT:g} seconds, got {timeout}")
-        # ZeroMQ takes it as an `int` of C; 0 would mean no limit.
-        if not 1 <= backlog < 2**31:
-            raise ValueError(f"backlog: required 1 to {2**31 - 1} messages, got {backlog}")
         self.timeout = timeout
         self.lost = 0
         self.received = 0
@@ -93,10 +91,10 @@ class Subscriber(Connection):
         self._sensor = sensor
         self._last_seq: dict[str, int] = {}
         # Not zmq.CONFLATE, with which a message of several parts aborts the process.
-        self._skipped_at_most = backlog if latest else 0
+        self._skipped_at_most = BACKLOG if latest else 0
         options: dict[int, int | bytes] = {
             **OPTIONS,
-            zmq.RCVHWM: backlog,
+            zmq.RCVHWM: BACKLOG,
             zmq.MAXMSGSIZE: LONGEST_MESSAGE,
             # The space ends the topic: `main` must not receive `main2`.
             zmq.SUBSCRIBE: b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode(),
