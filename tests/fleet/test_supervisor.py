@@ -90,17 +90,19 @@ class Machine:
             return supervisor.run(members)
 
 
+@pytest.mark.parametrize(("code", "end"), [(4, 4), (-signal.SIGKILL, 3)])
 def test_the_pause_before_a_new_start_doubles_until_the_sensor_is_given_up(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    code: int, end: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    machine = Machine(tmp_path, {"left": [(0.0, 4)], "right": [(100.0, 0)]})
-    assert machine.run() == 4
+    machine = Machine(tmp_path, {"left": [(0.0, code)], "right": [(100.0, 0)]})
+    assert machine.run() == end
     starts = machine.starts["left"]
     gaps = [later - earlier for earlier, later in pairwise(starts)]
     expected = [min(FIRST_PAUSE * 2**number, LONGEST_PAUSE) for number in range(GIVE_UP_AFTER)]
     assert gaps == pytest.approx(expected, abs=0.2)
-    assert "given up" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "given up" in said
+    assert ("was ended by signal 9" in said) == (code < 0)
     assert len(machine.starts["right"]) == 1
 
 

@@ -15,7 +15,6 @@ import zmq
 from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
 from tactflow.engine.control import Control
-from tactflow.engine.errors import StageError
 from tactflow.engine.run import Runner
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
@@ -137,13 +136,6 @@ def test_what_is_too_long_or_no_request_is_dropped(bare: ControlSocket) -> None:
             junk.send_multipart(parts)
         with RemoteControl(bare.endpoint, PATIENCE) as run:
             assert run.ping()["ok"]
-
-
-def test_an_address_that_is_taken_is_named_with_what_to_do(bare: ControlSocket) -> None:
-    sink = Zmq(Zmq.Params(endpoint=ANY_PORT, control=bare.endpoint))
-    with pytest.raises(StageError, match=r"is in use: another run takes commands there.*tactflow-{sensor}"):
-        sink.open()
-    sink.close()
 
 
 def test_a_late_answer_to_an_earlier_command_is_not_taken_for_the_next() -> None:
