@@ -64,10 +64,10 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
         before_run()
         return int(args.run(args))
     except TactflowError as error:
-        mistakes = error.mistakes if isinstance(error, ConfigError) else (str(error),)
-        first = f"{len(mistakes)} mistakes" if len(mistakes) > 1 else mistakes[0]
-        for text in (f"tactflow: {first}", *(mistakes if len(mistakes) > 1 else ())):
-            say(shown_address(text))
+        mistakes = error.mistakes if isinstance(error, ConfigError) and len(error.mistakes) > 1 else ()
+        say(f"tactflow: {len(mistakes)} mistakes" if mistakes else shown_address(f"tactflow: {error}"))
+        for mistake in mistakes:
+            say(shown_address(mistake))
         return error.exit_code
     except KeyboardInterrupt:
         return INTERRUPTED

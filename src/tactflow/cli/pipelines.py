@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import time
 from importlib.resources import files
 
@@ -15,7 +14,6 @@ from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan
-from tactflow.system.children import python_command
 from tactflow.system.extras import opencv_conflict
 
 
@@ -122,7 +120,6 @@ def add_arguments_warmup(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `warmup`."""
     add_pipeline(parser)
     add_quiet(parser)
-    parser.add_argument("--helper", action="store_true", help=argparse.SUPPRESS)
 
 
 def run_warmup(args: argparse.Namespace) -> int:
@@ -134,17 +131,9 @@ def run_warmup(args: argparse.Namespace) -> int:
     sensors: list[str | None] = [*sensor_names(file, args.overrides)]
     for sensor in sensors or [None]:
         load_pipeline(file, args.overrides, sensor=sensor)
-    if args.helper:
-        compiled.load(backwards=True)
-        return 0
     begin = time.perf_counter()
-    # A second process begins at the other end, and leaves on disk what it has compiled.
-    settings = [word for override in args.overrides for word in ("--set", override)]
-    command = python_command("-m", "tactflow", "warmup", str(file), *settings, "--helper")
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as other:
-        total, count = compiled.load()
-        other.kill()
+    total, count = compiled.load()
     if not args.quiet:
         seconds = time.perf_counter() - begin
-        say(f"{total} loops are ready; {count} of them were compiled here, in {seconds:.1f} s")
+        say(f"{total} loops are ready; {count} of them were compiled now, in {seconds:.1f} s")
     return 0

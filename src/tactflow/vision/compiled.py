@@ -190,13 +190,12 @@ def kernel(signature: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     return wrap
 
 
-def load(*, backwards: bool = False) -> tuple[int, int]:
+def load() -> tuple[int, int]:
     """Compile the kernels of all imported modules, or read them from disk.
 
-    backwards : begin with the last one, so that two processes can share the work.
     Returns how many there are, and how many of them this process has compiled.
     """
-    found = [each.compiled for each in (reversed(_kernels) if backwards else _kernels)]
+    found = [each.compiled for each in _kernels]
     return len(found), sum(hasattr(each, "stats") and not each.stats.cache_hits for each in found)
 
 
