@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from tactflow.doctor.measures import REGULAR, Gray, Image, Pair, exposure, grey, jpeg_step
 from tactflow.engine.errors import SourceError
@@ -30,7 +32,7 @@ class Observation:
     """Observation of a source over some seconds.
 
     source : as given by the user. description : of its kind. live : a camera or stream. nominal : frame rate
-    that it reports, 1/s, or None. times : (N,) s, or None for single pictures. frames : number of frames.
+    that it reports, 1/s, or None. times : s, or None for single pictures. frames : number of frames.
     repeated : frames bit-identical to their predecessor. missing : lost frames, by the numbers in a
     recording. stopped : why it ended early, or "". delays : s from the driver's time stamp to reading, for
     frames with a stamp. pairs : kept frames.
@@ -40,7 +42,7 @@ class Observation:
     description: str
     live: bool
     nominal: float | None = None
-    times: NDArray[np.float64] | None = None
+    times: list[float] | None = None
     frames: int = 0
     repeated: int = 0
     missing: int = 0
@@ -107,8 +109,8 @@ def _recur(dots: Detection, again: Detection | None) -> bool:
     """Whether at least half of the dots recur within half a pitch."""
     if again is None:
         return False
-    distances = np.hypot(*(dots.centers[:, None] - again.centers).transpose(2, 0, 1)).min(axis=1)
-    return bool(np.mean(distances < dots.pitch / 2) >= 0.5)
+    distances = cdist(dots.centers, again.centers).min(axis=1)
+    return bool(np.median(distances) < dots.pitch / 2)
 
 
 def observe(source: str, seconds: float, report: Callable[[int], None] = lambda _: None) -> Observation:
@@ -125,34 +127,27 @@ def observe(source: str, seconds: float, report: Callable[[int], None] = lambda 
     >>> observation.frames, observation.nominal, len(observation.pairs)
     (5, 60.0, 5)
     """
-    reader = open_source(source)
-    observation = Observation(source, reader.description, reader.live, reader.fps)
-    times: list[float] = []
-    try:
-        _read(reader, seconds, observation, times, report)
-    except SourceError as error:
-        observation.stopped = str(error)
-    except KeyboardInterrupt:
-        observation.stopped = ""
-    finally:
-        reader.close()
+    with closing(open_source(source)) as reader:
+        observation = Observation(source, reader.description, reader.live, reader.fps)
+        try:
+            _read(reader, seconds, observation, report)
+        except SourceError as error:
+            observation.stopped = str(error)
+        except KeyboardInterrupt:
+            pass
     if not observation.frames:
         raise SourceError(f"{source}: {observation.stopped or 'it contains no frames'}")
     if isinstance(reader, ImageFiles | ArrayFile):
         # The reader invents the rate of these.
-        observation.nominal = None
-    else:
-        observation.times = np.array(times)
+        observation.nominal = observation.times = None
     return observation
 
 
 def _read(
-    reader: FrameReader,
-    seconds: float,
-    observation: Observation,
-    times: list[float],
-    report: Callable[[int], None],
+    reader: FrameReader, seconds: float, observation: Observation, report: Callable[[int], None]
 ) -> None:
+    times: list[float] = []
+    observation.times = times
     last: Image | None = None
     last_seq: int | None = None
     stride = 1
