@@ -60,6 +60,12 @@ class Interval:
     low: float = math.nan
     high: float = math.nan
 
+    @property
+    def likely(self) -> float:
+        """What four of five draws stay below. The upper end is an expensive bound: 2.3 times the CPU time on
+        a gel without dots."""
+        return (self.value + self.high) / 2
+
 
 @dataclass
 class Trial:

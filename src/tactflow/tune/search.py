@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from tactflow.bench.report import pareto
 from tactflow.bench.scenes import Case
 from tactflow.engine.errors import SourceError
 from tactflow.tune.measure import ANY, ERRORS, Trial, judge, mark_unsound, measure_on_recording
@@ -29,10 +30,6 @@ FINALISTS: Final = 6
 """Candidates of the last round, in addition to the original, the most expensive one and the Pareto front."""
 ERROR_FACTOR: Final = 1.5
 """Without a budget, the largest acceptable error relative to the smallest. Chosen by hand."""
-MARGIN: Final = 0.5
-"""Fraction of the distance from an error to the upper end of its 90 % interval that must be within the
-budget, so that four of five draws stay within. The full distance is expensive: 2.3 times the CPU time on a
-gel without dots."""
 FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask.method"})
 """Settings that change nothing but the mean flow."""
 
@@ -193,7 +190,7 @@ class Search:
         bound = goal.error_limit(tuned.trials)
         picked = [trial for trial in goal.order(tuned.trials) if trial.usable and goal.keeps(trial, bound)]
         if goal.max_error is not None:
-            likely = [trial for trial in picked if _upper_error(trial, goal.kind) <= bound]
+            likely = [trial for trial in picked if trial.errors[goal.kind].likely <= bound]
             if picked and not likely:
                 tuned.notes.append("the budget lies within the interval of the chosen pipeline's error")
             picked = likely or picked
@@ -202,21 +199,10 @@ class Search:
         return [*same, *picked][0].name if picked else None
 
 
-def _upper_error(trial: Trial, kind: str) -> float:
-    """Value that an error most likely stays below, px."""
-    error = trial.errors[kind]
-    return error.value + MARGIN * (error.high - error.value)
-
-
 def front(trials: Sequence[Trial], kind: str) -> list[str]:
     """Names of usable trials on the Pareto front of time and error, by increasing time."""
-    names: list[str] = []
-    least = math.inf
-    for trial in sorted(trials, key=lambda f: (f.ms.value, f.of(kind))):
-        if trial.usable and trial.of(kind) < least:
-            least = trial.of(kind)
-            names.append(trial.name)
-    return names
+    usable = {trial.name: (trial.ms.value, trial.of(kind)) for trial in trials if trial.usable}
+    return pareto({name: point for name, point in usable.items() if math.isfinite(point[1])})
 
 
 def impossible(tuned: Tuned) -> str:
