@@ -48,7 +48,6 @@ def test_a_full_disk_is_told_by_the_name_that_was_given(
         ([], "NAME"),
         (["press"], "--out"),
         (["pres", "--out", "a.npy"], "did you mean press"),
-        (["press?noise=x", "--out", "a.npy"], "noise"),
         (["press", "--out", "a.gif"], ".npy"),
         (["press", "--out", "a.npy", "--truth", "a.txt"], ".jsonl"),
         (["press", "--out", "there.npy"], "--overwrite"),
