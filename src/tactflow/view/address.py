@@ -36,20 +36,16 @@ def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
     """
     family, _, _, _, resolved = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     candidates = range(port, min(port + tries, 65536)) if port else range(0)
-    for candidate in (*candidates, 0):
-        listener = socket.socket(family, socket.SOCK_STREAM)
+    two_families = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+    for candidate in candidates:
         try:
-            # Allows reusing the port of a run that has just ended.
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind((resolved[0], candidate, *resolved[2:]))
-            listener.listen(64)
+            return socket.create_server(
+                (resolved[0], candidate, *resolved[2:]), family=family, dualstack_ipv6=two_families
+            )
         except OSError as error:
-            listener.close()
-            if candidate == 0 or error.errno != errno.EADDRINUSE:
+            if error.errno != errno.EADDRINUSE:
                 raise
-        else:
-            return listener
-    raise AssertionError("port 0 either binds or raises")
+    return socket.create_server((resolved[0], 0, *resolved[2:]), family=family, dualstack_ipv6=two_families)
 
 
 class Neighbours:
