@@ -99,18 +99,22 @@ def warming_up(path: Path, gains: list[float]) -> list[Any]:
     return frames
 
 
+@pytest.mark.parametrize("source", ["r.npy", "pictures"])
 def test_a_recording_is_compared_with_the_first_frame_in_steady_light_and_keeps_all_frames(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    source: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     images = warming_up(tmp_path / "r.npy", [0.6, 0.7, 0.8, 0.9] + [1.0] * 16)
+    (tmp_path / "pictures").mkdir()
+    for index, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / "pictures" / f"{index}.png"), image)
     with caplog.at_level("INFO", "tactflow"):
-        before, *frames = capture("r.npy", tmp_path, fps=10.0).frames()
+        before, *frames = capture(source, tmp_path, fps=10.0).frames()
     assert (before.seq, before.reference, before.t) == (-1, True, 0.0)
     np.testing.assert_array_equal(before.image, images[4])
     assert [(frame.seq, frame.reference) for frame in frames] == [(i, False) for i in range(20)]
     assert all(np.array_equal(frame.image, image) for frame, image in zip(frames, images, strict=True))
     assert caplog.messages == [
-        "r.npy: the reference is frame 4; the camera was setting exposure and white balance until then"
+        f"{source}: the reference is frame 4; the camera was setting exposure and white balance until then"
     ]
 
 
