@@ -83,21 +83,6 @@ def test_no_change_of_colour_is_no_depth_and_neither_is_a_change_of_all_the_ligh
         assert depth.greatest_stderr is None
 
 
-def test_a_height_map_does_not_depend_on_the_ones_before_it() -> None:
-    rng = np.random.default_rng(5)
-    surface = Surface(SlopeModel(ANY), Scale(0.1, 0.1, (0, 0), (0, 0)))
-    masks = np.zeros((2, *GEL.shape[:2]), np.uint8)
-    masks[0, 10:70, 20:100] = masks[1, 50:60, 90:110] = 255
-    images = rng.integers(60, 150, (2, *GEL.shape)).astype(np.uint8)
-    first = surface.depth(images[0], Rest(GEL), masks[0])
-    kept = first.heights.copy()
-    second = surface.depth(images[1], Rest(GEL), masks[1])
-    assert first.heights.tobytes() == kept.tobytes()
-    alone = Surface(SlopeModel(ANY), Scale(0.1, 0.1, (0, 0), (0, 0))).depth(images[1], Rest(GEL), masks[1])
-    assert second.heights.tobytes() == alone.heights.tobytes()
-    assert second.greatest > 0
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_a_grainy_gel_that_is_not_touched_has_no_change_of_colour_however_its_means_are_rounded(
     dtype: type,

@@ -63,17 +63,14 @@ class SlopeModel:
         self.coefficients: Floats32 = np.asarray(coefficients, np.float32)
         self._by_place = np.ascontiguousarray(self.coefficients.transpose(2, 1, 0))
 
-    def slopes(
-        self, change: Floats32, x: Floats32, y: Floats32, near: Bytes, out: Floats32 | None = None
-    ) -> Floats32:
+    def slopes(self, change: Floats32, x: Floats32, y: Floats32, near: Bytes) -> Floats32:
         """(2, h, w) float32: how much the surface rises to the right, and down, towards the camera.
 
         change : (h, w, 3) float32, change of the light over the light at rest. x : (w,), y : (h,) float32,
         `coordinates` of the pixels. near : (bands, w) uint8, one row for `BAND` rows: slopes are computed
-        from its first column that is not 0 to the last; elsewhere they are 0. out : is written, if given.
+        from its first column that is not 0 to the last; elsewhere they are 0.
         """
-        slope = np.empty((2, *change.shape[:2]), np.float32) if out is None else out
-        slope[:] = 0
+        slope = np.zeros((2, *change.shape[:2]), np.float32)
         slopes_of_colour(change, self._by_place, x, y, near, slope)
         return slope
 

@@ -50,7 +50,7 @@ class SurfaceErrors(NamedTuple):
 
 
 class Rest:
-    """The untouched gel, prepared for `colour_change`.
+    """The untouched gel, prepared for `colour_change`, at half resolution.
 
     untouched : (H, W, 3), BGR, without markers; H and W at least 8; of the dtype of the pictures that are
     compared with it, so that both are rounded alike.
@@ -60,28 +60,25 @@ class Rest:
         self.window = Window(0, untouched.shape[0] // 4 * 2, 0, untouched.shape[1] // 4 * 2)
         self.light = _halved(untouched, self.window)
         self.weight: Floats32 = np.reciprocal(self.light + np.float32(DIM), dtype=np.float32)
+        self.x, self.y = coordinates((self.window.right, self.window.bottom))
 
 
-def colour_change(
-    image: Bytes | Floats32, rest: Rest, window: Window, out: Floats32 | None = None
-) -> Floats32:
+def colour_change(image: Bytes | Floats32, rest: Rest, window: Window) -> Floats32:
     """(h, w, 3) float32: change of the light at half resolution, relative to the light at rest.
 
     image : (H, W, 3) uint8 or float32, grey levels, BGR, without markers; means of 2 x 2 pixels of uint8 are
     rounded. What the window's border shows, a change of the light as a whole, is taken out.
-    out : is written and returned, if given.
     """
-    light, weight = rest.light[window.part], rest.weight[window.part]
-    change = np.empty(light.shape, np.float32) if out is None else out
-    cv2.subtract(_halved(image, window), light, change, dtype=cv2.CV_32F)
-    change *= weight
+    halved = _halved(image, window)
+    change = np.asarray(cv2.subtract(halved, rest.light[window.part], dtype=cv2.CV_32F), np.float32)
+    change *= rest.weight[window.part]
     # In numpy this takes nine times as long, for the three channels are the inner loop.
     cv2.subtract(change, (*_median(_border(change)).tolist(), 0.0), change)  # type: ignore[call-overload]
     return change
 
 
 class Surface:
-    """Height maps of a gel; not to be asked by two threads at once.
+    """Height maps of a gel.
 
     Parameters
     ----------
@@ -106,7 +103,6 @@ class Surface:
         self._model = model
         self._scale = scale
         self._errors = errors
-        self._kept: _Memory | None = None
 
     def depth(self, image: Bytes, rest: Rest, mask: Bytes) -> Depth:
         """The height map of a frame.
@@ -137,42 +133,16 @@ class Surface:
 
     def _slopes(self, image: Bytes, rest: Rest, around: Surroundings) -> tuple[Floats32, float]:
         """(2, h, w) float32, and the part of all slope that is steeper than the ball has shown, 0 to 1."""
-        memory = self._memory(rest.window)
-        change, slope = memory.arrays(around.window)
-        colour_change(image, rest, around.window, out=change)
+        change = colour_change(image, rest, around.window)
         rows, columns = around.window.part
-        self._model.slopes(change, memory.x[columns], memory.y[rows], around.near, out=slope)
+        slope = self._model.slopes(change, rest.x[columns], rest.y[rows], around.near)
         return slope, 0.0 if self._errors is None else _steep_part(slope, self._errors.steepest)
-
-    def _memory(self, whole: Window) -> _Memory:
-        if self._kept is None or self._kept.whole != whole:
-            self._kept = _Memory(whole)
-        return self._kept
 
     def _integrated(self, slope: Floats32) -> Floats32:
         # Two processed pixels a step. Slopes rise towards the camera, where the gel is pushed to.
         heights = self._integrate(slope, (-2 * self._scale.x, -2 * self._scale.y))
         heights -= _median(_border(heights[..., None]))
         return np.maximum(heights, 0, out=heights)
-
-
-class _Memory:
-    """Memory for pictures of one size, which every frame uses again: to get new memory from the system can
-    take as long as to compute what it holds.
-
-    x : (w,), y : (h,) float32, `coordinates` of the picture at half resolution.
-    """
-
-    def __init__(self, whole: Window) -> None:
-        self.whole = whole
-        self.x, self.y = coordinates((whole.right, whole.bottom))
-        self._values = np.empty(5 * whole.height * whole.width, np.float32)
-
-    def arrays(self, window: Window) -> tuple[Floats32, Floats32]:
-        """(h, w, 3) and (2, h, w) float32 of a window, to be written to."""
-        pixels = window.height * window.width
-        change, slope = self._values[: 3 * pixels], self._values[3 * pixels : 5 * pixels]
-        return change.reshape(window.height, window.width, 3), slope.reshape(2, window.height, window.width)
 
 
 def _steep_part(slope: Floats32, steepest: float | None) -> float:
