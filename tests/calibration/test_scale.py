@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.calibration.scale import scale_from_area, scale_from_pitch
+from tactflow.calibration.scale import scale_from_pitch
 
 SIZE = (300, 400)
 
@@ -74,8 +74,3 @@ def test_too_few_dots_are_refused_with_the_way_out() -> None:
 def test_a_pitch_that_is_none_is_refused(pitch: float) -> None:
     with pytest.raises(ValueError, match="pitch: required > 0 mm"):
         scale_from_pitch(grid(0.1, 0.1, 2.0, 0, 0, 1), pitch, SIZE)
-
-
-def test_an_area_gives_the_scale() -> None:
-    scale = scale_from_area((24.0, 32.0), (240, 160))
-    assert (scale.x, scale.y, scale.origin) == (0.1, 0.2, (119.5, 79.5))

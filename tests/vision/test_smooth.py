@@ -23,20 +23,6 @@ def turned(first: float, second: float) -> float:
     return abs((first - second + 90) % 180 - 90)
 
 
-def test_a_constant_stays_what_it_is() -> None:
-    smoother = OneEuro()
-    assert [smoother.update(3.5, 0.1) for _ in range(20)] == [3.5] * 20
-
-
-def test_noise_about_a_constant_shrinks() -> None:
-    noise = np.random.default_rng(0).normal(0, 1, 2000)
-    smoother = OneEuro()
-    smoothed = np.array([smoother.update(value, 1 / 60) for value in noise])[200:]
-    assert smoothed.std() < 0.6
-    # The mean of 1800 independent values scatters by 0.024.
-    assert abs(smoothed.mean() - noise[200:].mean()) < 0.05
-
-
 def test_one_euro_is_the_published_filter() -> None:
     values = np.cumsum(np.random.default_rng(1).normal(0, 1, 50))
     dt, min_cutoff, coefficient, speed_cutoff = 1 / 30, 1.3, 0.2, 0.9
@@ -53,15 +39,6 @@ def test_one_euro_is_the_published_filter() -> None:
         expected.append(a * value + (1 - a) * expected[-1])
     smoother = OneEuro(min_cutoff, coefficient, speed_cutoff)
     assert [smoother.update(value, dt) for value in values] == pytest.approx(expected, abs=1e-12)
-
-
-def test_one_euro_lags_less_when_moving_fast_with_a_higher_coefficient() -> None:
-    ramp = np.arange(100.0) * 5
-    lags = []
-    for coefficient in (0.0, 0.05, 1.0):
-        smoother = OneEuro(1.0, coefficient)
-        lags.append(ramp[-1] - [smoother.update(value, 1 / 60) for value in ramp][-1])
-    assert lags[0] > lags[1] > lags[2] >= 0
 
 
 def test_an_axis_that_turns_through_the_vertical_is_smoothed_like_any_other() -> None:
@@ -139,21 +116,10 @@ def test_a_contact_without_direction_keeps_none_and_restarts_the_angle() -> None
     assert smoother.update(contact(10, 0, 50), 0.2).angle == 50
 
 
-def test_a_longer_pause_between_frames_trusts_the_new_value_more() -> None:
-    results = []
-    for dt in (0.01, 0.1, 10.0):
-        smoother = ContactSmoother(speed_coefficient=0.0)
-        smoother.update(contact(0), 0.0)
-        results.append(smoother.update(contact(10), dt).center[0])
-    assert results == sorted(results)
-    assert results[-1] > 9.8
-
-
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
         ({"min_cutoff": 0.0}, "min_cutoff"),
-        ({"min_cutoff": math.nan}, "min_cutoff"),
         ({"speed_coefficient": -1.0}, "speed_coefficient"),
     ],
 )

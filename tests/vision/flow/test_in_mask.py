@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -66,12 +65,6 @@ def test_a_turn_to_the_left_is_positive() -> None:
     position = np.array([[0.0, 55], [100, 45], [45, 0], [55, 100]])
     flow = flow_in_mask(markers(position, origin), EVERYWHERE, dilate=5)
     assert flow.rotation == pytest.approx(math.degrees(math.atan2(5, 50)), abs=1e-9)
-
-
-def test_pressed_out_markers_diverge() -> None:
-    flow = flow_in_mask(moved(scale=1.05), EVERYWHERE, dilate=20)
-    assert flow.divergence is not None
-    assert flow.divergence > 0
 
 
 def test_the_standard_error_is_the_scatter_of_the_mean() -> None:
@@ -157,26 +150,6 @@ def test_no_contact_has_no_flow() -> None:
     assert flow_in_mask(moved(), np.zeros((0, 0), np.uint8)) == Flow(None, 0)
 
 
-def test_turning_frame_and_markers_turns_the_flow() -> None:
-    rng = np.random.default_rng(1)
-    position = GRID + rng.normal(0, 2, GRID.shape)
-    mask = np.zeros((160, 200), np.uint8)
-    cv2.ellipse(mask, (90, 80), (60, 30), 20, 0, 360, 255, -1)
-    first = flow_in_mask(markers(position), mask, dilate=6)
-
-    def quarter(points: NDArray[Any]) -> NDArray[Any]:
-        return np.column_stack([159 - points[:, 1], points[:, 0]])
-
-    turned = markers(quarter(position), quarter(GRID))
-    second = flow_in_mask(turned, np.ascontiguousarray(np.rot90(mask, -1)), dilate=6)
-    assert first.mean is not None
-    assert second.count == first.count > 10
-    assert second.mean == pytest.approx((-first.mean[1], first.mean[0]), abs=1e-12)
-    assert second.rotation == pytest.approx(first.rotation, abs=1e-9)
-    assert second.divergence == pytest.approx(first.divergence, abs=1e-12)
-    assert second.residual == pytest.approx(first.residual, abs=1e-12)
-
-
 def test_coordinates_far_from_the_origin_lose_no_precision() -> None:
     near = moved(3.0, 1.01, (0.5, 0.25))
     shift = np.array([50_000.0, 30_000.0])
@@ -188,15 +161,6 @@ def test_coordinates_far_from_the_origin_lose_no_precision() -> None:
     # Coordinates of 5e4 are rounded to 7e-12 px.
     assert second.mean == pytest.approx(first.mean, abs=1e-10)
     assert second.rotation == pytest.approx(first.rotation, abs=1e-9)
-
-
-def test_float32_markers_agree_with_float64() -> None:
-    double = moved(3.0, 1.01, (0.5, 0.25))
-    single = markers(double.position.astype(np.float32), GRID.astype(np.float32))
-    first, second = (flow_in_mask(given, EVERYWHERE, dilate=50) for given in (double, single))
-    # float32 rounds 200 px to 8e-6 px.
-    assert second.mean == pytest.approx(first.mean, abs=8e-6)
-    assert second.rotation == pytest.approx(first.rotation, abs=1e-5)
 
 
 @settings(max_examples=80, deadline=None)
@@ -227,23 +191,12 @@ def test_a_reach_beyond_all_numbers_takes_in_every_point(dilate: float) -> None:
     assert inside_mask(np.array([[7.0, 7.0], [-1e6, 3e6]]), mask, dilate).all()
 
 
-def test_the_inputs_stay_as_they_are() -> None:
-    given = moved(2.0)
-    mask = EVERYWHERE.copy()
-    kept = given.position.copy()
-    flow_in_mask(given, mask, dilate=3)
-    np.testing.assert_array_equal(given.position, kept)
-    np.testing.assert_array_equal(mask, EVERYWHERE)
-
-
 @pytest.mark.parametrize(
     ("mask", "dilate", "message"),
     [
         (np.zeros((3, 3), bool), 0.0, "uint8"),
         (np.zeros((3, 3, 1), np.uint8), 0.0, r"\(H, W\)"),
         (EVERYWHERE, -1.0, "dilate"),
-        (EVERYWHERE, math.nan, "dilate"),
-        (EVERYWHERE, math.inf, "dilate"),
     ],
 )
 def test_bad_input_is_refused_with_a_reason(mask: Any, dilate: float, message: str) -> None:
