@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 
-import tactflow
-from tactflow.calibration.presses import Press, find_presses
+from tactflow.calibration.presses import Press
 from tactflow.calibration.progress import fault, progress
 
 GEL = np.zeros((90, 90, 3), np.uint8)
@@ -35,12 +33,3 @@ def test_the_part_with_the_fewest_good_presses_is_asked_for_next() -> None:
     lasting = progress(presses, True, 9)
     assert (lasting["now"], lasting["done"], lasting["good"]) == ("Lift the ball.", 8, 8)
     assert progress(presses, False, 9)["now"] == "These are enough presses."
-
-
-def test_the_presses_of_a_recording_are_found() -> None:
-    scene = tactflow.open_scene("ball?frames=75")
-    session = find_presses(tactflow.stream(source="sim:ball?frames=75", images=True))
-    assert len(session.presses) == 3
-    for found in session.presses:
-        (pressed,) = scene.presses(found.seq)
-        assert found.center == pytest.approx(((599 - pressed.y) / 2, pressed.x / 2), abs=3)

@@ -14,9 +14,10 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from tactflow.calibration.file import ForceEntry, LinearForceEntry
-from tactflow.calibration.reference import Reference, nonnegative, time_offset
+from tactflow.calibration.reference import Reference, time_offset
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
 from tactflow.vision.arrays import Floats
@@ -237,11 +238,11 @@ def _learn(
     # Features differ by orders of magnitude.
     size = np.maximum(np.abs(features).max(axis=0), 1e-12)
     features = features / size
-    fitted = nonnegative(features, force)
+    fitted = nnls(features, force)[0]
     predicted = np.zeros(len(force))
     for group in np.unique(groups):
         held = groups == group
-        predicted[held] = features[held] @ nonnegative(features[~held], force[~held])
+        predicted[held] = features[held] @ nnls(features[~held], force[~held])[0]
     residual = force - predicted
     spread = float(((force - force.mean()) ** 2).sum())
     return LinearForceEntry(

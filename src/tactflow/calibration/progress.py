@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from tactflow.calibration.presses import Press, usual_radius
+from tactflow.vision.geometry.region import measure_region
 
 LIGHT: Final = 0.5
 """Radius of a contact over the usual one, below which a press is called light. Chosen by hand."""
@@ -31,6 +28,7 @@ def fault(press: Press, usual: float) -> str | None:
 
     usual : radius of contacts, px.
 
+    >>> import numpy as np
     >>> mask = np.zeros((60, 60), np.uint8)
     >>> fault(Press(1, np.zeros((60, 60, 3), np.uint8), mask, mask > 0, (5.0, 30.0), 9.0), 9.0)
     'cut off by the border of the picture at (5, 30); press further inside'
@@ -41,7 +39,8 @@ def fault(press: Press, usual: float) -> str | None:
         return f"light, radius {press.radius:.0f} px where {usual:.0f} px is usual; press harder"
     if min(x, y, width - 1 - x, height - 1 - y) < press.radius:
         return f"cut off by the border of the picture at ({x:.0f}, {y:.0f}); press further inside"
-    if _elongation(press.mask) > ROUND:
+    major, minor = measure_region(press.mask).moments().principal
+    if major > ROUND**2 * minor:
         return "not round; press the ball straight, and nothing else"
     return None
 
@@ -97,11 +96,3 @@ def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str,
             for press, wrong in zip(presses, faults, strict=True)
         ],
     }
-
-
-def _elongation(mask: NDArray[np.uint8]) -> float:
-    """Longer over shorter axis of a region (H, W) uint8, not 0 inside; 0 of nothing."""
-    moments = cv2.moments(mask, binaryImage=True)
-    across, both, down = moments["mu20"], moments["mu11"], moments["mu02"]
-    apart = float(np.hypot(across - down, 2 * both))
-    return float(np.sqrt((across + down + apart) / max(across + down - apart, 1e-9)))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.optimize import nnls
 
 from tactflow.engine.errors import ConfigError
 from tactflow.system.files import expanded
@@ -159,22 +160,6 @@ def recordings_with_csv(source: str) -> dict[str, Path]:
     return pairs
 
 
-def nonnegative(features: Floats, aim: Floats) -> Floats:
-    """(k,) coefficients >= 0 of the least-squares fit aim = features @ coefficients, without a constant.
-
-    features : (N, k). aim : (N,).
-
-    >>> features = np.array([[1.0, 1.0], [2.0, 1.0], [3.0, 1.0]])
-    >>> nonnegative(features, np.array([1.0, 3.0, 5.0])).round(6).tolist()
-    [1.571429, 0.0]
-    """
-    from scipy.optimize import nnls
-
-    # QR leaves as many rows as there are unknowns, which nnls solves at once.
-    triangle: Floats = np.asarray(np.linalg.qr(np.column_stack([features, aim]), mode="r"))
-    return np.asarray(nnls(triangle[:, :-1], triangle[:, -1])[0], np.float64)
-
-
 def time_offset(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
     """By how much the time of the frames is ahead of the reference's, s.
 
@@ -226,5 +211,5 @@ def _explained(reference: Reference, seconds: Floats, times: Floats, features: F
     spread = float(((force - force.mean()) ** 2).sum())
     if spread == 0:
         return math.nan
-    residual = force - features[there] @ nonnegative(features[there], force)
+    residual = force - features[there] @ nnls(features[there], force)[0]
     return 1 - float(residual @ residual) / spread
