@@ -87,10 +87,6 @@ def test_one_pixel_is_a_point() -> None:
     assert contact.area == 1
 
 
-def test_a_frame_of_one_pixel_can_be_a_contact() -> None:
-    assert described(np.full((1, 1), 255, np.uint8)).center == (0, 0)
-
-
 @pytest.mark.parametrize("offset", [(0, 0), (13, 5), (119, 99)])
 @pytest.mark.parametrize(
     ("step", "angle", "slope"),
@@ -127,13 +123,6 @@ def test_a_vertical_bar_is_vertical_and_has_no_slope(width: int) -> None:
     assert contact.angle == 90.0
     assert contact.slope is None
     assert contact.area == contact.region_area == width * 159
-
-
-def test_the_whole_frame_is_a_contact() -> None:
-    contact = described(np.full((300, 400), 255, np.uint8))
-    assert contact.center == (199.5, 149.5)
-    assert contact.angle == 0.0
-    assert contact.area == 120000
 
 
 def test_a_disc_has_no_direction_wherever_it_lies() -> None:
@@ -272,19 +261,6 @@ def test_mirroring_the_mask_mirrors_the_result(seed: int) -> None:
         assert turned(second.angle, -first.angle) < 1e-9
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_doubling_the_scale_doubles_lengths_and_keeps_angles(seed: int) -> None:
-    mask = blobs(seed)
-    first = described(mask)
-    second = described(np.kron(mask, np.ones((2, 2), np.uint8)))
-    assert second.center == pytest.approx((2 * first.center[0] + 0.5, 2 * first.center[1] + 0.5), abs=1e-9)
-    assert second.region_area == 4 * first.region_area
-    assert (second.angle is None) == (first.angle is None)
-    if first.angle is not None and second.angle is not None:
-        # Each pixel becomes a square, whose own moments are the same in every direction.
-        assert turned(second.angle, first.angle) < 1e-9
-
-
 @settings(max_examples=150, deadline=None)
 @given(
     mask=hnp.arrays(
@@ -312,7 +288,7 @@ def test_any_mask_gives_sound_numbers_or_none(mask: Mask, min_area: float, max_g
     mask=hnp.arrays(
         np.uint8,
         hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12),
-        elements=st.sampled_from([0, 255]),
+        elements=st.sampled_from([0, 1, 128, 255]),
     )
 )
 def test_centre_and_area_are_those_of_the_pixels(mask: Mask) -> None:
@@ -412,22 +388,6 @@ def test_the_group_with_most_pixels_is_the_contact_even_of_many_small_blobs() ->
     assert contact.angle == 0.0
 
 
-@pytest.mark.parametrize("value", [1, 128, 255])
-def test_any_non_zero_value_is_contact(value: int) -> None:
-    mask = ellipse_mask((60, 50), (50, 20), 30)
-    other = described((mask // 255 * value).astype(np.uint8))
-    assert other.center == described(mask).center
-
-
-def test_views_and_read_only_masks_are_as_good_as_any() -> None:
-    mask = ellipse_mask((60, 50), (50, 20), 30)
-    wide = np.zeros((140, 320), np.uint8)
-    wide[:, ::2] = mask
-    view = wide[:, ::2]
-    view.flags.writeable = False
-    assert described(view).center == described(mask).center
-
-
 def test_a_large_frame_loses_no_precision() -> None:
     mask = np.zeros((2160, 3840), np.uint8)
     mask[500:1500, 1000:3000] = 255
@@ -447,7 +407,6 @@ def test_a_large_frame_loses_no_precision() -> None:
         (np.zeros((3, 3), bool), {}, "uint8"),
         (np.zeros((3, 3, 3), np.uint8), {}, r"\(H, W\)"),
         (np.zeros((3, 3), np.uint8), {"min_area": -1}, "min_area"),
-        (np.zeros((3, 3), np.uint8), {"min_area": math.nan}, "min_area"),
         (np.zeros((3, 3), np.uint8), {"min_confidence": 1.1}, "min_confidence"),
         (np.zeros((3, 3), np.uint8), {"min_confidence": math.nan}, "min_confidence"),
     ],

@@ -59,17 +59,6 @@ def project(matrix: Floats, points: Floats) -> Floats:
     return homogeneous[:, :2] / depth[:, None]
 
 
-def inverse(matrix: Floats) -> Floats:
-    """The homography back, (3, 3) float64.
-
-    >>> inverse(np.diag([2.0, 2.0, 1.0]))
-    array([[0.5, 0. , 0. ],
-           [0. , 0.5, 0. ],
-           [0. , 0. , 1. ]])
-    """
-    return np.linalg.inv(matrix).astype(np.float64)
-
-
 def _corners(name: str, points: ArrayLike) -> Floats:
     """Four points (4, 2) of which no three lie on a line; ValueError otherwise."""
     corners = np.array(points, dtype=np.float64)

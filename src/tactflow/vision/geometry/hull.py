@@ -138,9 +138,6 @@ def _describe(
 def _hull(contours: Contours) -> tuple[Points, float]:
     """Convex hull of some components: its corners (m, 2), clockwise on the screen; pixels in it."""
     corners = cv2.convexHull(np.concatenate(contours))[:, 0]
-    # The left one of the first row comes last.
-    first = int(np.lexsort(corners.T)[0]) + 1
-    corners = np.concatenate([corners[first:], corners[:first]])
     steps = corners - np.concatenate([corners[-1:], corners[:-1]])
     # Pick's theorem, with the pixels on the border.
     on_border = int(np.gcd(steps[:, 0], steps[:, 1]).sum())

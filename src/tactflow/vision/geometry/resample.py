@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats
-from tactflow.vision.geometry.homography import inverse
 from tactflow.vision.geometry.mapping import PixelMapping
 
 _LARGEST_FIXED_POINT: Final = 32000
@@ -98,7 +97,7 @@ def _shrinkage(mapping: PixelMapping, raw: Floats, in_front: NDArray[np.bool_]) 
 
 def _in_front(mapping: PixelMapping, grid: Floats) -> NDArray[np.bool_]:
     """False for processed pixels beyond the horizon of the homography, where it folds over."""
-    back = inverse(mapping.matrix)
+    back = np.linalg.inv(mapping.matrix)
     depth = grid @ back[2, :2] + back[2, 2]
     centre = np.array([(mapping.raw_size[0] - 1) / 2, (mapping.raw_size[1] - 1) / 2, 1.0])
     sign = np.sign(mapping.matrix[2] @ centre) or 1.0

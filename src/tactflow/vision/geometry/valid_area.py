@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Mask
+from tactflow.vision.arrays import SATURATED, Mask
 
 BLACK: Final = 24
 """Grey levels below which a pixel is black: video has its black at 16 (ITU-R BT.601), and compression and
@@ -24,8 +24,6 @@ DARK: Final = 0.15
 development recordings: corners of a gel are above 0.2, housings that are seen below 0.12."""
 BRIGHTEST: Final = 90.0
 """Percentile of the brightness that stands for the brightest part of the picture. Chosen by hand."""
-SATURATED: Final = 250
-"""Grey levels of all channels from which a place is saturated: it cannot become brighter. Chosen by hand."""
 COARSE: Final = 200
 """Shorter side of the picture that is looked at, px, at least; larger ones are shrunk by a whole factor. By
 hand: 10 ms instead of 100 for each reference."""
