@@ -3,19 +3,8 @@
 This file is the reference. Each class attribute below may be set and each method overridden; everything has
 the default that stands here.
 
-A stage that swaps dark and bright::
-
-    class Invert(Stage):
-        memory = "pure"
-
-        class Params(StageParams):
-            strength: float = Field(1.0, ge=0, le=1, description="0 keeps the image, 1 inverts it")
-
-        def process(self, image: Image) -> Image:
-            return np.rint(image + self.params.strength * (255.0 - 2.0 * image)).astype(np.uint8)
-
-All three kinds are built from their parameters, `Invert(Invert.Params(strength=1))`, and can be called
-without the engine. A constructor that takes more than `params` is given, by name, what it asks for:
+All three kinds are built from their parameters, as in `Invert(Invert.Params())`, and can be called without
+the engine. A constructor that takes more than `params` is given, by name, what it asks for:
 
     sensor : str              name of the sensor
     directory : Path          folder of the pipeline file, against which relative paths are read

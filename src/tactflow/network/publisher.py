@@ -96,6 +96,7 @@ class Publisher(BoundSocket):
         """Deliver what is under way, for at most `linger` seconds, and free the address. May come twice."""
         with self._lock:
             self._topics.clear()
+            self.subscriptions = 0
             super().close(linger)
 
 
