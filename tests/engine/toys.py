@@ -33,7 +33,6 @@ class Ramp(contract.Source):
         source: str = "ramp"
         realtime: bool = False
         frames: int = 20
-        fail_at: int = -99
         refuse: bool = False
         pause: float = 0.0
         retake_at: int = -1
@@ -67,8 +66,6 @@ class Ramp(contract.Source):
         for seq in range(self.params.frames):
             if self.stopped.wait(self.params.pause):
                 return
-            if seq == self.params.fail_at:
-                raise OSError("the cable came off")
             epoch += seq == self.params.retake_at
             yield self.frame(seq, epoch)
 
