@@ -29,7 +29,7 @@ from tactflow.calibration.photometric import fit_photometry, try_photometry
 from tactflow.calibration.presses import PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
-from tactflow.cli.guide import Guide, typed_lines
+from tactflow.cli.guide import Guide
 from tactflow.cli.options import add_overwrite, add_sensor, number, positive, refuse_output
 from tactflow.cli.terminal import notes, say, show, typed
 from tactflow.engine.collect import with_collector
@@ -158,7 +158,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     kept = KeptPresses(out.with_suffix(".presses"))
     if args.fresh:
         kept.clear()
-    guide = Guide(args.presses, say, typed_lines())
+    guide = Guide(args.presses, say)
     page = _page(args, pipeline, guide) if args.view else {}
     if args.ball_radius is None:
         session = _find_presses(loaded, None, page=page)
@@ -224,7 +224,7 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
     then = calibration.photometric
     _instruct(args, None if then is None else then.ball_radius)
-    guide = None if then is None else Guide(args.presses, say, typed_lines())
+    guide = None if then is None else Guide(args.presses, say)
     session = _find_presses(_load(args, pipeline), guide)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
@@ -494,9 +494,8 @@ def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = 
         say("Leave the gel untouched.")
         return
     say(
-        "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, "
-        f"all over the gel and to several depths. {args.presses} presses will do. Type u and Enter to "
-        f"undo the last one, q and Enter or Ctrl-C to end earlier{ended}."
+        "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, all "
+        f"over the gel and to several depths. {args.presses} presses will do; Ctrl-C ends earlier{ended}."
     )
 
 

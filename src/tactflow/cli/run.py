@@ -8,7 +8,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ Sinks = dict[str, dict[str, Any]]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `run`."""
+    parser.set_defaults(out=None)
     add_pipeline(parser)
     parser.add_argument("--source", metavar="SRC", help="replaces the source of the pipeline's capture stage")
     parser.add_argument(
@@ -93,11 +94,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace, extra_sinks: Callable[[str | None], Sinks] = lambda _: {}) -> int:
-    """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started.
-
-    extra_sinks : gives the sinks that a command adds for one of several sensors, or for None, the only one.
-    """
+def run(args: argparse.Namespace) -> int:
+    """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started."""
     file = find_pipeline(args.pipeline)
     sensors: list[str] = []
     if args.sensor is None:
@@ -105,13 +103,11 @@ def run(args: argparse.Namespace, extra_sinks: Callable[[str | None], Sinks] = l
         warn_of_opencv()
         sensors = sensor_names(file, args.overrides)
     if len(sensors) > 1:
-        return _run_all(args, file, sensors, extra_sinks)
-    return _run_one(args, _load(args, file, args.sensor, _added_sinks(args, None) | extra_sinks(None)))
+        return _run_all(args, file, sensors)
+    return _run_one(args, _load(args, file, args.sensor, _added_sinks(args, None)))
 
 
-def _run_all(
-    args: argparse.Namespace, file: Path, sensors: Sequence[str], extra_sinks: Callable[[str | None], Sinks]
-) -> int:
+def _run_all(args: argparse.Namespace, file: Path, sensors: Sequence[str]) -> int:
     """Run every sensor in a process of its own."""
     problems = []
     if args.source is not None:
@@ -120,12 +116,12 @@ def _run_all(
             f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
         )
     reports = _reports(args)
-    files = {"--jsonl": args.jsonl, "--video": args.video, "--out": getattr(args, "out", None)}
+    files = {"--jsonl": args.jsonl, "--video": args.video, "--out": args.out}
     named = {option: str(path) for option, path in files.items() if path is not None}
     problems += name_problems(named | reports, sensors)
     if problems:
         raise ConfigError("\n".join(problems))
-    sinks = {sensor: _added_sinks(args, sensor) | extra_sinks(sensor) for sensor in sensors}
+    sinks = {sensor: _added_sinks(args, sensor) for sensor in sensors}
     pipelines = {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors}
     request = Request(
         file,
@@ -152,13 +148,16 @@ def _reports(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
-    """The sinks of `--jsonl` and `--video`."""
-    paths = {"jsonl": args.jsonl, "video": args.video}
-    return {
-        f"--{use}": {"use": use, "path": path if sensor is None else with_name(path, sensor)}
-        for use, path in paths.items()
-        if path is not None
-    }
+    """The sinks that options add, for one of several sensors, or, for None, the only one."""
+    paths = {"jsonl": args.jsonl, "video": args.video, "record": args.out}
+    sinks: Sinks = {}
+    for use, path in paths.items():
+        if path is not None:
+            own = str(path) if sensor is None else with_name(str(path), sensor)
+            sinks[f"--{use}"] = {"use": use, "path": own}
+    if args.out is not None:
+        sinks["--record"] |= _recording_options(args, Path(sinks["--record"]["path"]))
+    return sinks
 
 
 def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:
@@ -283,18 +282,17 @@ def run_record(args: argparse.Namespace) -> int:
     if problem is not None:
         raise ConfigError(problem)
     refuse_output("--out", args.out, overwrite=True, suffixes=(".mcap",))
-    return run(args, lambda sensor: _recording_sink(args, sensor))
+    return run(args)
 
 
-def _recording_sink(args: argparse.Namespace, sensor: str | None) -> Sinks:
-    """The sink that records one of several sensors, or, for None, the only one."""
-    out = args.out if sensor is None else Path(with_name(str(args.out), sensor))
+def _recording_options(args: argparse.Namespace, out: Path) -> dict[str, Any]:
+    """Settings of the sink that records to a file. Raises ConfigError if the file is there already."""
     if out.exists() and args.number:
         out = next_name(out)
     if out.exists() and not args.overwrite:
         raise ConfigError(
             f"--out: {out} is already there; give --overwrite to replace it or --number to record beside it"
         )
-    settings = {"use": "record", "path": str(out), "overwrite": args.overwrite}
     rotation = {"rotate_size": args.rotate_size, "rotate_after": args.rotate_after}
-    return {"--record": settings | {key: value for key, value in rotation.items() if value is not None}}
+    chosen = {key: value for key, value in rotation.items() if value is not None}
+    return {"path": str(out), "overwrite": args.overwrite, **chosen}
