@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +35,7 @@ class Quantity:
 
     key : name in results. title : for people. unit : "" for none.
     summary : makes one number of the values (N,) of all frames, N > 0.
-    best : the perfect value. better : which direction is better.
+    best : the perfect value: 0 for an error, of which less is better; otherwise more is.
     slack : a stored result may be exceeded by slack + `SHARE` * |stored - best| before it counts as worse:
         by what other CPUs change in the last bits of floating-point sums (a marker or a pixel at a threshold
         falls to the other side). For shares of frames, a little more than one frame of the quick run's 30.
@@ -45,7 +45,6 @@ class Quantity:
     title: str
     unit: str
     summary: Summary = MEAN
-    better: Literal["lower", "higher"] = "lower"
     best: float = 0.0
     slack: float = 0.0
 
@@ -61,21 +60,12 @@ class Quantity:
     def allowed(self, stored: float) -> float:
         """The worst value that still counts as no worse than `stored`."""
         margin = self.slack + SHARE * self.distance(stored)
-        return stored + margin if self.better == "lower" else stored - margin
+        return stored + margin if self.best == 0 else stored - margin
 
     def is_worse(self, value: float, stored: float) -> bool:
         """Whether `value` is worse than `stored` by more than the tolerance."""
         allowed = self.allowed(stored)
-        return value > allowed if self.better == "lower" else value < allowed
-
-
-def _within(key: str, title: str) -> tuple[Quantity, Quantity]:
-    """Shares of errors within one and two of their stated standard errors."""
-    kind = partial(Quantity, unit="%", better="higher")
-    return (
-        kind(f"{key}_within_one", f"{title} within one stderr", best=68.0, slack=15.0),
-        kind(f"{key}_within_two", f"{title} within two stderr", best=95.0, slack=5.0),
-    )
+        return value > allowed if self.best == 0 else value < allowed
 
 
 _ALL = [
@@ -85,11 +75,11 @@ _ALL = [
     Quantity("lost_percent", "visible markers declared lost", "%", slack=0.1),
     Quantity("markers_missed", "markers never found", "", slack=0.5),
     Quantity("markers_false", "false markers", "", slack=0.5),
-    Quantity("marker_recall", "markers found (recall)", "", better="higher", best=1.0, slack=0.005),
-    Quantity("marker_precision", "detections that are markers (precision)", "", MEAN, "higher", 1.0, 0.005),
+    Quantity("marker_recall", "markers found (recall)", "", best=1.0, slack=0.005),
+    Quantity("marker_precision", "detections that are markers (precision)", "", MEAN, 1.0, slack=0.005),
     Quantity("localisation_rms", "detected centre against true centre, RMS", "px", rms, slack=0.01),
-    Quantity("contact_iou", "contact mask, IoU with the truth", "", MEAN, "higher", 1.0, slack=0.01),
-    Quantity("hull_iou", "contact hull, IoU with the true hull", "", MEAN, "higher", 1.0, slack=0.01),
+    Quantity("contact_iou", "contact mask, IoU with the truth", "", MEAN, 1.0, slack=0.01),
+    Quantity("hull_iou", "contact hull, IoU with the true hull", "", MEAN, 1.0, slack=0.01),
     Quantity("area_error", "hull area error, mean", "%", slack=0.5),
     Quantity("center_error", "contact centre error, mean", "px", slack=0.05),
     Quantity("angle_mean", "direction error, mean", "deg", slack=0.05),
@@ -98,20 +88,22 @@ _ALL = [
     Quantity("angle_invented", "round contacts with a direction", "%", slack=4.0),
     Quantity("flow_error", "mean flow of the gel in contact, error, mean", "px", slack=0.02),
     Quantity("flow_rms", "mean flow of the gel in contact, error, RMS", "px", rms, slack=0.02),
-    *_within("flow", "mean-flow errors"),
+    Quantity("flow_within_one", "mean-flow errors within one stderr", "%", MEAN, 68.0, slack=15.0),
+    Quantity("flow_within_two", "mean-flow errors within two stderr", "%", MEAN, 95.0, slack=5.0),
     Quantity("false_contacts", "idle frames called contact", "%"),
     Quantity("missed_contacts", "frames with contact missed", "%", slack=4.0),
     Quantity("missed_half_depth", "contact at half depth or more missed", "%"),
     Quantity("inpaint_mae", "marker removal, mean absolute error in the mask", "grey levels", slack=0.1),
     Quantity("depth_rms", "heights, RMS error over the greatest depth", "%", slack=0.3),
-    *_within("depth", "greatest-depth errors"),
+    Quantity("depth_within_one", "greatest-depth errors within one stderr", "%", MEAN, 68.0, slack=15.0),
+    Quantity("depth_within_two", "greatest-depth errors within two stderr", "%", MEAN, 95.0, slack=5.0),
     Quantity("volume_error", "indented volume, error, mean", "%", slack=1.0),
-    Quantity("outline_iou_p50", "outline by eye, IoU, median", "", MEDIAN, "higher", 1.0, slack=0.02),
-    Quantity("outline_iou_min", "outline by eye, IoU, worst", "", LEAST, "higher", 1.0, slack=0.05),
+    Quantity("outline_iou_p50", "outline by eye, IoU, median", "", MEDIAN, 1.0, slack=0.02),
+    Quantity("outline_iou_min", "outline by eye, IoU, worst", "", LEAST, 1.0, slack=0.05),
     Quantity("label_distance_p50", "centre against labelled circle, median", "px", MEDIAN, slack=0.1),
     Quantity("line_angle_p50", "direction against labelled line, median", "deg", MEDIAN, slack=0.1),
     Quantity("line_angle_max", "direction against labelled line, maximum", "deg", MOST, slack=0.3),
-    Quantity("dots_found", "dots found, of those counted by eye", "%", MEAN, "higher", 100.0, slack=1.0),
+    Quantity("dots_found", "dots found, of those counted by eye", "%", MEAN, 100.0, slack=1.0),
     Quantity("dots_beyond", "dots found beyond those counted by eye", "%", slack=1.0),
 ]
 
