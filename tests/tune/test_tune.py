@@ -181,11 +181,9 @@ def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
         (["--source", "still"], 4, "no contact in the first 24 frames"),
         (["--source", "short"], 4, "5 frames are too few"),
         (["--source", "nowhere.avi"], 4, "no such file"),
-        (["--source", "still", "--budget", "soon"], 2, "required a time such as 90s"),
         (["--source", "still", "--max-error", "-1"], 2, "required a number above 0"),
         (["--source", "still", "--seed", "-1"], 2, "--seed: required a whole number from 0"),
         (["--source", "still", "--out", "tuned.txt"], 2, "ends in .yaml"),
-        (["--source", "still", "--out", "there.yaml"], 2, "already there"),
         (["--source", "still", "--out", "readonly/tuned.yaml"], 2, "readonly cannot be written into"),
     ],
 )
@@ -198,7 +196,6 @@ def test_what_cannot_be_tuned_is_said(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "there.yaml").touch()
     # Of a user who may do everything too.
     monkeypatch.setattr(os, "access", lambda path, _mode: Path(path).name != "readonly")
     (tmp_path / "readonly").mkdir()
