@@ -59,7 +59,7 @@ class PixelMapping:
     def to_raw(self, points: ArrayLike) -> Floats:
         """Where points of the processed frame lie in the raw frame: inverse of `to_processed`."""
         given = _points(points)
-        straight = project(np.linalg.inv(self.matrix), given.reshape(-1, 2))
+        straight = project(np.asarray(np.linalg.inv(self.matrix), np.float64), given.reshape(-1, 2))
         return (straight if self.lens is None else self.lens.distort(straight)).reshape(given.shape)
 
 
