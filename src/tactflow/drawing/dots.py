@@ -58,19 +58,17 @@ def draw_detection(
     if rival is not None:
         _circles(picture, rival.centers, np.full(len(rival.centers), rival.radius), MAGENTA, factor)
     if marks is not None:
-        for link in marks.centers[marks.edges]:
-            one, other = (_fixed(point, factor) for point in link)
-            cv2.line(picture, one, other, GREEN, 1, cv2.LINE_AA, _SHIFT)
+        links = list(_fixed(marks.centers, factor)[marks.edges])
+        cv2.polylines(picture, links, False, GREEN, 1, cv2.LINE_AA, _SHIFT)
         sizes = np.full(len(marks.centers), marks.dot_radius) if marks.radii is None else marks.radii
         _circles(picture, marks.centers, sizes, DARK, factor, 3)
         _circles(picture, marks.centers, sizes, YELLOW, factor)
     return np.concatenate([picture, _caption(caption, picture.shape[1])])
 
 
-def _fixed(point: NDArray[np.float64], factor: int) -> tuple[int, int]:
-    """A point of the frame in drawing coordinates of the enlarged one."""
-    x, y = np.rint(((point + 0.5) * factor - 0.5) * 2**_SHIFT).astype(int).tolist()
-    return x, y
+def _fixed(points: NDArray[np.float64], factor: int) -> NDArray[np.int32]:
+    """Points (N, 2) of the frame in drawing coordinates of the enlarged one."""
+    return np.rint(((points + 0.5) * factor - 0.5) * 2**_SHIFT).astype(np.int32)
 
 
 def _circles(
@@ -81,9 +79,9 @@ def _circles(
     factor: int,
     width: int = 1,
 ) -> None:
-    for center, radius in zip(centers, radii.tolist(), strict=True):
+    for center, radius in zip(_fixed(centers, factor).tolist(), radii.tolist(), strict=True):
         outline = round((radius * factor + 1) * 2**_SHIFT)
-        cv2.circle(picture, _fixed(center, factor), outline, colour, width, cv2.LINE_AA, _SHIFT)
+        cv2.circle(picture, center, outline, colour, width, cv2.LINE_AA, _SHIFT)
 
 
 def _caption(text: str, width: int) -> NDArray[np.uint8]:

@@ -50,9 +50,5 @@ def _divergence(slope: Floats32, step: tuple[float, float]) -> Floats32:
     slope_x, slope_y = slope
     across = (slope_x[:, 1:] + slope_x[:, :-1]) * np.float32(step[0] / 2)
     down = (slope_y[1:] + slope_y[:-1]) * np.float32(step[1] / 2)
-    divergence = np.zeros(slope_x.shape, np.float32)
-    divergence[:, :-1] += across
-    divergence[:, 1:] -= across
-    divergence[:-1] += down
-    divergence[1:] -= down
-    return divergence
+    rise = np.diff(np.pad(across, ((0, 0), (1, 1))), axis=1) + np.diff(np.pad(down, ((1, 1), (0, 0))), axis=0)
+    return np.asarray(rise, np.float32)

@@ -198,11 +198,6 @@ class FieldModel:
         x, y = points.T[:, :, None] - self.origin.T[:, None]
         return matern(np.sqrt(x * x + y * y) / self._length)
 
-    @cached_property
-    def weights(self) -> Floats:
-        """(cells, N): how much each marker counts in each cell where all are seen."""
-        return self.fine.to_markers.reshape(-1, len(self.origin)) @ self.inverse
-
     def __call__(self, markers: Markers) -> DisplacementField | None:
         """The field of one frame; None where fewer than three markers are seen.
 
@@ -251,7 +246,7 @@ class DisplacementField:
     def stderr(self) -> Floats:
         """(rows, columns) float64, standard error of each component of `displacement`, px."""
         kernel = self._model.fine.to_markers.reshape(-1, len(self._seen))
-        weights = self._model.weights - kernel @ self._removed.T @ self._removed
+        weights = kernel @ self._model.inverse - kernel @ self._removed.T @ self._removed
         unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
         variances = (self._planes[COEFFICIENTS] ** 2).sum(axis=0) * self._planes[PRECISION]
         scale = kernel @ variances / np.maximum(kernel @ self._seen, 1e-12)

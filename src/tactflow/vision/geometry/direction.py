@@ -105,9 +105,5 @@ def _outline_power(contours: Contours, moments: Moments) -> Floats:
         fraction = np.imag(np.conj(around[:-2]) * around[2:]) / (4 * math.pi)
         deviations.append((distance / 2 - 1) * fraction)
         turns.append(turn)
-    turn = np.concatenate(turns)
-    powers = np.empty((len(_HARMONICS), len(turn)), np.complex128)
-    np.multiply(turn * turn, turn * np.concatenate(deviations), out=powers[0])
-    for k in range(1, len(powers)):
-        np.multiply(powers[k - 1], turn, out=powers[k])
-    return np.asarray(np.abs(powers.sum(axis=1)) ** 2)
+    powers = np.vander(np.concatenate(turns), _HARMONICS.stop, increasing=True)[:, _HARMONICS.start :]
+    return np.asarray(np.abs(np.concatenate(deviations) @ powers) ** 2)

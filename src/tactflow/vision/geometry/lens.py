@@ -15,8 +15,6 @@ _DISTORTION_LENGTHS: Final = (4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV's polynomial model knows."""
 _CONVERGED: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-14)
 """Where the iterations of `Lens.undistort` end: after so many steps, or at so small an error."""
-_ON_AXIS: Final = 1e-12
-"""Distance from the optical axis, normalised, below which a fisheye lens bends nothing. Chosen by hand."""
 
 # OpenCV 4 has a name of its own for the function that takes a stopping rule.
 _undistort: Final[Any] = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
@@ -49,12 +47,12 @@ class Lens:
         normalised = np.empty((len(points), 2))
         normalised[:, 1] = (points[:, 1] - matrix[1, 2]) / matrix[1, 1]
         normalised[:, 0] = (points[:, 0] - matrix[0, 2] - matrix[0, 1] * normalised[:, 1]) / matrix[0, 0]
+        # OpenCV ignores a camera matrix's skew: it gets the identity, and the matrix is applied here.
         if self.fisheye:
-            return _equidistant(normalised, self.distortion) @ matrix[:2, :2].T + matrix[:2, 2]
-        rays = np.column_stack([normalised, np.ones(len(points))])
-        nothing = np.zeros(3)
-        # projectPoints ignores a camera matrix's skew: it gets the identity, and the matrix is applied here.
-        projected, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), nothing, nothing, np.eye(3), self.distortion)
+            projected = cv2.fisheye.distortPoints(normalised[:, None], np.eye(3), self.distortion)
+        else:
+            rays, nothing = np.column_stack([normalised, np.ones(len(points))]), np.zeros(3)
+            projected, _ = cv2.projectPoints(rays[:, None], nothing, nothing, np.eye(3), self.distortion)
         bent = np.asarray(projected, dtype=np.float64).reshape(-1, 2)
         return bent @ matrix[:2, :2].T + matrix[:2, 2]
 
@@ -74,17 +72,6 @@ class Lens:
             rays = _undistort(bent, np.eye(3), self.distortion, criteria=_CONVERGED)
         straight = np.asarray(rays, np.float64).reshape(-1, 2)
         return straight @ self.camera_matrix[:2, :2].T + self.camera_matrix[:2, 2]
-
-
-def _equidistant(normalised: Floats, distortion: Floats) -> Floats:
-    """Kannala and Brandt's (2006) equidistant model with four coefficients, on normalised points."""
-    radius = np.hypot(normalised[:, 0], normalised[:, 1])
-    theta = np.arctan(radius)
-    squared = theta * theta
-    k1, k2, k3, k4 = distortion
-    bent = theta * (1 + squared * (k1 + squared * (k2 + squared * (k3 + squared * k4))))
-    scale: Floats = np.divide(bent, radius, out=np.ones_like(radius), where=radius > _ON_AXIS)
-    return normalised * scale[:, None]
 
 
 def check_lens(camera_matrix: ArrayLike | None, distortion: ArrayLike | None, fisheye: bool) -> Lens | None:
