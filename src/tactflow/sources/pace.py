@@ -88,4 +88,4 @@ def paced(arrivals: Iterator[Arrival], name: str, realtime: bool, stop: threadin
             latest = t
             if pace is not None and not pace.wait_for(t):
                 return
-        yield arrival._replace(t=t)
+        yield arrival if ahead == 0 else arrival._replace(t=t)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -117,12 +117,7 @@ class Watched(FrameReader):
             target=self._work, args=(source,), name=f"tactflow-read-{name}", daemon=True
         )
         self._reader.start()
-
-    @property
-    def threads(self) -> Sequence[int]:  # type: ignore[override]
-        """The thread that reads."""
-        reader = self._reader.native_id
-        return () if reader is None else (reader,)
+        self.threads = [id_ for id_ in (self._reader.native_id,) if id_ is not None]
 
     @property
     def state(self) -> str:  # type: ignore[override]
@@ -198,7 +193,7 @@ class Watched(FrameReader):
 
     def _recover(self, fault: _Fault, now: float) -> None:
         self._fault = None
-        tries = f" and {fault.attempts} attempt{'s'[: fault.attempts > 1]}" if fault.attempts else ""
+        tries = f", at attempt {fault.attempts}" if fault.attempts else ""
         log.warning("%s: is back after %.1f s%s (%s)", self.name, now - fault.since, tries, fault.what)
 
     def _picture_problem(self, image: BgrImage, now: float) -> tuple[str, float, bool] | None:
