@@ -23,7 +23,8 @@ class Flaky:
 
     good: noisy frames. black: black frames, not all the same. frozen: one frame again and again. gone:
     reading and opening fail. ends: reading says that it is the end; opening works. hangs: reading does not
-    return until `free` is set; opening works. other_size: gone, and what then can be opened has another size.
+    return until `free` is set; opening works. other_size: gone, and what then can be opened gives
+    pictures of another size, whatever size it states.
 
     Time passes on `clock` while the newest connection is read, and nowhere else.
     """
@@ -69,7 +70,8 @@ class Connection:
 
     def __init__(self, device: Flaky) -> None:
         self.device = device
-        self.size: tuple[int, int] | None = (32, 24) if device.does == "other_size" else (64, 48)
+        self.size: tuple[int, int] | None = (64, 48)
+        self._is_small = device.does == "other_size"
         self.description = "flaky, 64 x 48"
 
     def read(self) -> tuple[NDArray[np.uint8], float] | None:
@@ -82,7 +84,7 @@ class Connection:
                 if device.newest is self:
                     device.clock.advance(PERIOD)
             return None
-        if does in ("gone", "other_size"):
+        if does == "gone" or (does == "other_size" and not self._is_small):
             raise SourceError("flaky: delivers no more frames")
         if does == "ends":
             return None
@@ -90,6 +92,7 @@ class Connection:
             device.last = device.noisy()
         device.stamp += PERIOD
         image = device.noisy(level=0) // 10 if does == "black" else device.last.copy()
+        image = image[:24, :32] if self._is_small else image
         return image, device.stamp
 
     def close(self) -> None:

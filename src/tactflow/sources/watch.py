@@ -249,10 +249,6 @@ class Watched(FrameReader):
 
     def _reopen(self) -> FrameReader:
         source = self._opener()
-        if self.size and source.size and source.size != self.size:
-            source.close()
-            sizes = ("{} x {}".format(*size) for size in (source.size, self.size))
-            raise SourceError("it came back with {} pixels instead of {}".format(*sizes))
         with self._changed:
             if self._fault is not None:
                 self._connection += 1
@@ -264,10 +260,17 @@ class Watched(FrameReader):
         now = self._clock.now()
         with self._changed:
             gap, self._arrived_at = now - self._arrived_at, now
+            size, first = (image.shape[1], image.shape[0]), self.size
+            if first is None or self._seq < 0:
+                # A driver may state another size.
+                self.size = size
+            elif size != first:
+                raise SourceError(
+                    f"it came back with {size[0]} x {size[1]} pixels instead of {first[0]} x {first[1]}"
+                )
             self._seq += 1
             if self._seq and not (self._fault and self._fault.attempts):
                 self._interval = max(gap, INTERVAL_DECAY * self._interval)
-            self.size = self.size or (image.shape[1], image.shape[0])
             problem = self._picture_problem(image, now)
             if problem is not None:
                 what, since, reportable = problem
