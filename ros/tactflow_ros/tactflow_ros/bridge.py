@@ -21,7 +21,6 @@ from rclpy.clock import Clock as Steady
 from rclpy.clock import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.logging import get_logger
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
@@ -356,8 +355,12 @@ def main() -> int:
             if node.trigger_configure() != done or node.trigger_activate() != done:
                 return 1
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
+    except Exception:
+        # After Ctrl-C, rclpy refuses whatever is being done, also while the node still starts.
+        if rclpy.ok():
+            raise
     finally:
         node.disconnect()
         rclpy.try_shutdown()
