@@ -131,13 +131,13 @@ def _drafts(document: Document, directory: Path) -> list[Draft]:
 
 def _resolve(draft: Draft, directory: Path, document: Document) -> None:
     """Find the class of a stage or sink."""
-    is_named = document.has(*draft.keys, "use")
-    place = (*draft.keys, "use") if is_named else draft.keys
-    use = document.get(*place) if is_named else draft.id
+    settings = document.mapping(*draft.keys)
+    place = (*draft.keys, "use") if "use" in settings else draft.keys
+    use = settings.get("use", draft.id)
     if not isinstance(use, str):
         return
     # From the command line, and in a packaged pipeline, a loose file lies in the current folder.
-    own = is_packaged(directory) or (is_named and not document.mark(*place).line)
+    own = is_packaged(directory) or ("use" in settings and not document.mark(*place).line)
     try:
         draft.component = resolve(use, draft.section, *([Path()] if own else []), directory)
     except ConfigError as error:
@@ -241,7 +241,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
         Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
         for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
     ]
-    marked = [key for key in ("segment", "queue") if document.has(*draft.keys, key)]
+    marked = {"segment", "queue"} & document.mapping(*draft.keys).keys()
     return Node(
         id=draft.id,
         component=draft.component,
