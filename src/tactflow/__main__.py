@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 
-from tactflow.system.signals import ENDING, INTERRUPTED, end_at_once, interrupt, on_ending
+from tactflow.system.signals import ENDING, INTERRUPTED, interrupt, on_ending
 
 ENDLESS = ("run", "record", "listen")
 """Commands that run until they are told to end: one signal ends them with exit code 0."""
@@ -22,7 +22,8 @@ def entry() -> None:
     # Before anything else is imported, which takes a while.
     command = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
     is_endless = command in ENDLESS
-    end_at_once(0 if is_endless else INTERRUPTED)
+    # Nothing is raised, which an import might swallow, or show.
+    on_ending(lambda _number, _frame: os._exit(0 if is_endless else INTERRUPTED))
     from tactflow.cli.main import main
     from tactflow.system.files import LossyStream, discard_output
 

@@ -54,7 +54,8 @@ def interrupted(folder: Path, words: list[str], *numbers: int) -> tuple[int, str
     return process.returncode, errors
 
 
-BLOCKS = f"open('ready-1', 'w').close(); import time; time.sleep({PATIENCE})"
+# No file object: what a signal raises while Python frees one is dropped.
+BLOCKS = f"import os, time; os.close(os.open('ready-1', os.O_CREAT)); time.sleep({PATIENCE})"
 
 
 @pytest.mark.parametrize("number", ENDS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -24,14 +23,6 @@ class Interrupted(KeyboardInterrupt):
     Not KeyboardInterrupt itself: where that is raised within `exec` of a text, as numba uses it, `python -m`
     ends by SIGINT whatever the exit code is, even if the exception was caught.
     """
-
-
-def end_at_once(code: int) -> None:
-    """Have the signals end the process with this exit code while it starts and nothing is under way.
-
-    Nothing is raised, which an import might swallow, or show.
-    """
-    on_ending(lambda _number, _frame: os._exit(code))
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:
