@@ -40,6 +40,9 @@ def test_a_block_is_halved_as_if_it_were_cut_out_first() -> None:
     assert np.array_equal(halved(picture, block), expected)
     strided = np.dstack([picture, picture])[:, :, ::2]
     assert np.array_equal(halved(strided, block), plain_halved(strided[block]))
+    into = np.zeros_like(expected)
+    assert halved(picture, block, into=into) is into
+    assert np.array_equal(into, expected)
 
 
 @pytest.mark.parametrize("rotate", [0, 90, 180, 270])

@@ -14,6 +14,7 @@ def halved(
     picture: Bytes,
     block: tuple[slice, slice] | None = None,
     *,
+    into: Bytes | None = None,
     upside_down: bool = False,
 ) -> Bytes:
     """Means over 2 x 2 pixels of a picture or of a block of it, rounded half up.
@@ -22,6 +23,7 @@ def halved(
     ----------
     picture : (H, W, 3) uint8.
     block : rows and columns, slices with start and stop inside the picture; None takes all of it.
+    into : (h // 2, w // 2, 3) uint8, C-contiguous, to be written and returned.
     upside_down : whether the first row of the block becomes the last one.
 
     Returns
@@ -40,7 +42,7 @@ def halved(
         picture = np.ascontiguousarray(picture[rows, columns])
         rows, columns = slice(0, picture.shape[0]), slice(0, picture.shape[1])
     height, width = (rows.stop - rows.start) // 2, (columns.stop - columns.start) // 2
-    half = np.empty((height, width, 3), np.uint8)
+    half = np.empty((height, width, 3), np.uint8) if into is None else into
     lines = half.reshape(height, 3 * width)
     _halve(picture.reshape(len(picture), -1), rows.start, 3 * columns.start, upside_down, lines)
     return half
