@@ -28,7 +28,7 @@ def _touched() -> tuple[Image, Image]:
     return scene.frame(0), scene.frame(25)
 
 
-@pytest.mark.parametrize("method", ["noise", "colour"])
+@pytest.mark.parametrize("method", ["noise", "network", "colour"])
 def test_a_touched_gel_is_told_from_the_reference(method: str) -> None:
     untouched, touched = _touched()
     stage = _stage(method=method)

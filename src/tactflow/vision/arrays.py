@@ -26,6 +26,14 @@ SATURATED: Final = 250
 """Grey levels from which on a camera is taken for saturated: it cannot become brighter. Chosen by hand."""
 
 
+def check_color_image(image: NDArray[Any]) -> None:
+    """Raise ValueError if an array is not a non-empty (H, W, 3) uint8 image."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise ValueError(
+            f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
+        )
+
+
 def check_mask(mask: NDArray[Any], shape: tuple[int, ...] | None = None) -> None:
     """Raise ValueError if an array is not an (H, W) uint8 mask, or not of a shape."""
     wanted = "(H, W)" if shape is None else shape

@@ -11,8 +11,11 @@
 5. `resolution` draws it into the mask of the frame.
 
 `fusion` joins that mask with what the markers show.
+
+`learned` does without all of this: it shows the change (`change`) to a neural network (`network`).
 """
 
 from tactflow.vision.contact.detector import ContactDetector, ContactResult, chi_square_threshold
+from tactflow.vision.contact.learned import LearnedDetector
 
-__all__ = ["ContactDetector", "ContactResult", "chi_square_threshold"]
+__all__ = ["ContactDetector", "ContactResult", "LearnedDetector", "chi_square_threshold"]

@@ -33,7 +33,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import Floats32, check_color_image
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
 from tactflow.vision.contact.contact_outline import contact_level
@@ -239,10 +239,7 @@ class ContactDetector:
         return self._against_noise(image, hidden)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-            raise ValueError(
-                f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
-            )
+        check_color_image(image)
         if self._last is not None and image.shape != self._last.shape:
             raise ValueError(f"required the reference's shape {self._last.shape}, got {image.shape}")
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Flags, Floats32, Indices
+from tactflow.vision.arrays import Flags, Floats32, Indices, check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 
@@ -99,10 +99,7 @@ def remove_markers(
 
 def _check(image: Bytes, mask: Bytes, method: str, radius: float) -> None:
     """Raise what `remove_markers` raises."""
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise ValueError(
-            f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
-        )
+    check_color_image(image)
     if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
         raise ValueError(
             f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"

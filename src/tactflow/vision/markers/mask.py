@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers
@@ -136,10 +137,7 @@ def marker_mask(image: Bytes, dot: Dot) -> Bytes:
     >>> int(mask[30, 40]), int(mask[30, 60])
     (255, 0)
     """
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise ValueError(
-            f"required a non-empty (H, W, 3) uint8 image, got shape {image.shape}, dtype {image.dtype}"
-        )
+    check_color_image(image)
     whole = _even(image)
     mask = _mask(whole, dot, dot.radius)
     for radius in dot.others:
