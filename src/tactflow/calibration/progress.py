@@ -39,9 +39,11 @@ def fault(press: Press, usual: float) -> str | None:
         return f"light, radius {press.radius:.0f} px where {usual:.0f} px is usual; press harder"
     if min(x, y, width - 1 - x, height - 1 - y) < press.radius:
         return f"cut off by the border of the picture at ({x:.0f}, {y:.0f}); press further inside"
-    major, minor = measure_region(press.mask).moments().principal
-    if major > ROUND**2 * minor:
-        return "not round; press the ball straight, and nothing else"
+    region = measure_region(press.mask)
+    if region.pixels:
+        major, minor = region.moments().principal
+        if major > ROUND**2 * minor:
+            return "not round; press the ball straight, and nothing else"
     return None
 
 
