@@ -4,11 +4,7 @@
     python benchmarks/train_contact.py
 
 The result replaces src/tactflow/vision/contact/contact.onnx. Scenes, weights and order follow from fixed
-seeds. `--weights FILE` keeps the weights; where the file is there already, training goes on from it. The
-shipped network was trained in two rounds:
-
-    python benchmarks/train_contact.py --weights contact.pt
-    python benchmarks/train_contact.py --weights contact.pt --first 100000 --rate 0.0015
+seeds. `--scenes` and `--steps` are for shorter trials.
 """
 
 from __future__ import annotations
@@ -39,6 +35,8 @@ from tactflow.vision.types import Markers
 WIDTHS: Final = (12, 24, 32, 40)
 """Channels at a half, a quarter, an eighth and a sixteenth of the grid: 72,000 weights, 290 kB."""
 BATCH: Final = 24
+RATE: Final = 3e-3
+"""Largest learning rate; it falls as a cosine."""
 OVERLAP: Final = 0.1
 """Weight of the overlap (Dice) beside the cross entropy, which alone would leave small contacts to last."""
 FIRST_JUDGED: Final = 1_000_000
@@ -172,17 +170,16 @@ def judged(network: nn.Module, planes: Half, truths: Bytes) -> str:
     return f"cross entropy {np.mean(entropies):.4f}, {overlap}"
 
 
-def train(
-    network: Network, planes: Half, truths: Bytes, unseen: tuple[Half, Bytes], steps: int, fastest: float
-) -> dict[str, Any]:
-    """The weights, averaged over the last steps. fastest : largest learning rate; it falls as a cosine."""
+def train(planes: Half, truths: Bytes, unseen: tuple[Half, Bytes], steps: int) -> dict[str, Any]:
+    """The weights, averaged over the last steps."""
+    torch.manual_seed(0)
     random = np.random.default_rng(0)
-    network = network.to(memory_format=torch.channels_last)
+    network = Network().to(memory_format=torch.channels_last)
     mean = {name: value.clone() for name, value in network.state_dict().items()}
-    optimiser = torch.optim.AdamW(network.parameters(), fastest, weight_decay=1e-3)
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=1e-3)
     order: list[int] = []
     for step in range(steps):
-        rate = fastest * min(1, (step + 1) / 100) * 0.5 * (1 + np.cos(np.pi * step / steps)) + 1e-5
+        rate = RATE * min(1, (step + 1) / 100) * 0.5 * (1 + np.cos(np.pi * step / steps)) + 1e-5
         for group in optimiser.param_groups:
             group["lr"] = rate
         if len(order) < BATCH:
@@ -227,25 +224,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, default=20_000)
     parser.add_argument("--steps", type=int, default=12_000)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
-    parser.add_argument("--rate", type=float, default=3e-3, help="largest learning rate")
-    parser.add_argument("--weights", type=Path, help="file that keeps the weights")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(room.__file__).with_name(WEIGHTS))
     options = parser.parse_args()
     started = time.monotonic()
-    planes, truths = draw(options.first, options.scenes)
+    planes, truths = draw(0, options.scenes)
     unseen = draw(FIRST_JUDGED, 400)
     print(f"{options.scenes} scenes after {(time.monotonic() - started) / 60:.0f} min", flush=True)
     torch.set_num_threads(options.threads)
-    torch.manual_seed(0)
-    network = Network()
-    if options.weights is not None and options.weights.exists():
-        network.load_state_dict(torch.load(options.weights))
-    weights = train(network, planes, truths, unseen, options.steps, options.rate)
-    if options.weights is not None:
-        torch.save(weights, options.weights)
+    weights = train(planes, truths, unseen, options.steps)
     export(weights, options.out)
+    network = Network()
     network.load_state_dict(weights)
     print(f"{judged(network, *unseen)}; {options.out} after {(time.monotonic() - started) / 60:.0f} min")
 
