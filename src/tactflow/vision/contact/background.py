@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import MAD_TO_SIGMA, Floats32
 from tactflow.vision.contact.background_kernels import (
     change_strength,
     scaled_change,
@@ -35,8 +35,6 @@ QUANTISATION: Final = 12**-0.5
 """Standard deviation of rounding to whole grey levels, grey levels: that of a uniform variable of width 1."""
 BRIGHTNESS_BINS: Final = 6
 """Ranges of brightness for which noise is guessed separately: shot noise grows with the light. By hand."""
-MAD_TO_SIGMA: Final = 1.4826
-"""Standard deviation of a normal variable in units of its median absolute deviation."""
 NOISE_CORRELATION: Final = 2.0
 """How much less than white noise the guessed noise shrinks by smoothing: demosaicing and video compression
 leave little noise between neighbours, and more over distances. Chosen by hand."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Flags, Floats32, Mask
+from tactflow.vision.arrays import MAD_TO_SIGMA, Flags, Floats32, Mask
 from tactflow.vision.types import Markers, MarkerStatus
 
 CELLS: Final = 128
@@ -21,10 +21,8 @@ PLANES: Final = 12
 """Of `Change.planes`."""
 LEAST_NOISE: Final = 0.3
 """Standard deviation of a cell, grey levels: rounding to whole grey levels alone leaves as much."""
-MAD_TO_SIGMA: Final = 1.4826
-"""Standard deviation of a normal variable in units of its median absolute deviation."""
 CLEAR: Final = 6.0
-"""Noise, standard deviations, up to which the largest change does not count as full scale."""
+"""Change, standard deviations of the noise, below which a frame shows no contact; and full scale at least."""
 FULL_SCALE: Final = 0.99
 """Quantile of the changes that is full scale: a contact covers more than a hundredth of most pictures."""
 MOST_DOTS: Final = 0.95
@@ -74,6 +72,9 @@ class Untouched:
         self.gel: Flags = np.ones(self.size, np.bool_)
         if valid is not None:
             self.gel = to_cells(valid, self.size) > HALF
+        sparse = self.gel[::SPARSE, ::SPARSE]
+        self._sparse: Flags = sparse if sparse.any() else np.ones_like(sparse)
+        self._padded = tuple(-(-side // MULTIPLE) * MULTIPLE for side in self.size)
         self._count = 0
         self._mean: Floats32 = np.zeros((3, *self.size), np.float32)
         self.add(image)
@@ -97,10 +98,7 @@ class Untouched:
         The exposure of each channel is taken out as the median ratio, which a contact that covers less than
         half of the picture does not move. The noise is what differs between neighbouring cells in this frame.
         """
-        now, before = to_planes(image, self.size), self._mean
-        sparse = self.gel[::SPARSE, ::SPARSE]
-        if not sparse.any():
-            sparse = np.ones_like(sparse)
+        now, before, sparse = to_planes(image, self.size), self._mean, self._sparse
         ratio = (now[:, ::SPARSE, ::SPARSE] + 1) / (before[:, ::SPARSE, ::SPARSE] + 1)
         exposure = np.median(ratio[:, sparse], axis=1)
         change = (now - before * exposure[:, None, None]) * self.gel
@@ -109,10 +107,8 @@ class Untouched:
         noise = max(noise, LEAST_NOISE)
         largest = np.abs(smooth[:, ::2, ::2]).ravel()
         scale = max(_quantile(largest, FULL_SCALE), CLEAR * noise)
-        high, wide = self.size
-        padded = -(-high // MULTIPLE) * MULTIPLE, -(-wide // MULTIPLE) * MULTIPLE
-        planes = np.zeros((PLANES, *padded), np.float32)
-        inside = planes[:, :high, :wide]
+        planes = np.zeros((PLANES, *self._padded), np.float32)
+        inside = planes[:, : self.size[0], : self.size[1]]
         inside[0:3] = _logarithmic(change * np.float32(1 / noise)) / 3
         np.clip(change * np.float32(1 / scale), -2, 2, out=inside[3:6])
         if hidden is not None:

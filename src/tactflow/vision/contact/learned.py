@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats32, Mask, check_color_image, check_mask
 from tactflow.vision.contact.change import CLEAR, Change, Untouched
-from tactflow.vision.contact.detector import ContactResult
+from tactflow.vision.contact.detector import FORGET, ContactResult
 from tactflow.vision.contact.network import ContactNetwork
 from tactflow.vision.types import Markers
 
-FORGET: Final = 0.96
-"""Decay of the largest recent change per frame: half in 17 frames, about a second of a soft gel's creep."""
 OUTSIDE: Final = -10.0
 """Log odds of contact where no gel is."""
 
