@@ -174,8 +174,7 @@ class Parquet(Sink):
                 # Its name begins with a dot until it is complete: readers of folders leave such files out.
                 part = self._folder / name / f"part-{self._next:05d}.parquet"
                 # A folder that somebody removed is an error, not made anew.
-                part.parent.stat()
-                with completed(part) as unfinished, unfinished.open("wb") as file:
+                with completed(part, make_parent=False) as unfinished, unfinished.open("wb") as file:
                     pq.write_table(_table(rows[name], schema), file, compression="zstd")
                     file.flush()
                     # On the disk before it gets its name, so that a power cut leaves no empty part.

@@ -81,14 +81,18 @@ def next_name(path: Path) -> Path:
 
 
 @contextmanager
-def completed(path: Path) -> Iterator[Path]:
+def completed(path: Path, *, make_parent: bool = True) -> Iterator[Path]:
     """A path to write a file or a folder to, renamed to `path` if all went well and removed if not.
 
     It replaces what is there, but no file replaces a folder; if nothing was written, nothing is replaced. Its
-    name begins with a dot and ends as that of `path` does. Folders above are made. What a killed process of
-    this machine has left for the same path is removed first. Raises OSError.
+    name begins with a dot and ends as that of `path` does. What a killed process of this machine has left for
+    the same path is removed first.
+
+    make_parent : whether folders above are made; if not, they have to be there.
+    Raises OSError.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if make_parent:
+        path.parent.mkdir(parents=True, exist_ok=True)
     front, end = f".{path.stem}.{platform.node()[:16]}-", f".partial{path.suffix}"
     for left in path.parent.glob(f"{glob.escape(front)}*{glob.escape(end)}"):
         process = left.name[len(front) : -len(end)]
