@@ -5,6 +5,7 @@
 # make fuzz         damaged input to every parser, SECONDS for each
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
+# make packages     the wheel and the sdist in dist/, checked as a package index does
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
 # make system-deps  what the tests need from the system: a browser, ffmpeg, ROS 1 (Debian; needs root)
 
@@ -20,7 +21,7 @@ SYSTEM_DEPS := chromium ffmpeg
 # For the script for ROS 1; Debian 12 has them, later ones do not, and its test says so.
 ROS1_DEPS := python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs python3-zmq
 
-.PHONY: run test soak load fuzz audit lock lint types ros-env system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types packages ros-env system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -64,6 +65,12 @@ $(VENV)/.installed-test: pyproject.toml setup.py requirements-test.txt | $(VENV)
 	$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@ $(VENV)/.installed
 
+packages: $(TOOLS)/.installed
+	rm -rf build dist
+	$(TOOLS)/bin/python -m build --quiet
+	$(TOOLS)/bin/twine check --strict dist/*
+	$(TOOLS)/bin/check-wheel-contents dist/*.whl
+
 ros-env: $(ROS)/.installed
 
 # Beside it there is no tactflow, as on a robot.
@@ -75,7 +82,8 @@ $(ROS)/.installed: ros/requirements.txt
 
 $(TOOLS)/.installed:
 	python3 -m venv $(TOOLS)
-	$(TOOLS)/bin/python -m pip --quiet --disable-pip-version-check install pip-audit uv
+	$(TOOLS)/bin/python -m pip --quiet --disable-pip-version-check install \
+		pip-audit uv build twine check-wheel-contents
 	@touch $@
 
 # For every Python from 3.11 on and every system. The second file is a part of the first.
