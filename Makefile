@@ -7,12 +7,15 @@
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
 # make packages     the wheel and the sdist in dist/, checked as a package index does
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
+# make lerobot-env  LeRobot in an environment of its own (650 MB), for the tests of its camera
+# make lerobot-datasets  the same with PyTorch (up to 6 GB), for the tests of its datasets
 # make system-deps  what the tests need from the system: a browser, ffmpeg, ROS 1 (Debian; needs root)
 
 VENV := .venv
 PY := $(VENV)/bin/python
 TOOLS := $(VENV)-tools
 ROS := $(VENV)-ros
+LEROBOT := $(VENV)-lerobot
 PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
 # Debian packages that tests use; without them those tests say that they were skipped.
@@ -21,7 +24,7 @@ SYSTEM_DEPS := chromium ffmpeg
 # For the script for ROS 1; Debian 12 has them, later ones do not, and its test says so.
 ROS1_DEPS := python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs python3-zmq
 
-.PHONY: run test soak load fuzz audit lock lint types packages ros-env system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types packages ros-env lerobot-env lerobot-datasets system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -80,6 +83,22 @@ $(ROS)/.installed: ros/requirements.txt
 		--require-hashes --requirement ros/requirements.txt
 	@touch $@
 
+lerobot-env: $(LEROBOT)/.installed
+
+# Without what LeRobot's cameras do not import, see left_out.txt; the other packages are those that are listed.
+$(LEROBOT)/.installed: lerobot_plugin/requirements.txt lerobot_plugin/pyproject.toml pyproject.toml
+	python3 -m venv $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		--no-deps --require-hashes --requirement lerobot_plugin/requirements.txt
+	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		--no-deps --no-build-isolation --editable . --editable lerobot_plugin
+	@touch $@
+
+# On a machine without CUDA, `pip config set global.extra-index-url` with PyTorch's index for CPUs saves 4 GB.
+lerobot-datasets: $(LEROBOT)/.installed
+	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		torch torchvision "accelerate<2" datasets pandas pyarrow av jsonlines einops
+
 $(TOOLS)/.installed:
 	python3 -m venv $(TOOLS)
 	$(TOOLS)/bin/python -m pip --quiet --disable-pip-version-check install \
@@ -95,6 +114,9 @@ lock: $(TOOLS)/.installed
 		--output-file requirements.txt pyproject.toml -
 	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
 		--custom-compile-command "make lock" $(LOCK) --output-file ros/requirements.txt ros/requirements.in
+	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
+		--custom-compile-command "make lock" $(LOCK) --override lerobot_plugin/left_out.txt \
+		--output-file lerobot_plugin/requirements.txt lerobot_plugin/requirements.in
 
 ADVISORIES := https://pypi.org/pypi/numpy/2.0.0/json
 audit: $(TOOLS)/.installed
@@ -114,4 +136,4 @@ system-deps:
 		echo "system-deps: ROS 1 is not to be had here; its test is skipped" >&2
 
 clean:
-	rm -rf $(VENV) $(TOOLS) $(ROS) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(TOOLS) $(ROS) $(LEROBOT) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,48 +1,179 @@
-"""Pictures for LeRobot's camera."""
+"""`lerobot_camera_tactflow`, in LeRobot's own hands."""
 
 from __future__ import annotations
 
-import base64
 import json
+from pathlib import Path
 
-import cv2
+from tests.adapters.lerobot_env import needs_datasets, needs_lerobot, run_with_lerobot
+
+START = """
+import json, sys
 import numpy as np
-import pytest
-import zmq
-from pydantic import ValidationError
+import draccus
+from lerobot.cameras import CameraConfig, make_cameras_from_configs
+from lerobot.utils.import_utils import register_third_party_plugins
+import tactflow
 
-from tactflow.adapters.lerobot_camera import LerobotCamera
-from tactflow.engine.frame import Frame, Tick
-from tests.clock import until
+register_third_party_plugins()
 
-IMAGE = np.full((48, 64, 3), (200, 100, 20), np.uint8)
+def make(**outputs):
+    typed = {name: {"type": "tactflow", **fields} for name, fields in outputs.items()}
+    configs = {name: draccus.decode(CameraConfig, fields) for name, fields in typed.items()}
+    return make_cameras_from_configs(configs)
+
+def failure(call, *arguments):
+    try:
+        call(*arguments)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+
+def results(source, **settings):
+    return list(tactflow.stream(source=source, settings={"sinks": {}, **settings}, images=True))
+"""
+
+OUTPUTS = """
+source = {"source": "sim:press?frames=60&noise=0", "realtime": False}
+cameras = make(gel=source, swapped=source | {"color_mode": "bgr"}, markers=source | {"output": "markers"},
+    change=source | {"output": "difference"})
+for camera in cameras.values():
+    camera.connect()
+shapes = {name: [camera.height, camera.width] for name, camera in cameras.items()}
+equal, changes = [], []
+for result in results(source["source"]):
+    frame = {name: camera.async_read(60_000) for name, camera in cameras.items()}
+    markers = result.markers
+    equal += [
+        np.array_equal(frame["gel"][:, :, ::-1], result.image),
+        np.array_equal(frame["swapped"], result.image),
+        np.array_equal(frame["markers"][:, :2], markers.origin.astype(np.float32)),
+        np.array_equal(frame["markers"][:, 2:4], markers.displacement.astype(np.float32)),
+        np.array_equal(frame["markers"][:, 4], markers.status),
+        len({camera.capture_time for camera in cameras.values()} | {result.t}) == 1,
+    ]
+    changes.append([result.contact is not None, float(abs(frame["change"] - 128.0).mean())])
+latest = cameras["gel"].read_latest(10**9)
+ended = failure(cameras["gel"].async_read, 60_000)
+for camera in cameras.values():
+    camera.disconnect()
+print(json.dumps([shapes, equal, changes, ended, np.array_equal(latest, frame["gel"])]))
+"""
+
+ERRORS = """
+source = {"source": "sim:press?frames=3", "realtime": False}
+cameras = make(gel=source, markers=source | {"output": "markers"}, missing={"source": "no-such.avi"},
+    wide=source | {"width": 320}, depth=source | {"output": "depth"})
+gel, markers = cameras["gel"], cameras["markers"]
+said = [failure(gel.async_read), failure(gel.disconnect)]
+gel.connect()
+markers.connect()
+said += [failure(gel.connect)]
+gel.read()
+# The next frame waits until the other camera has read this one.
+said += [failure(gel.async_read, 20)]
+markers.read()
+gel.read()
+gel.disconnect()
+markers.disconnect()
+said += [failure(gel.read), failure(cameras["missing"].connect), failure(cameras["wide"].connect),
+    failure(cameras["depth"].connect), failure(lambda: make(odd=source | {"output": "smell"})),
+    failure(lambda: make(odd=source | {"depth_mm": 0}))]
+print(json.dumps(said))
+"""
+
+RECORDED = """
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+root, file = sys.argv[1:]
+sources = {"left": "sim:press?frames=25", "right": "sim:slide?frames=25", "file": file}
+cameras = make(**{f"{name}{ending}": {"source": source, "realtime": False, "output": output}
+    for name, source in sources.items() for ending, output in (("", "image"), ("_markers", "markers"))})
+for camera in cameras.values():
+    camera.connect()
+features = {}
+for name in sources:
+    height, width = cameras[name].height, cameras[name].width
+    names = ["height", "width", "channels"]
+    features[f"observation.images.{name}"] = {"dtype": "image", "shape": (height, width, 3), "names": names}
+    shape = (cameras[f"{name}_markers"].height, 5)
+    features[f"observation.tactile.{name}"] = {"dtype": "float32", "shape": shape, "names": None}
+dataset = LeRobotDataset.create("tactflow/press", 60, features, root=root, use_videos=False)
+for _ in range(25):
+    frame = {"task": "press"}
+    for name in sources:
+        frame[f"observation.images.{name}"] = cameras[name].async_read(60_000)
+        frame[f"observation.tactile.{name}"] = cameras[f"{name}_markers"].async_read(60_000)
+    dataset.add_frame(frame)
+dataset.save_episode()
+dataset.finalize()
+for camera in cameras.values():
+    camera.disconnect()
+loaded = LeRobotDataset("tactflow/press", root=root)
+differences = {}
+for name, source in sources.items():
+    pairs = list(zip(loaded, results(source), strict=True))
+    images = [item[f"observation.images.{name}"].numpy() * 255 for item, _ in pairs]
+    images = [image.round().transpose(1, 2, 0)[:, :, ::-1] for image in images]
+    loaded_moved = [item[f"observation.tactile.{name}"][:, 2:4] for item, _ in pairs]
+    moved = [result.markers.displacement.astype(np.float32) for _, result in pairs]
+    differences[name] = [
+        len(pairs),
+        all(np.array_equal(image, result.image) for image, (_, result) in zip(images, pairs)),
+        all(map(np.array_equal, loaded_moved, moved)),
+        float(np.max(np.abs(moved))),
+    ]
+print(json.dumps(differences))
+"""
 
 
-def test_a_reader_gets_the_picture_with_its_time_and_colours_as_lerobot_takes_them() -> None:
-    sink = LerobotCamera(LerobotCamera.Params(endpoint="tcp://127.0.0.1:*"), "left")
-    sink.open()
-    tick = Tick(Frame("left", 3, 0.1, IMAGE))
-    sink.write(tick, IMAGE)
-    assert sink.counters() == {"pictures": 0}
-    with zmq.Context() as context, context.socket(zmq.SUB) as reader:
-        reader.subscribe(b"")
-        reader.setsockopt(zmq.CONFLATE, 1)
-        reader.connect(sink.endpoint)
-
-        def arrived() -> int:
-            sink.write(tick, IMAGE)
-            return reader.poll(10)
-
-        until(arrived)
-        message = json.loads(reader.recv_string())
-        sink.close()
-    assert message["timestamps"] == {"left": 0.1}
-    jpeg = np.frombuffer(base64.b64decode(message["images"]["left"]), np.uint8)
-    red_first = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
-    assert np.allclose(red_first.mean((0, 1)), (20, 100, 200), atol=3)
+@needs_lerobot
+def test_outputs_are_what_tactflow_found_in_the_same_frame() -> None:
+    shapes, equal, changes, ended, latest_is_last = json.loads(run_with_lerobot(START + OUTPUTS))
+    picture, (markers, columns) = [400, 300], shapes.pop("markers")
+    assert shapes == dict.fromkeys(("gel", "swapped", "change"), picture)
+    assert (markers, columns) == (80, 5)
+    assert len(equal) == 6 * 60
+    assert all(equal)
+    assert latest_is_last
+    touched = [change for touching, change in changes if touching]
+    assert min(touched) > max(change for touching, change in changes[:10] if not touching)
+    assert ended.startswith("RuntimeError: TactflowCamera(sim:press")
+    assert ended.endswith("read thread is not running: the source has ended")
 
 
-def test_an_address_that_others_reach_is_refused_because_lerobot_knows_no_keys() -> None:
-    with pytest.raises(ValidationError, match="knows no keys"):
-        LerobotCamera.Params(endpoint="tcp://*:5555")
-    assert LerobotCamera.Params(endpoint="tcp://*:5555", open_to_all=True).open_to_all
+@needs_lerobot
+def test_errors_are_those_that_lerobot_expects() -> None:
+    said = json.loads(run_with_lerobot(START + ERRORS))
+    camera = "TactflowCamera(sim:press?frames=3, "
+    failed = "ConnectionError: Failed to connect to "
+    expected = [
+        "DeviceNotConnectedError: TactflowCamera is not connected",
+        f"DeviceNotConnectedError: {camera}image) not connected",
+        "DeviceAlreadyConnectedError: TactflowCamera is already connected",
+        f"TimeoutError: {camera}image) async_read timeout after 20ms",
+        "DeviceNotConnectedError: TactflowCamera is not connected",
+        f"{failed}TactflowCamera(no-such.avi, image): capture (source no-such.avi): no-such.avi: no such",
+        f"{failed}{camera}image): width=320 is configured, but the pipeline gives 300",
+        f"{failed}{camera}depth): the pipeline gives no scale",
+        "DecodingError:",
+        "ParsingError:",
+    ]
+    for given, beginning in zip(said, expected, strict=True):
+        assert str(given).startswith(beginning), (given, beginning)
+
+
+@needs_datasets
+def test_a_dataset_recorded_by_lerobot_holds_what_tactflow_found(tmp_path: Path) -> None:
+    import numpy as np
+
+    from tactflow import open_scene
+
+    scene = open_scene("twist?frames=25")
+    np.save(tmp_path / "file.npy", np.stack([scene.frame(index) for index in range(25)]))
+    found = json.loads(
+        run_with_lerobot(START + RECORDED, str(tmp_path / "press"), str(tmp_path / "file.npy"))
+    )
+    for name in ("left", "right", "file"):
+        frames, images_equal, markers_equal, largest = found[name]
+        assert (frames, images_equal, markers_equal) == (25, True, True), name
+        assert largest > 0, name

@@ -1,0 +1,69 @@
+"""What can be set about the camera."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from lerobot.cameras.configs import CameraConfig, ColorMode
+
+
+class Output(StrEnum):
+    """What the camera returns; (H, W) is the size of the processed frame.
+
+    image : (H, W, 3) uint8, the processed frame.
+    difference : (H, W, 3) uint8, 128 + half of the change against the untouched gel, without its dots.
+    depth : (H, W, 3) uint8, how far the gel is pushed in, grey: `depth_mm` or more is 255.
+    markers : (N, 5) float32, of each marker: its place x, y in the reference frame, its displacement dx, dy,
+        all in px, and its status: 0 tracked, 1 inferred, 2 lost.
+    """
+
+    IMAGE = "image"
+    DIFFERENCE = "difference"
+    DEPTH = "depth"
+    MARKERS = "markers"
+
+
+@CameraConfig.register_subclass("tactflow")
+@dataclass
+class TactflowCameraConfig(CameraConfig):
+    """A tactile sensor; `width` and `height`, if set, must be those of the output.
+
+    source : of frames, as `tactflow run --source`: a camera, a recording, `sim:press`.
+    pipeline : a file, or the name of a shipped pipeline such as "mini"; None is tactflow's default.
+    output : what is returned, see `Output`.
+    settings : values of the pipeline file to replace, as `{"calibration": "left.yaml"}`.
+    color_mode : order of the colors of `image` and `difference`.
+    depth_mm : depth that becomes 255, mm: the smaller, the finer are the steps.
+    realtime : whether a recording plays at its own pace, as a camera does. Without, its next frame waits
+        until the last one has been read, and none is dropped.
+    timeout_s : longest wait for the first frame, s; the very first run compiles for a minute.
+
+    Cameras with the same source, pipeline, settings and pace share one run, so that a sensor gives several
+    outputs.
+    """
+
+    source: str
+    pipeline: str | None = None
+    output: Output = Output.IMAGE
+    settings: dict[str, Any] = field(default_factory=dict)
+    color_mode: ColorMode = ColorMode.RGB
+    depth_mm: float = 2.0
+    realtime: bool = True
+    timeout_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        self.output = Output(self.output)
+        self.color_mode = ColorMode(self.color_mode)
+        for name in ("depth_mm", "timeout_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"`{name}` must be positive, but {getattr(self, name)} is provided.")
+        if not self.source:
+            raise ValueError("`source` cannot be empty.")
+
+    @property
+    def run_key(self) -> str:
+        """Equal for cameras that share a run."""
+        return json.dumps([self.source, self.pipeline, self.settings, self.realtime], sort_keys=True)

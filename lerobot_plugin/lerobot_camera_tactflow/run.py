@@ -1,0 +1,135 @@
+"""A running pipeline, shared by all cameras that show one of its outputs."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import closing
+from typing import ClassVar
+
+from lerobot_camera_tactflow.configuration import TactflowCameraConfig
+from tactflow import Result, Sink, stream
+from tactflow.ports import Unmarked, Untouched
+
+REQUEST = "lerobot_camera_tactflow"
+"""Id of the sink that asks for the pictures of `difference`."""
+LEAVE_SECONDS = 2.0
+"""Longest wait for a run to end, s, as for LeRobot's own cameras: one whose camera hangs ends by itself."""
+
+
+class AskForPictures(Sink):
+    """Needs both pictures of `difference`, so that they are in every result."""
+
+    def write(self, unmarked: Unmarked | None, untouched: Untouched | None) -> None:
+        """Nothing is done with them here."""
+
+
+class SharedRun:
+    """The newest result of a pipeline, for several readers.
+
+    config : of the camera that comes first. `counter` is the number of results so far; `arrived` when the
+    last one came, on the monotonic clock, s; `failure` why no more will come, empty while the run goes on.
+    """
+
+    _running: ClassVar[dict[str, SharedRun]] = {}
+    _registry_lock: ClassVar[threading.Lock] = threading.Lock()
+
+    @classmethod
+    def join(cls, config: TactflowCameraConfig, reader: object) -> SharedRun:
+        """Become a reader of the run of this configuration, which starts with its first reader."""
+        with cls._registry_lock:
+            run = cls._running.get(config.run_key)
+            if run is None or run.failure:
+                run = cls._running[config.run_key] = cls(config)
+            with run.changed:
+                run._seen[reader] = 0 if run._every_frame else run.counter
+            return run
+
+    def __init__(self, config: TactflowCameraConfig) -> None:
+        self.changed = threading.Condition()
+        self.latest: Result | None = None
+        self.counter = 0
+        self.arrived = 0.0
+        self.failure = ""
+        self._key = config.run_key
+        self._every_frame = not config.realtime
+        self._seen: dict[object, int] = {}
+        self._stopped = False
+        sinks = {REQUEST: {"use": f"{__name__}:{AskForPictures.__name__}"}}
+        self._results = stream(
+            config.pipeline,
+            source=config.source,
+            settings={**config.settings, "sinks": sinks},
+            realtime=config.realtime,
+            images=True,
+            sinks=True,
+        )
+        self._thread = threading.Thread(target=self._work, name=f"tactflow {config.source}", daemon=True)
+        self._thread.start()
+
+    def leave(self, reader: object) -> None:
+        """Read no more; the run ends with its last reader."""
+        with self._registry_lock:
+            with self.changed:
+                self._seen.pop(reader, None)
+                self._stopped = not self._seen
+                self.changed.notify_all()
+            if self._stopped and self._running.get(self._key) is self:
+                del self._running[self._key]
+        if self._stopped:
+            self._thread.join(LEAVE_SECONDS)
+
+    def peek(self, timeout_s: float) -> Result | None:
+        """The newest result, once there is one, which stays unread; None if none came in time.
+
+        Raises
+        ------
+        RuntimeError : there will be none.
+        """
+        with self.changed:
+            self.changed.wait_for(lambda: self.latest is not None or self.failure, timeout_s)
+            if self.latest is None and self.failure:
+                raise RuntimeError(self.failure)
+            return self.latest
+
+    def read(self, reader: object, timeout_s: float) -> Result | None:
+        """The newest result, once it is one that this reader has not seen; None if none came in time.
+
+        Raises
+        ------
+        RuntimeError : no more will come.
+        """
+        with self.changed:
+            self.changed.wait_for(lambda: self.counter > self._seen[reader] or self.failure, timeout_s)
+            if self.counter > self._seen[reader]:
+                self._seen[reader] = self.counter
+                self.changed.notify_all()
+                return self.latest
+            if self.failure:
+                raise RuntimeError(self.failure)
+            return None
+
+    def _work(self) -> None:
+        failure = "the source has ended"
+        try:
+            with closing(self._results) as results:
+                for result in results:
+                    if not self._publish(result):
+                        break
+        except Exception as error:
+            failure = str(error) or type(error).__name__
+        with self.changed:
+            self.failure = failure
+            self.changed.notify_all()
+
+    def _publish(self, result: Result) -> bool:
+        """Show a result to the readers; whether they want another one."""
+        with self.changed:
+            self.latest, self.arrived = result, time.monotonic()
+            self.counter += 1
+            self.changed.notify_all()
+            self.changed.wait_for(lambda: self._stopped or not self._every_frame or self._all_have_seen())
+            return not self._stopped
+
+    def _all_have_seen(self) -> bool:
+        return all(seen == self.counter for seen in self._seen.values())
