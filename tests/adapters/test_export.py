@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from contextlib import redirect_stderr
@@ -22,6 +21,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import Result
 from tactflow.sources import open_source
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
+from tests.adapters.lerobot_env import needs_datasets, run_with_lerobot
 from tests.messages import Results, result_of
 
 pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
@@ -169,14 +169,10 @@ except OSError as error:
 """
 
 
+@needs_datasets
 def test_lerobot_opens_it(dataset: Path) -> None:
-    # Not in the environment of the tests: LeRobot takes other versions of numpy and OpenCV, and torch.
-    python = os.environ.get("LEROBOT_PYTHON")
-    if python is None:
-        pytest.skip("LEROBOT_PYTHON does not name the Python of an environment in which LeRobot is")
-    command = [python, "-W", "ignore", "-c", OPENED, str(dataset), KEY]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "2; 70; 60; press; (3, 400, 300); (5,); 1"
+    opened = run_with_lerobot(OPENED, str(dataset), KEY)
+    assert opened == "2; 70; 60; press; (3, 400, 300); (5,); 1"
 
 
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(

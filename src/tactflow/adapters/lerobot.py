@@ -1,5 +1,5 @@
-"""`tactflow export lerobot`: datasets of LeRobot (layout v3.0) with pictures, contact and flow at a constant
-rate; of a calibrated sensor also in mm and N.
+"""`tactflow export lerobot`: datasets of LeRobot (layout v3.0) with pictures, contact, flow and markers at a
+constant rate; of a calibrated sensor also in mm and N.
 
 The layout is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v3. Each recording is an
 episode, in files of its own.
@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,8 +19,10 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from tactflow import __version__
+from tactflow.adapters.episodes import AlignedMarkers, MarkerOrder, Moments, at_rate
 from tactflow.engine.errors import StageError
 from tactflow.system.extras import missing
 
@@ -32,7 +35,10 @@ log = logging.getLogger("tactflow")
 
 VERSION = "v3.0"
 """Of the layout, as LeRobot compares it."""
+PICTURES = "observation.images."
 TACTILE = "observation.tactile"
+WINDOW = "window"
+"""Key under which a row keeps the numbers of all results since the row before."""
 NAMES = {
     "contact": ["touching", "x", "y", "area", "angle"],
     "flow": ["known", "dx", "dy"],
@@ -44,6 +50,8 @@ NAMES = {
 }
 """Features and the names of their numbers: the first two in px, the others only with a calibration, whatever
 parts it has. All numbers are 0 where the first is 0."""
+FORCES = ("Fx_N", "Fy_N", "Fz_N")
+"""Force on a marker: always unknown, as tactflow knows only that on the whole gel."""
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
 """Integer columns that every dataset has, besides `timestamp`."""
 CHUNK = 1000
@@ -97,7 +105,11 @@ class DatasetWriter:
         self._frames = 0
         self._kind = self._camera = ""
         self._shape: tuple[int, ...] = ()
-        self._numbers: dict[str, list[list[float]]] = {}
+        self._features: dict[str, dict[str, Any]] = {}
+        self._moments: dict[str, Moments] = {}
+        self._order = MarkerOrder()
+        self._window = 0
+        self._recent: deque[tuple[float, list[float]]] = deque()
         self._pixels: list[NDArray[np.float64]] = []
 
     def add(self, results: Iterable[Result]) -> int:
@@ -115,7 +127,8 @@ class DatasetWriter:
         rows: list[dict[str, Any]] = []
         encode: Callable[[NDArray[np.uint8] | None], None] | None = None
         with ExitStack() as stack:
-            for index, result in enumerate(at_rate(results, self._fps)):
+            self._recent.clear()
+            for index, result in enumerate(at_rate(self._remembered(results), self._fps)):
                 image = self._check(result)
                 if self._is_video and encode is None:
                     path = self._folder / "videos" / self._camera / f"{file}.mp4"
@@ -128,6 +141,7 @@ class DatasetWriter:
                 encode(None)
         if not rows:
             raise StageError("there is no frame in it")
+        self._complete(rows)
         self._write_rows(rows, self._folder / "data" / f"{file}.parquet")
         self._episodes.append(self._episode(episode, len(rows)))
         self._frames += len(rows)
@@ -156,7 +170,7 @@ class DatasetWriter:
         image = result.image
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")
-        camera, size = f"observation.images.{result.sensor}", f"{image.shape[1]} x {image.shape[0]} pixels"
+        camera, size = f"{PICTURES}{result.sensor}", f"{image.shape[1]} x {image.shape[0]} pixels"
         calibrated = result.scale is not None
         kind = f"{camera}, {size}, with{'' if calibrated else 'out'} calibration"
         if not self._kind:
@@ -167,13 +181,22 @@ class DatasetWriter:
             raise StageError(f"pictures of {size}: a video needs even numbers; give --pictures png")
         return image
 
-    def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
-        row: dict[str, Any] = {}
-        for name, numbers in _numbers(result).items():
-            row[f"{TACTILE}.{name}"] = values = (
-                [1.0, *map(float, numbers)] if numbers else [0.0] * len(NAMES[name])
+    def _remembered(self, results: Iterable[Result]) -> Iterator[Result]:
+        """The same results; the numbers of each are kept until the next frame of the dataset."""
+        for result in results:
+            self._recent.append(
+                (result.t, [number for values in _values(result).values() for number in values])
             )
-            self._numbers.setdefault(name, []).append(values)
+            yield result
+
+    def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
+        row: dict[str, Any] = {f"{TACTILE}.{name}": values for name, values in _values(result).items()}
+        row |= self._marker_rows(result)
+        window = []
+        while self._recent and self._recent[0][0] <= result.t:
+            t, numbers = self._recent.popleft()
+            window.append([1.0, t - result.t, *numbers])
+        row[WINDOW] = window
         if index % SAMPLED == 0:
             # Mean, mean square, minimum and maximum of red, green, blue.
             rgb = image.reshape(-1, 3)[:, ::-1] / 255.0
@@ -183,13 +206,61 @@ class DatasetWriter:
         integers = (index, episode, self._frames + index, 0)
         return row | {"timestamp": index / self._fps} | dict(zip(INTEGERS, integers, strict=True))
 
+    def _marker_rows(self, result: Result) -> dict[str, NDArray[Any]]:
+        """The features of the markers; empty as long as no frame had any."""
+        if result.markers is not None:
+            markers = self._order.align(result.markers)
+            return _marker_features(result.sensor, markers, _points(markers, result))
+        return {} if self._order.origin is None else self._lost_markers(result.sensor)
+
+    def _lost_markers(self, sensor: str) -> dict[str, NDArray[Any]]:
+        lost = self._order.lost()
+        return _marker_features(sensor, lost, np.full((len(lost.offset), 6), np.nan))
+
+    def _complete(self, rows: list[dict[str, Any]]) -> None:
+        """Give every row of an episode all features, in their fixed lengths, and count their values.
+
+        Raises
+        ------
+        StageError : this recording has markers, and those before had none.
+        """
+        sensor = self._camera.removeprefix(PICTURES)
+        if self._order.origin is not None:
+            lost = self._lost_markers(sensor)
+            rows[:] = [lost | row for row in rows]
+        windows = [row.pop(WINDOW) for row in rows]
+        if not self._features:
+            self._window = max(map(len, windows))
+        if self._window > 1:
+            nothing = [0.0] * len(windows[0][0])
+            for row, window in zip(rows, windows, strict=True):
+                newest = window[-self._window :]
+                row[f"{TACTILE}.{sensor}.window"] = [nothing] * (self._window - len(newest)) + newest
+        values = [
+            {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE)} for row in rows
+        ]
+        if not self._features:
+            calibrated = f"{TACTILE}.contact_mm" in values[0]
+            self._features = {name: _feature(name, value, calibrated) for name, value in values[0].items()}
+        if values[0].keys() != self._features.keys():
+            raise StageError("it has markers, and the recordings before have none: make two datasets")
+        for arrays in values:
+            for name, array in arrays.items():
+                self._moments.setdefault(name, Moments()).add(array)
+
     def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
         import pyarrow as pa
 
-        types = {f"{TACTILE}.{name}": pa.list_(pa.float32(), len(NAMES[name])) for name in self._numbers}
+        types: dict[str, Any] = {}
+        for name, feature in self._features.items():
+            value = pa.bool_() if feature["dtype"] == "bool" else getattr(pa, feature["dtype"])()
+            length, *columns = feature["shape"]
+            types[name] = pa.list_(pa.list_(value)) if columns else pa.list_(value, length)
         if not self._is_video:
             types[self._camera] = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
         types |= {"timestamp": pa.float32(), **dict.fromkeys(INTEGERS, pa.int64())}
+        for row in rows:
+            row |= {name: np.asarray(row[name]).tolist() for name in self._features}
         _write(pa.Table.from_pylist(rows, pa.schema(types)), path)
 
     def _episode(self, episode: int, frames: int) -> dict[str, Any]:
@@ -227,9 +298,7 @@ class DatasetWriter:
                 "has_audio": False,
             }
         features: dict[str, Any] = {self._camera: camera}
-        for name in self._numbers:
-            shape = [len(NAMES[name])]
-            features[f"{TACTILE}.{name}"] = {"dtype": "float32", "shape": shape, "names": NAMES[name]}
+        features |= self._features
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INTEGERS}
         video_path = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -253,10 +322,9 @@ class DatasetWriter:
     def _statistics(self) -> dict[str, Any]:
         """What training normalises by: of each number, and of each color (in [0, 1], red first)."""
         statistics: dict[str, Any] = {}
-        for name, rows in self._numbers.items():
-            values = np.array(rows)
-            moments = {key: getattr(values, key)(0).tolist() for key in ("min", "max", "mean", "std")}
-            statistics[f"{TACTILE}.{name}"] = moments | {"count": [len(values)]}
+        for name, moments in self._moments.items():
+            summary: dict[str, Any] = {key: value.tolist() for key, value in moments.summary().items()}
+            statistics[name] = summary | {"count": [moments.frames]}
         means, squares, lowest, highest = np.array(self._pixels).transpose(1, 0, 2)
         mean = means.mean(0)
         std = np.sqrt(np.maximum(squares.mean(0) - mean**2, 0))
@@ -266,26 +334,58 @@ class DatasetWriter:
         return statistics
 
 
-def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
-    """For each multiple of 1 / fps since the first result, the result whose time is nearest.
+def _values(result: Result) -> dict[str, list[float]]:
+    """The numbers of each feature of a frame: all 0 where the first is 0."""
+    return {
+        name: [1.0, *map(float, numbers)] if numbers else [0.0] * len(NAMES[name])
+        for name, numbers in _numbers(result).items()
+    }
 
-    >>> from types import SimpleNamespace
-    >>> times = [5.0, 5.02, 5.21, 5.3]
-    >>> [result.t for result in at_rate((SimpleNamespace(t=t) for t in times), 10)]
-    [5.0, 5.02, 5.21, 5.3]
+
+def _marker_features(
+    sensor: str, markers: AlignedMarkers, points: NDArray[np.float64]
+) -> dict[str, NDArray[Any]]:
+    """The features of N markers. points : (N, 6), NaN where unknown."""
+    prefix = f"{TACTILE}.{sensor}"
+    return {
+        f"{prefix}.marker_offset": markers.offset,
+        f"{prefix}.marker_status": markers.status,
+        f"{prefix}.points": points,
+        f"{prefix}.points_mask": np.isfinite(points),
+    }
+
+
+def _points(markers: AlignedMarkers, result: Result) -> NDArray[np.float64]:
+    """(N, 6) float64: dx, dy, dz, Fx, Fy, Fz of each marker; NaN where unknown.
+
+    In mm and N, right, down and out of the gel, so that dz is negative where the gel is pushed in; without a
+    calibration dx and dy are in px, and the others unknown. dz is that of the gel under the marker.
     """
-    before: Result | None = None
-    begin, index = 0.0, 0
-    for result in results:
-        if before is None:
-            before, begin = result, result.t
-        # Halves go to the earlier one.
-        while begin + index / fps < (before.t + result.t) / 2:
-            yield before
-            index += 1
-        before = result
-    if before is not None and index <= round((before.t - begin) * fps):
-        yield before
+    points = np.full((len(markers.offset), 6), np.nan)
+    scale = result.scale
+    points[:, :2] = markers.offset * ((1.0, 1.0) if scale is None else (scale.x, scale.y))
+    if result.depth is not None:
+        places = (markers.origin + markers.offset)[:, ::-1].T
+        heights = result.depth.heights.astype(np.float64)
+        points[:, 2] = -map_coordinates(heights, places, order=1, mode="constant", cval=np.nan)
+    return points
+
+
+def _feature(name: str, value: NDArray[Any], calibrated: bool) -> dict[str, Any]:
+    """The description of a feature, from its values in a frame."""
+    dtype = "float32" if value.dtype.kind == "f" else value.dtype.name
+    ending = name.removeprefix(f"{TACTILE}.")
+    if ending in NAMES:
+        return {"dtype": dtype, "shape": [len(value)], "names": NAMES[ending]}
+    parts = list(NAMES) if calibrated else ["contact", "flow"]
+    components = {
+        "marker_offset": ["dx_px", "dy_px"],
+        "marker_status": ["0 tracked, 1 inferred, 2 lost"],
+        "points": [*(["dx_mm", "dy_mm"] if calibrated else ["dx_px", "dy_px"]), "dz_mm", *FORCES],
+        "points_mask": ["known"],
+        "window": ["known", "t_s", *(f"{part}.{number}" for part in parts for number in NAMES[part])],
+    }[ending.rpartition(".")[2]]
+    return {"dtype": dtype, "shape": list(value.shape), "names": {"components": components}}
 
 
 def _numbers(result: Result) -> dict[str, Sequence[float] | None]:

@@ -30,7 +30,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "warmup": ("pipelines", "compile what `run` would compile on its first use"),
     "batch": ("batch", "run a pipeline over many recordings; a second call does what is missing"),
     "record": ("run", "run a pipeline and record its frames and results"),
-    "export": ("recordings", "make a LeRobot dataset of recordings"),
+    "export": ("recordings", "make a dataset of recordings: LeRobot, Diffusion Policy"),
     "repair": ("recordings", "give a recording that was cut off its index"),
     "calibrate": ("calibrate", "make the calibration file of a sensor, or see whether it still fits"),
     "detect": ("detect", "find the marks of a gel and show what was found and why, in one picture"),

@@ -26,7 +26,11 @@ _frame_rate = number(int, 1, 1000, "1 to 1000 frames a second")
 
 def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `export`."""
-    parser.add_argument("format", help="lerobot (a LeRobot dataset, layout v3.0), or that of a plug-in")
+    parser.add_argument(
+        "format",
+        help="lerobot (a LeRobot dataset, layout v3.0), replay-buffer (Zarr, for Diffusion Policy), or that "
+        "of a plug-in",
+    )
     parser.add_argument(
         "recordings",
         nargs="+",
@@ -49,7 +53,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
         "--pictures",
         choices=("video", "png"),
         default="video",
-        help="video: H.264, small, loses a little (default); png: every bit",
+        help="of lerobot: video is H.264, small, loses a little (default); png keeps every bit",
     )
 
 

@@ -1,0 +1,155 @@
+"""What datasets for training policies share: a constant rate, and the same markers in every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from tactflow.engine.errors import StageError
+from tactflow.vision.types import Markers, MarkerStatus
+
+if TYPE_CHECKING:
+    from tactflow.message.result import Result
+
+
+def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
+    """For each multiple of 1 / fps since the first result, the result whose time is nearest.
+
+    >>> from types import SimpleNamespace
+    >>> times = [5.0, 5.02, 5.21, 5.3]
+    >>> [result.t for result in at_rate((SimpleNamespace(t=t) for t in times), 10)]
+    [5.0, 5.02, 5.21, 5.3]
+    """
+    before: Result | None = None
+    begin, index = 0.0, 0
+    for result in results:
+        if before is None:
+            before, begin = result, result.t
+        # Halves go to the earlier one.
+        while begin + index / fps < (before.t + result.t) / 2:
+            yield before
+            index += 1
+        before = result
+    if before is not None and index <= round((before.t - begin) * fps):
+        yield before
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedMarkers:
+    """The N markers of a dataset in one frame.
+
+    origin : (N, 2) float64, places in the reference frame of this recording, px. offset : (N, 2) float64, how
+    far they have moved since, px. status : (N,) uint8, values of `MarkerStatus`. All are finite.
+    """
+
+    origin: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    status: NDArray[np.uint8]
+
+
+class MarkerOrder:
+    """Gives the markers of all recordings of a sensor the order that they have in the first one.
+
+    Each recording finds its markers anew, some of which it may miss. Those belong together whose places in
+    the reference frames are closer than half the distance between neighbours.
+
+    origin : (N, 2) float64, px, places in the first recording; None until a frame has markers.
+
+    >>> order = MarkerOrder()
+    >>> first = np.array([[10.0, 10.0], [20.0, 10.0], [30.0, 10.0]])
+    >>> seen = np.zeros(3, np.uint8)
+    >>> _ = order.align(Markers(first, first, seen, np.zeros(3)))
+    >>> later = first[[2, 0]] + 0.5
+    >>> aligned = order.align(Markers(later, later + [[2.0, 0.0], [1.0, 0.0]], seen[:2], np.zeros(2)))
+    >>> aligned.offset[:, 0], aligned.status
+    (array([1., 1., 2.]), array([0, 2, 0], dtype=uint8))
+    """
+
+    def __init__(self) -> None:
+        self.origin: NDArray[np.float64] | None = None
+        self._aligned_origin: NDArray[np.float64] | None = None
+        self._nearest = np.zeros(0, np.intp)
+        self._is_missing = np.zeros(0, np.bool_)
+
+    def align(self, markers: Markers) -> AlignedMarkers:
+        """The markers in the order of the first recording.
+
+        One that this recording does not have is filled with the displacement of its nearest neighbour, and is
+        lost.
+
+        Raises
+        ------
+        StageError : less than half of the markers are where those of the first recording were.
+        """
+        if self.origin is None:
+            self.origin = markers.origin
+        if self._aligned_origin is None or not np.array_equal(self._aligned_origin, markers.origin):
+            self._match(self.origin, markers.origin)
+        origin = np.where(self._is_missing[:, None], self.origin, markers.origin[self._nearest])
+        status = np.where(self._is_missing, MarkerStatus.LOST, markers.status[self._nearest])
+        return AlignedMarkers(origin, markers.displacement[self._nearest], status.astype(np.uint8))
+
+    def lost(self) -> AlignedMarkers:
+        """All markers, for a frame that has none: unmoved and lost. Only after `align`."""
+        assert self.origin is not None
+        count = len(self.origin)
+        return AlignedMarkers(self.origin, np.zeros((count, 2)), np.full(count, MarkerStatus.LOST, np.uint8))
+
+    def _match(self, first: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
+        distance, nearest = (
+            KDTree(origin).query(first) if len(origin) else (np.full(len(first), np.inf), None)
+        )
+        # A single marker has no neighbour, which is then infinitely far away.
+        neighbours = KDTree(first).query(first, [2])[0]
+        self._is_missing = np.asarray(distance > np.median(neighbours) / 2)
+        if nearest is None or 2 * self._is_missing.sum() > len(first):
+            found = int(len(first) - self._is_missing.sum())
+            raise StageError(
+                f"only {found} of {len(first)} markers are where those of the first recording were: was the "
+                "camera or the gel moved? Make two datasets"
+            )
+        self._nearest, self._aligned_origin = np.asarray(nearest), origin
+
+
+class Moments:
+    """Running minimum, maximum, mean and standard deviation of arrays of one shape; NaN is passed over.
+
+    >>> moments = Moments()
+    >>> for values in ([1.0, np.nan], [3.0, np.nan]):
+    ...     moments.add(np.array(values))
+    >>> {name: values.tolist() for name, values in moments.summary().items()}
+    {'min': [1.0, 0.0], 'max': [3.0, 0.0], 'mean': [2.0, 0.0], 'std': [1.0, 0.0]}
+    """
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self._count: NDArray[np.float64] | float = 0.0
+        self._sum: NDArray[np.float64] | float = 0.0
+        self._squares: NDArray[np.float64] | float = 0.0
+        self._min: NDArray[np.float64] | float = np.inf
+        self._max: NDArray[np.float64] | float = -np.inf
+
+    def add(self, values: NDArray[np.generic]) -> None:
+        """Count one frame's values."""
+        numbers = values.astype(np.float64)
+        known = np.isfinite(numbers)
+        self.frames += 1
+        self._count = self._count + known
+        self._sum = self._sum + np.where(known, numbers, 0.0)
+        self._squares = self._squares + np.where(known, numbers, 0.0) ** 2
+        self._min = np.minimum(self._min, np.where(known, numbers, np.inf))
+        self._max = np.maximum(self._max, np.where(known, numbers, -np.inf))
+
+    def summary(self) -> dict[str, NDArray[np.float64]]:
+        """The four by name, of the values' shape; 0 where none was known."""
+        known = np.asarray(self._count) > 0
+        count = np.maximum(self._count, 1)
+        mean = self._sum / count
+        std = np.sqrt(np.maximum(self._squares / count - mean**2, 0))
+        found = {"min": self._min, "max": self._max, "mean": mean, "std": std}
+        return {name: np.where(known, values, 0.0) for name, values in found.items()}
