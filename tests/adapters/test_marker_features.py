@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.adapters.episodes import MarkerOrder
 from tactflow.adapters.lerobot import DatasetWriter
 from tactflow.adapters.replay_buffer import ReplayBuffer, fit_embedding
 from tactflow.cli.main import main
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message.episodes import MarkerOrder
 from tactflow.message.result import Result
 from tactflow.vision.types import Depth, Markers, Scale
 from tests.adapters.lerobot_env import needs_datasets, run_with_lerobot

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from tactflow import __version__
-from tactflow.adapters.episodes import AlignedMarkers, MarkerOrder, Moments, at_rate
 from tactflow.engine.errors import StageError
+from tactflow.message.episodes import AlignedMarkers, MarkerOrder, Moments, at_rate
 from tactflow.system.extras import missing
 
 if TYPE_CHECKING:

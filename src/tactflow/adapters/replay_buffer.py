@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.adapters.episodes import AlignedMarkers, MarkerOrder, at_rate
 from tactflow.engine.errors import StageError
+from tactflow.message.episodes import AlignedMarkers, MarkerOrder, at_rate
 from tactflow.system.extras import missing
 
 if TYPE_CHECKING:
