@@ -7,16 +7,17 @@ from pathlib import Path
 from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
-from tactflow.ports import ContactMask, Unmarked, Untouched
+from tactflow.ports import ContactMask, Gradients, Unmarked, Untouched
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Depth as HeightMap
 from tactflow.vision.types import Scale
 
 
 class Depth(Stage):
-    """Heights from the colour of the gel, by the photometric part of the sensor's calibration.
+    """Heights from the colour of the gel, by the photometric part of the sensor's calibration, or from the
+    gradients of a network.
 
-    Nothing without a calibration, or with one that only knows the scale.
+    Nothing without a calibration, or with one that knows the scale alone and no network.
     """
 
     memory = "pure"
@@ -29,16 +30,25 @@ class Depth(Stage):
         self._rest: tuple[Untouched, Rest] | None = None
 
     def process(
-        self, unmarked: Unmarked, untouched: Untouched, contact_mask: ContactMask, scale: Scale
+        self,
+        unmarked: Unmarked,
+        untouched: Untouched,
+        contact_mask: ContactMask,
+        scale: Scale,
+        gradients: Gradients | None = None,
     ) -> HeightMap | Absent:
         """The height map of the contact."""
         known = self._known
-        if known is None or known.slopes is None or known.photometric is None:
+        photometric = None if known is None else known.photometric
+        if known is None or (gradients is None and (known.slopes is None or photometric is None)):
             return Absent("no_calibration")
         if not contact_mask.any():
             return Absent("no_contact")
         if self._surface is None or self._surface[0] is not scale:
-            self._surface = scale, Surface(known.slopes, scale, known.photometric.errors())
+            self._surface = (
+                scale,
+                Surface(known.slopes, scale, None if photometric is None else photometric.errors()),
+            )
         if self._rest is None or self._rest[0] is not untouched:
             self._rest = untouched, Rest(untouched)
-        return self._surface[1].depth(unmarked, self._rest[1], contact_mask)
+        return self._surface[1].depth(unmarked, self._rest[1], contact_mask, gradients)

@@ -22,7 +22,7 @@ from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
 from tactflow.config.validation import validated
 from tactflow.engine.by_hand import with_frames_made
-from tactflow.engine.conformance import build, component
+from tactflow.engine.conformance import build, component, configured
 from tactflow.engine.contract import Stage
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
@@ -245,5 +245,5 @@ def stage(use: str | type[Stage], /, **params: Any) -> Any:
     offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
     instance: Any = build(found.cls, checked, offered)
     instance.open()
-    instance.process = with_frames_made(instance.process, found.ports.inputs)
+    instance.process = with_frames_made(instance.process, configured(found, checked).ports.inputs)
     return instance

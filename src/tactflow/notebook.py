@@ -114,7 +114,7 @@ def to_frame(results: Iterable[Result]) -> pd.DataFrame:
         import pandas as pd
     except ImportError:
         raise ImportError("tactflow.to_frame needs pandas: pip install 'tactflow[pandas]'") from None
-    columns = [column for column in frame_columns() if column.kind not in ("points", "words")]
+    columns = [column for column in frame_columns() if column.kind not in ("numbers", "points", "words")]
     rows = []
     for result in results:
         message = result.to_dict(detail=True)

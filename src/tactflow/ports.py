@@ -34,6 +34,9 @@ ContactMask = Annotated[NDArray[np.uint8], ArrayPort("contact_mask", ("H", "W"),
 Picture = Annotated[NDArray[np.uint8], ArrayPort("annotated", ("H", "W", 3), "uint8", "grey levels, BGR")]
 """The processed frame with the results drawn on it."""
 
+Gradients = Annotated[NDArray[np.float32], ArrayPort("gradients", ("H", "W", 2), "float32", "slope")]
+"""How much deeper the gel is pushed in to the right and down, mm per mm, for each pixel."""
+
 Touching = Annotated[bool, SignalPort("touching", closed="no_contact")]
 """True while something touches the gel."""
 

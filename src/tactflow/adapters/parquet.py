@@ -209,6 +209,7 @@ def _make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
         "integer": pa.int64(),
         "boolean": pa.bool_(),
         "string": pa.string(),
+        "numbers": pa.list_(pa.float64()),
         "points": pa.list_(pa.list_(pa.float64())),
         "words": pa.map_(pa.string(), pa.string()),
     }

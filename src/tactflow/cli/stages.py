@@ -18,6 +18,7 @@ from tactflow.cli.terminal import say, show, show_json, table
 from tactflow.config.document import shown
 from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, names, resolve
+from tactflow.engine.conformance import declares
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.engine.ports import Port, describe_type
@@ -77,6 +78,9 @@ def details(component: Component) -> Iterator[str]:
     if component.kind == "stage":
         yield ""
         yield f"memory: {component.memory}"
+    if declares(component.cls):
+        yield ""
+        yield "inputs and outputs: as the parameters say"
     for title, ports in (("inputs", component.ports.inputs), ("outputs", component.ports.outputs)):
         if ports:
             yield ""

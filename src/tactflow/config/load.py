@@ -17,6 +17,7 @@ from tactflow.config.registry import Section, code_place, resolve
 from tactflow.config.shipped import is_packaged
 from tactflow.config.validation import validate
 from tactflow.config.wiring import Draft
+from tactflow.engine.conformance import configured, declares
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, OnError, Pipeline
@@ -58,6 +59,11 @@ def load_pipeline(
             apply(document, override, source.keys)
     for draft in drafts:
         draft.params = _params(draft, document)
+        if draft.component is not None and draft.params is not None:
+            draft.component = configured(draft.component, draft.params)
+        elif draft.component is not None and declares(draft.component.cls):
+            # Its ports are not known, so that nothing is said of what is connected to it.
+            draft.component = None
     calibration = _calibration(document, path.parent)
     _check_files(drafts, path, calibration, document)
     wiring.connect(drafts, document)

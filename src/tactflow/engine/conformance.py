@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from typing import Any, get_args
 
 from tactflow.engine.contract import Memory, Part, Sink, Source, Stage, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component, Kind
-from tactflow.engine.ports import read_ports
+from tactflow.engine.ports import Ports, read_ports
 
 BASES: dict[Kind, type[Part]] = {"source": Source, "stage": Stage, "sink": Sink}
 """What each kind inherits from."""
@@ -44,7 +45,21 @@ def component(cls: type[Any], name: str, origin: str, reserved: Collection[str])
     if problems:
         raise _broken(cls, *problems)
     memory: Memory = getattr(cls, "memory", "pure")
-    return Component(name, kind, cls, cls.Params, read_ports(cls, METHODS[kind]), memory, origin)
+    ports = Ports((), ()) if declares(cls) else read_ports(cls, METHODS[kind])
+    return Component(name, kind, cls, cls.Params, ports, memory, origin)
+
+
+def declares(cls: type[Any]) -> bool:
+    """Whether the ports of a class depend on its parameters (`Stage.declare`)."""
+    return issubclass(cls, Stage) and cls.declare.__func__ is not Stage.declare.__func__  # type: ignore[attr-defined]
+
+
+def configured(found: Component, params: StageParams) -> Component:
+    """The component with the ports and the memory that it has with these parameters."""
+    if not declares(found.cls):
+        return found
+    declared = found.cls.declare(params)
+    return replace(found, ports=Ports(declared.inputs, declared.outputs), memory=declared.memory)
 
 
 def build(cls: type[Any], params: StageParams, offered: Mapping[str, Any]) -> Part:

@@ -21,11 +21,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict
 
 from tactflow.engine.frame import Frame
+from tactflow.engine.ports import Port
 
 Memory = Literal["pure", "stateful"]
 WhenLive = Literal["block", "latest"]
@@ -98,6 +99,15 @@ class Part:
         return ()
 
 
+class Declared(NamedTuple):
+    """What `Stage.declare` returns: the ports, in the order in which `process` takes inputs and returns a
+    tuple of outputs, and the memory."""
+
+    inputs: Sequence[Port]
+    outputs: Sequence[Port]
+    memory: Memory
+
+
 class Stage(Part):
     """Computes outputs from inputs, frame by frame.
 
@@ -135,6 +145,24 @@ class Stage(Part):
 
     process: Callable[..., Any]
     """Computes the outputs of one frame; see above."""
+
+    @classmethod
+    def declare(cls, params: Any) -> Declared | None:  # noqa: ARG003 (for stages whose ports are settings)
+        """Ports and memory, for a stage in which these depend on its parameters.
+
+        None, the default: ports are the annotations of `process`, and `memory` is that of the class.
+
+        >>> class Mean(Stage):
+        ...     memory = "pure"
+        ...     class Params(StageParams):
+        ...         port: str = "image"
+        ...     @classmethod
+        ...     def declare(cls, params: Params) -> Declared:
+        ...         return Declared([Port(params.port, Any)], [Port(f"{params.port}_mean", float)], "pure")
+        ...     def process(self, *inputs: Any) -> tuple[float]:
+        ...         return (float(inputs[0].mean()),)
+        """
+        return None
 
     def reset(self) -> None:
         """Forget everything: a new reference follows (`Frame.epoch` has grown)."""

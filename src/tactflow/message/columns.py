@@ -24,7 +24,7 @@ class Column(NamedTuple):
     """One column of a table.
 
     name : `contact_center_x`. path : keys and indices that lead to the value in a message.
-    kind : number, integer, string, boolean, points (a list of pairs) or words (name -> text).
+    kind : number, integer, string, boolean, numbers, points (a list of pairs) or words (name -> text).
     description : for people.
     """
 
@@ -97,4 +97,6 @@ def _columns(
             yield Column(f"{name}_{suffix}", (*path, index), inner.get("type", "number"), description)
     else:
         kind = {"array": "points", "object": "words"}.get(kind, kind)
+        if part.get("items", {}).get("type") == "number":
+            kind = "numbers"
         yield Column(name, path, kind, description)

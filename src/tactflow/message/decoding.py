@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
 from tactflow.message.encoding import FLOW_DETAILS, STATUS_NAMES
-from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, Scale, Slip
+from tactflow.vision.types import Contact, Depth, Ellipse, Features, Flow, Force, Markers, Scale, Slip
 
 T = TypeVar("T")
 
@@ -32,6 +32,7 @@ def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str,
         "depth": _optional(_depth, message["contact"]),
         "slip": _optional(_slip, message.get("slip")),
         "force": _optional(_force, message.get("force")),
+        "features": _optional(_features, message.get("features")),
     }
     parts = tuple(map(_contact, message.get("contacts", ())))
     if values["contact"] is not None and len(parts) > 1:
@@ -111,3 +112,7 @@ def _slip(slip: Any) -> Slip:
 
 def _force(force: Any) -> Force:
     return Force(_numbers(force["value"]), _numbers(force["stderr"]), bool(force["in_range"]))
+
+
+def _features(features: Any) -> Features:
+    return Features(np.array(features["values"], np.float32), str(features["unit"]))

@@ -49,6 +49,8 @@ def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
         message["slip"] = _attributes(result.slip, "slipping", "stick_ratio")
     if result.force is not None:
         message["force"] = _attributes(result.force, "value", "stderr", "in_range")
+    if result.features is not None:
+        message["features"] = _attributes(result.features, "values", "unit")
     if field:
         message["field"] = None if result.field is None else _field(result.field)
     return {name: _finite(part, name) for name, part in message.items()}

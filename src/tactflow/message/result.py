@@ -17,7 +17,7 @@ from tactflow.engine.frame import NO_PICTURE, Frame, Tick
 from tactflow.message.decoding import decode_values
 from tactflow.message.encoding import SCHEMA, encode
 from tactflow.ports import ContactMask, Image
-from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip
+from tactflow.vision.types import Contact, Depth, Features, Flow, Force, Markers, Scale, Slip
 
 if TYPE_CHECKING:
     from tactflow.vision.flow.displacement_field import DisplacementField
@@ -38,6 +38,7 @@ class Result(Tick):
         calibration that knows it.
     field, slip : displacement between the dots, and whether the contact slips; only where a stage of that
         name stands in the pipeline.
+    features : of a stage `network` that gives some.
 
     >>> import tactflow
     >>> result = next(tactflow.stream(source="sim:press", max_frames=1))
@@ -57,6 +58,7 @@ class Result(Tick):
     field: DisplacementField | None
     slip: Slip | None
     force: Force | None
+    features: Features | None
 
     def __init__(
         self,

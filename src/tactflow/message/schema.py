@@ -135,12 +135,19 @@ class _ForceModel(_Strict):
         description="(x, y, z), N: z presses on the gel, x and y drag it along the axes of the picture; null "
         "when not known"
     )
-    stderr: tuple[_NotNegative | None, _NotNegative | None, _NotNegative] = Field(
-        description="standard errors, N; null where value is"
+    stderr: tuple[_NotNegative | None, _NotNegative | None, _NotNegative | None] = Field(
+        description="standard errors, N; null where value is, and where a network gives the force"
     )
     in_range: bool = Field(
         description="whether the calibration was fitted to such contacts; stderr only holds there"
     )
+
+
+class _FeaturesModel(_Strict):
+    """What a network of the user says."""
+
+    values: list[_Finite] = Field(description="as many numbers as the network gives")
+    unit: str = Field(description="of the numbers")
 
 
 class _FieldModel(_Strict):
@@ -179,6 +186,9 @@ class _Message(_Strict):
     scale: _ScaleModel | None = Field(None, description="makes mm of px (calibrated)")
     force: _ForceModel | None = Field(
         None, description="on the gel; only where something touches (calibrated)"
+    )
+    features: _FeaturesModel | None = Field(
+        None, description="of a network (only where a stage network gives features)"
     )
     skipped: dict[str, str] = Field(
         description="port -> why this frame did not need it; reference -> why this frame became a new one"

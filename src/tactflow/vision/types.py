@@ -234,7 +234,7 @@ class Force:
 
     value : (x, y, z), N, along the axes of `Scale`: z is how hard the object presses, >= 0; x and y are how
         it drags the gel. None for a component that the calibration does not know.
-    stderr : standard error of each component, N; None where `value` is.
+    stderr : standard error of each component, N; None where `value` is, NaN where it is not known.
     in_range : whether the contact is like those the calibration was fitted to; `stderr` only holds there.
 
     >>> Force((None, None, 2.5), (None, None, 0.2), True).value[2]
@@ -244,3 +244,17 @@ class Force:
     value: tuple[float | None, float | None, float]
     stderr: tuple[float | None, float | None, float]
     in_range: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """What a network says about a frame, in numbers of its own.
+
+    values : (N,) float32. unit : of them.
+
+    >>> Features(np.zeros(2, np.float32), "1").values.shape
+    (2,)
+    """
+
+    values: NDArray[np.float32]
+    unit: str

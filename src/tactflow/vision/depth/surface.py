@@ -82,7 +82,8 @@ class Surface:
 
     Parameters
     ----------
-    model : which colour is which slope. scale : mm per px of the processed frame.
+    model : which colour is which slope; None where all slopes are given.
+    scale : mm per px of the processed frame.
     errors : of the calibration; None where they are not known.
 
     Examples
@@ -95,7 +96,7 @@ class Surface:
     0.0
     """
 
-    def __init__(self, model: SlopeModel, scale: Scale, errors: SurfaceErrors | None = None) -> None:
+    def __init__(self, model: SlopeModel | None, scale: Scale, errors: SurfaceErrors | None = None) -> None:
         # Only here: runs without a calibration need not wait 0.15 s for SciPy.
         from tactflow.vision.depth.poisson import integrate
 
@@ -104,14 +105,20 @@ class Surface:
         self._scale = scale
         self._errors = errors
 
-    def depth(self, image: Bytes, rest: Rest, mask: Bytes) -> Depth:
+    def depth(self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None) -> Depth:
         """The height map of a frame.
 
         image : (H, W, 3) uint8, BGR, without markers. mask : (H, W) uint8, 255 in contact; not all 0.
+        gradients : (H, W, 2), `tactflow.ports.Gradients`, in place of those by the model; then no errors are
+        known.
         """
         around = surroundings(mask, rest.window)
         window = around.window
-        slope, steep = self._slopes(image, rest, around)
+        if gradients is None:
+            slope, steep = self._slopes(image, rest, around)
+        else:
+            # The model's slopes fall where the gel is pushed in.
+            slope, steep = -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32), 0.0
         low = self._integrated(slope)
         heights = np.zeros(mask.shape, np.float32)
         size = (2 * window.width, 2 * window.height)
@@ -121,7 +128,7 @@ class Surface:
         volume = float(low.sum()) * cell
         pressed = float(low[mask[window.whole][::2, ::2] > 0].sum()) * cell
         depth_error = volume_error = None
-        if self._errors is not None:
+        if self._errors is not None and gradients is None:
             root, balls = math.sqrt(steep), self._errors
             depth_error = greatest * math.hypot(DEPTH_SHAPE * balls.depth, DEPTH_ROUNDED, DEPTH_STEEP * root)
             volume_error = volume * math.hypot(balls.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
@@ -134,6 +141,7 @@ class Surface:
     def _slopes(self, image: Bytes, rest: Rest, around: Surroundings) -> tuple[Floats32, float]:
         """(2, h, w) float32, and the part of all slope that is steeper than the ball has shown, 0 to 1."""
         change = colour_change(image, rest, around.window)
+        assert self._model is not None, "without a model, gradients are given"
         rows, columns = around.window.part
         slope = self._model.slopes(change, rest.x[columns], rest.y[rows], around.near)
         return slope, 0.0 if self._errors is None else _steep_part(slope, self._errors.steepest)

@@ -1,0 +1,536 @@
+"""Stage `network`: a neural network of your own, from an ONNX file, as a part of the graph."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from tactflow.engine.contract import Declared, Stage, StageParams
+from tactflow.engine.errors import StageError
+from tactflow.engine.ports import ArrayPort, Port, describe_type
+from tactflow.ports import (
+    ContactMask,
+    Gradients,
+    Image,
+    MarkerMask,
+    Picture,
+    Touching,
+    Unmarked,
+    Untouched,
+    Valid,
+)
+from tactflow.system.extras import missing
+from tactflow.system.files import expanded
+from tactflow.vision.flow.displacement_field import DisplacementField
+from tactflow.vision.types import Depth, Features, Force, Markers
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+log = logging.getLogger("tactflow")
+
+Floats = NDArray[np.float32]
+Side = int | None
+"""Length of an axis; None where only a frame tells, or any will do."""
+
+KNOWN: Final[dict[str, tuple[Any, int]]] = {
+    "image": (Image, 3),
+    "unmarked": (Unmarked, 3),
+    "untouched": (Untouched, 3),
+    "annotated": (Picture, 3),
+    "contact_mask": (ContactMask, 1),
+    "marker_mask": (MarkerMask, 1),
+    "valid": (Valid, 1),
+    "gradients": (Gradients, 2),
+    "depth": (Depth, 1),
+    "field": (DisplacementField, 2),
+    "markers": (Markers, 4),
+}
+"""Port -> its type, and its channels: of markers x and y in the reference, then dx and dy."""
+DTYPES: Final = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+}
+"""Number types that inputs may have, by onnxruntime's names."""
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")]
+
+
+class InputParams(StageParams):
+    """What one input of the network gets: a port, resized, then (value - background) * scale, then
+    (value - mean) / std."""
+
+    port: Name = Field("image", description="the output of another stage, by name")
+    background: Literal["none", "subtract", "subtract_half", "concat"] = Field(
+        "none",
+        description="what becomes of the untouched gel: subtract takes it off; subtract_half also adds 0.5 "
+        "and clips to 0..1; concat puts it behind the channels of the picture",
+    )
+    size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
+        None,
+        description="width and height, px; null: those that the network asks for, else those of the port",
+    )
+    pad: bool = Field(False, description="keep the aspect when resizing, with black bars, and do not stretch")
+    interpolation: Literal["linear", "area"] = Field(
+        "linear", description="area averages when shrinking: smoother, but slower"
+    )
+    colour: Literal["bgr", "rgb", "grey"] = Field("bgr", description="order of the channels of a picture")
+    scale: float = Field(1 / 255, description="factor on the values of the port; 1/255 brings bytes to 0..1")
+    mean: tuple[float, ...] = Field((0.0,), min_length=1, description="one number, or one for each channel")
+    std: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        (1.0,), min_length=1, description="one number, or one for each channel"
+    )
+    coordinates: bool = Field(
+        False, description="add two channels: column / width and row / height of each pixel"
+    )
+    frames: int = Field(1, ge=1, le=64, description="how many frames it sees; the first frame fills in")
+    stride: int = Field(1, ge=1, le=1000, description="processed frames from one of these to the next")
+    newest_first: bool = Field(False, description="order of these frames")
+    join: Literal["channels", "time"] = Field(
+        "channels", description="frames lie behind each other as channels, or along an axis of their own"
+    )
+    layout: Literal["chw", "hwc", "pixels"] = Field(
+        "chw",
+        description="order of the axes; pixels: one row of channels for each pixel (or marker), as a network "
+        "for single pixels takes them",
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> InputParams:
+        if self.frames > 1 and self.layout == "pixels":
+            raise ValueError("several frames need the layout chw or hwc")
+        if self.join == "time" and self.frames == 1:
+            raise ValueError("join: time needs frames of 2 or more")
+        if self.layout == "hwc" and self.join == "channels" and self.frames > 1:
+            raise ValueError("with the layout hwc, several frames need join: time")
+        if self.background != "none" and KNOWN.get(self.port, (None, 3))[1] != 3:
+            raise ValueError(f"background: {self.port} is not a picture, so that it has none")
+        return self
+
+    @property
+    def channels(self) -> Side:
+        """Channels of one frame; None where the port does not tell before it comes."""
+        known = KNOWN.get(self.port)
+        if known is None:
+            return None
+        channels = 1 if self.colour == "grey" and known[1] == 3 else known[1]
+        return channels * (2 if self.background == "concat" else 1) + 2 * self.coordinates
+
+    def shape(self, channels: Side, height: Side, width: Side) -> tuple[Side, ...]:
+        """Axes of what the network gets, without the batch."""
+        if self.layout == "pixels":
+            return (None if height is None or width is None else height * width, channels)
+        if self.join == "channels":
+            channels = None if channels is None else channels * self.frames
+        axes = (channels, height, width) if self.layout == "chw" else (height, width, channels)
+        return (self.frames, *axes) if self.join == "time" else axes
+
+
+class OutputParams(StageParams):
+    """One output. What it is follows from the name of its port: `force`, `gradients`, `contact_mask` and
+    `features` are known to other stages and to the message, all others are arrays."""
+
+    output: str | None = Field(
+        None, description="its name in the file; null: that of the port, or the only one"
+    )
+    scale: float = Field(1.0, description="factor on the values, for instance -1 or 0.001")
+    unit: str = Field("1", description="of the values; for features and arrays")
+    shape: tuple[int | Name, ...] = Field(
+        ("N",), description="of an array, without the batch: a number, or a name for any length"
+    )
+    threshold: float = Field(0.5, description="for contact_mask: what is larger is contact")
+
+
+class Network(Stage):
+    """Runs an ONNX file of your own on values of other stages, on the CPU or by another provider.
+
+    The file is read as data: no library with operators of its own is loaded, nor weights from other files.
+    """
+
+    memory = "pure"
+
+    class Params(StageParams):
+        """The file, and what goes in and comes out."""
+
+        file: str = Field(min_length=1, description="the ONNX file; relative to the pipeline file")
+        inputs: dict[str, InputParams] = Field(min_length=1, description="name in the file -> what it gets")
+        outputs: dict[Name, OutputParams] = Field(min_length=1, description="name of a port -> which output")
+        provider: str = Field(
+            "CPUExecutionProvider", description="of onnxruntime, such as CUDAExecutionProvider"
+        )
+        threads: int = Field(1, ge=1, le=1024, description="threads of the network's own, on the CPU")
+
+        @field_validator("outputs")
+        @classmethod
+        def _no_port_twice(cls, outputs: dict[str, OutputParams]) -> dict[str, OutputParams]:
+            if "contact_mask" in outputs and "touching" in outputs:
+                raise ValueError("touching comes with contact_mask; give this output another name")
+            return outputs
+
+    params: Params
+
+    @classmethod
+    def declare(cls, params: Params) -> Declared:
+        """Its inputs are the ports that `inputs` names, its outputs those of `outputs`."""
+        names = [value.port for value in params.inputs.values()]
+        if any(value.background != "none" for value in params.inputs.values()):
+            names.append("untouched")
+        inputs = [Port(name, KNOWN[name][0] if name in KNOWN else Any) for name in dict.fromkeys(names)]
+        stateful = any(value.frames > 1 for value in params.inputs.values())
+        outputs = [port for name, value in params.outputs.items() for port in _ports(name, value)]
+        return Declared(inputs, outputs, "stateful" if stateful else "pure")
+
+    def __init__(self, params: Params, directory: Path = Path()) -> None:
+        """Prepare; nothing is read yet. directory : where a relative path is looked for."""
+        super().__init__(params)
+        found = directory / expanded(params.file)
+        self._file = found if found.exists() else expanded(params.file)
+        self.description = str(self._file)
+        self._session: InferenceSession | None = None
+        self._feeds = {name: _Feed(value) for name, value in params.inputs.items()}
+        self._names = [port.name for port in self.declare(params).inputs]
+        self._wanted: list[str] = []
+
+    def open(self) -> None:
+        """Read the file, and compare its inputs and outputs with the parameters.
+
+        Raises StageError if onnxruntime or the provider is missing, or the file does not fit.
+        """
+        if (problem := missing("networks", "onnx", ["onnxruntime"])) is not None:
+            raise StageError(problem)
+        import onnxruntime
+
+        p = self.params
+        providers = onnxruntime.get_available_providers()
+        if p.provider not in providers:
+            raise StageError(f"there is no provider {p.provider} here; there are {', '.join(providers)}")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = p.threads, 1
+        options.log_severity_level = 3
+        try:
+            # As bytes, so that the file cannot name others for its weights.
+            content = self._file.read_bytes()
+            session = onnxruntime.InferenceSession(content, options, providers=[p.provider])
+        except OSError as error:
+            raise StageError(f"cannot read the network {self._file}: {error.strerror}") from None
+        except Exception as error:
+            raise StageError(f"{self._file} cannot be used as an ONNX file: {error}") from error
+        self._check(session)
+        self._session = session
+
+    def _check(self, session: InferenceSession) -> None:
+        inputs = {value.name: value for value in session.get_inputs()}
+        if inputs.keys() != self._feeds.keys():
+            raise StageError(
+                f"{self._file}: its inputs are {', '.join(inputs)}, but inputs: has {', '.join(self._feeds)}"
+            )
+        for name, feed in self._feeds.items():
+            feed.fit(f"{self._file}: input {name}", inputs[name].shape, inputs[name].type)
+        outputs = {value.name: value for value in session.get_outputs()}
+        for port, value in self.params.outputs.items():
+            only = next(iter(outputs)) if len(outputs) == 1 else port
+            name = value.output or (port if port in outputs else only)
+            if name not in outputs:
+                raise StageError(
+                    f"{self._file}: there is no output {name}; there are {', '.join(outputs)}: name one by "
+                    f"outputs.{port}.output"
+                )
+            wanted = _wanted_shapes(port, value, self._first.params)
+            if not any(_agree(_sides(outputs[name].shape), shape) for shape in wanted):
+                raise StageError(
+                    f"{self._file}: output {name} has the shape {_shown(outputs[name].shape)}, but the port "
+                    f"{port} needs {' or '.join(map(_shown, wanted))}"
+                )
+            self._wanted.append(name)
+
+    @property
+    def _first(self) -> _Feed:
+        """The input whose picture outputs of a picture's size belong to."""
+        return next(iter(self._feeds.values()))
+
+    def close(self) -> None:
+        """Free the network."""
+        self._session = None
+
+    def reset(self) -> None:
+        """Forget earlier frames."""
+        for feed in self._feeds.values():
+            feed.past.clear()
+
+    def process(self, *inputs: Any) -> tuple[Any, ...]:
+        """Run the network on the values of the ports that `declare` names, in this order."""
+        assert self._session is not None, "open() was not called"
+        values = dict(zip(self._names, inputs, strict=True))
+        background = values.get("untouched")
+        feeds = {name: feed(values[feed.params.port], background) for name, feed in self._feeds.items()}
+        found = self._session.run(list(dict.fromkeys(self._wanted)), feeds)
+        by_name = dict(zip(dict.fromkeys(self._wanted), found, strict=True))
+        results: list[Any] = []
+        for name, (port, value) in zip(self._wanted, self.params.outputs.items(), strict=True):
+            array = np.asarray(by_name[name], np.float32) * np.float32(value.scale)
+            if not np.isfinite(array).all():
+                raise StageError(f"{self._file}: output {name} is not finite in this frame")
+            results += self._result(port, value, array)
+        return tuple(results)
+
+    def _result(self, port: str, params: OutputParams, array: Floats) -> list[Any]:
+        """The values of the ports that an output becomes."""
+        if port == "force":
+            return [_force(array.ravel().tolist())]
+        if port == "features":
+            return [Features(array.ravel(), params.unit)]
+        if port == "gradients":
+            return [self._first.picture(array, 2)]
+        if port == "contact_mask":
+            mask = np.where(self._first.picture(array, 1)[..., 0] > params.threshold, 255, 0).astype(np.uint8)
+            return [mask, bool(mask.any())]
+        return [array[0] if array.ndim == len(params.shape) + 1 else array]
+
+
+class _Geometry(NamedTuple):
+    """Where a picture lies in what the network sees: its own size, and the part that it fills. px."""
+
+    size: tuple[int, int]
+    inner: tuple[int, int]
+    corner: tuple[int, int]
+    outer: tuple[int, int]
+
+
+class _Feed:
+    """Makes what one input of the network gets. Buffers are used again in the next frame."""
+
+    def __init__(self, params: InputParams) -> None:
+        self.params = params
+        self.past: deque[Floats] = deque(maxlen=(params.frames - 1) * params.stride + 1)
+        self._where = ""
+        self._sides: tuple[Side, ...] = ()
+        self._size = params.size
+        self._dtype: type[Any] = np.float32
+        self._geometry: _Geometry | None = None
+        self._background: tuple[Any, list[NDArray[Any]]] | None = None
+        self._tensor: Floats | None = None
+        self._factors: list[float] = []
+        self._offsets: list[float] = []
+
+    def fit(self, where: str, shape: Sequence[Any], dtype: str) -> None:
+        """Compare with the input of the file. Raises StageError with both shapes if they do not fit."""
+        if dtype not in DTYPES:
+            raise StageError(f"{where}: required one of {', '.join(DTYPES)}, got {dtype}")
+        self._where, self._sides, self._dtype = where, _sides(shape), DTYPES[dtype]
+        p = self.params
+        axes = p.shape(None, None, None)
+        if p.size is None and p.layout != "pixels" and len(self._sides) - len(axes) in (0, 1):
+            height, width = self._sides[-2:] if p.layout == "chw" else self._sides[-3:-1]
+            self._size = None if height is None or width is None else (width, height)
+        width, height = self._size or (None, None)
+        self._compare(p.shape(p.channels, height, width))
+
+    def _compare(self, shape: tuple[Side, ...]) -> None:
+        if not _agree(self._sides, shape):
+            raise StageError(
+                f"{self._where} takes {_shown(self._sides)}, but the settings give {_shown(shape)} "
+                "(without a batch); see port, size, frames and layout of this input"
+            )
+
+    def __call__(self, value: Any, background: Untouched | None) -> NDArray[Any]:
+        """What the network gets of this frame."""
+        array = _array(value)
+        height, width = array.shape[:2]
+        if self._geometry is None or self._geometry.size != (width, height):
+            self._geometry, self._background = self._placed(width, height), None
+            self._tensor = None
+            self.past.clear()
+        self.past.append(self._planes(array, background))
+        tensor = self._joined()
+        if self._dtype is np.float32:
+            return tensor
+        limits = (0, 255) if self._dtype is np.uint8 else (None, None)
+        return np.clip(np.rint(tensor) if limits[1] else tensor, *limits).astype(self._dtype)
+
+    def _placed(self, width: int, height: int) -> _Geometry:
+        outer = self._size or (width, height)
+        inner = outer
+        if self.params.pad:
+            ratio = min(outer[0] / width, outer[1] / height)
+            inner = max(1, round(width * ratio)), max(1, round(height * ratio))
+        corner = (outer[0] - inner[0]) // 2, (outer[1] - inner[1]) // 2
+        return _Geometry((width, height), inner, corner, outer)
+
+    def _channels(self, array: NDArray[Any]) -> list[NDArray[Any]]:
+        """The channels of a picture in the network's size and order, each (h, w)."""
+        p, geometry = self.params, self._geometry
+        assert geometry is not None
+        if geometry.inner != geometry.size:
+            method = cv2.INTER_AREA if p.interpolation == "area" else cv2.INTER_LINEAR
+            array = cv2.resize(array, geometry.inner, interpolation=method)
+        if geometry.inner != geometry.outer:
+            (left, top), (width, height) = geometry.corner, geometry.inner
+            right, bottom = geometry.outer[0] - left - width, geometry.outer[1] - top - height
+            array = cv2.copyMakeBorder(array, top, bottom, left, right, cv2.BORDER_CONSTANT)
+        if array.ndim == 3 and array.shape[2] == 3 and p.colour == "grey":
+            array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY)
+        channels = list(cv2.split(array))
+        return channels[::-1] if p.colour == "rgb" and len(channels) == 3 else channels
+
+    def _planes(self, array: NDArray[Any], background: Untouched | None) -> Floats:
+        """(C, h, w) float32 of one frame, in a buffer of an earlier one that is no longer needed."""
+        p = self.params
+        channels = self._channels(array)
+        behind: list[NDArray[Any]] = []
+        if background is not None and p.background != "none":
+            if self._background is None or self._background[0] is not background:
+                self._background = background, self._channels(background)
+            behind = self._background[1]
+        both = [*channels, *behind] if p.background == "concat" else channels
+        if len(self._factors) != len(both):
+            self._factors, self._offsets = self._affine(len(both))
+        factors, offsets = self._factors, self._offsets
+        planes = self._buffer(len(both), channels[0].shape[:2])
+        for index, channel in enumerate(both):
+            factor, offset = factors[index], offsets[index]
+            subtracts = p.background in ("subtract", "subtract_half")
+            other, weight = (behind[index], -factor) if subtracts else (channel, 0.0)
+            cv2.addWeighted(channel, factor, other, weight, offset, planes[index], cv2.CV_32F)
+            if p.background == "subtract_half":
+                # 0 and 1 before mean and std are taken off.
+                low = offset - 0.5 / self._std(index)
+                np.clip(planes[index], low, low + 1 / self._std(index), out=planes[index])
+        return planes
+
+    def _std(self, index: int) -> float:
+        return self.params.std[min(index, len(self.params.std) - 1)]
+
+    def _affine(self, count: int) -> tuple[list[float], list[float]]:
+        """Factor and offset of each channel: scale, 0.5, mean and std in one."""
+        p = self.params
+        for name, numbers in (("mean", p.mean), ("std", p.std)):
+            if len(numbers) not in (1, count):
+                raise StageError(f"{self._where}: {name} has {len(numbers)} numbers for {count} channels")
+        half = 0.5 if p.background == "subtract_half" else 0.0
+        means = [p.mean[min(index, len(p.mean) - 1)] for index in range(count)]
+        factors = [p.scale / self._std(index) for index in range(count)]
+        return factors, [(half - mean) / self._std(index) for index, mean in enumerate(means)]
+
+    def _buffer(self, count: int, size: tuple[int, ...]) -> Floats:
+        """Memory for the planes of a frame, those of the coordinates filled in."""
+        oldest = self.past[0] if len(self.past) == self.past.maxlen else None
+        if oldest is not None:
+            return oldest
+        height, width = size
+        planes = np.empty((count + 2 * self.params.coordinates, height, width), np.float32)
+        if self.params.coordinates:
+            planes[-2] = np.arange(width, dtype=np.float32) / width
+            planes[-1] = np.arange(height, dtype=np.float32)[:, None] / height
+        return planes
+
+    def _joined(self) -> Floats:
+        """The frames in the layout of the network, with a batch of one where it has one."""
+        p = self.params
+        places = [max(0, len(self.past) - 1 - back * p.stride) for back in range(p.frames)]
+        planes = [self.past[place] for place in (places if p.newest_first else places[::-1])]
+        channels, height, width = planes[0].shape
+        shape = p.shape(channels, height, width)
+        self._compare(shape)
+        if p.layout == "chw" and p.frames == 1:
+            tensor = planes[0]
+        else:
+            if self._tensor is None:
+                self._tensor = np.empty([side or 0 for side in shape], np.float32)
+            tensor = self._tensor
+            for part, plane in zip(tensor.reshape(p.frames, -1), planes, strict=True):
+                if p.layout == "chw":
+                    part[:] = plane.ravel()
+                else:
+                    cv2.merge(list(plane), part.reshape(height, width, channels))
+        return tensor[None] if len(self._sides) > len(shape) else tensor
+
+    def picture(self, array: Floats, channels: int) -> Floats:
+        """(H, W, channels) float32: an output of the size of the network's picture, at that of the port."""
+        geometry = self._geometry
+        assert geometry is not None
+        width, height = geometry.outer
+        shape = (channels, height, width) if self.params.layout == "chw" else (height, width, channels)
+        if array.size != channels * height * width:
+            raise StageError(f"required an output of the size of the input, {shape}, got {array.shape}")
+        array = array.reshape(shape)
+        if self.params.layout == "chw":
+            array = np.moveaxis(array, 0, -1)
+        (left, top), (width, height) = geometry.corner, geometry.inner
+        inner = np.ascontiguousarray(array[top : top + height, left : left + width])
+        if geometry.inner != geometry.size:
+            inner = np.asarray(cv2.resize(inner, geometry.size, interpolation=cv2.INTER_LINEAR), np.float32)
+        return inner.reshape(*geometry.size[::-1], channels)
+
+
+def _ports(name: str, params: OutputParams) -> list[Port]:
+    """The ports that an output becomes."""
+    if name == "contact_mask":
+        return [Port(name, ContactMask), Port("touching", Touching)]
+    known: Mapping[str, Any] = {"force": Force, "features": Features, "gradients": Gradients}
+    array = Annotated[NDArray[np.float32], ArrayPort(name, params.shape, "float32", params.unit)]
+    return [Port(name, known.get(name, array))]
+
+
+def _array(value: Any) -> NDArray[Any]:
+    """The value of a port as (H, W) or (H, W, C), uint8 or float32; markers as (N, 1, 4)."""
+    if isinstance(value, Depth):
+        return value.heights
+    if isinstance(value, Markers):
+        value = np.hstack([value.origin, value.displacement])[:, None]
+    elif isinstance(value, DisplacementField):
+        value = value.displacement
+    if not isinstance(value, np.ndarray) or value.ndim not in (2, 3):
+        raise StageError(f"required an array (H, W) or (H, W, C), got {describe_type(type(value))}")
+    if value.dtype == np.uint8:
+        return value
+    return np.ascontiguousarray(value, np.float32)
+
+
+def _force(numbers: Sequence[float]) -> Force:
+    """A force of (z) or (x, y, z), N. A network tells neither its errors nor what it was trained on."""
+    if len(numbers) not in (1, 3):
+        raise StageError(f"force: required 1 number (z) or 3 (x, y, z), got {len(numbers)}")
+    x, y = numbers[:-1] or (None, None)
+    unknown = None if x is None else np.nan
+    return Force((x, y, max(numbers[-1], 0.0)), (unknown, unknown, np.nan), False)
+
+
+def _wanted_shapes(port: str, params: OutputParams, first: InputParams) -> list[tuple[Side, ...]]:
+    """Shapes that an output may have, without the batch."""
+    if port == "force":
+        return [(1,), (3,)]
+    if port == "features":
+        return [(None,)]
+    if port in ("gradients", "contact_mask"):
+        channels = 2 if port == "gradients" else 1
+        if first.layout == "pixels":
+            return [(None, channels)]
+        return [(channels, None, None) if first.layout == "chw" else (None, None, channels)]
+    return [tuple(side if isinstance(side, int) else None for side in params.shape)]
+
+
+def _sides(shape: Sequence[Any]) -> tuple[Side, ...]:
+    """A shape of onnxruntime; axes of any length have names there, or None."""
+    return tuple(side if isinstance(side, int) else None for side in shape)
+
+
+def _agree(network: tuple[Side, ...], ours: tuple[Side, ...]) -> bool:
+    """Whether shapes fit, the network's with or without a batch of one in front."""
+    if len(network) == len(ours) + 1 and network[0] in (1, None):
+        network = network[1:]
+    pairs = zip(network, ours, strict=False)
+    return len(network) == len(ours) and all(a == b or a is None or b is None for a, b in pairs)
+
+
+def _shown(shape: Sequence[Any]) -> str:
+    return f"({', '.join('any' if side is None else str(side) for side in shape)})"
