@@ -13,6 +13,7 @@ import orjson
 from tactflow.cli.options import add_json
 from tactflow.cli.terminal import say, show
 from tactflow.sources.cameras import CameraInfo, list_cameras
+from tactflow.sources.usb import UsbBus, usb_buses
 
 NO_CAMERA = """no camera is plugged in (/dev/video* is empty)
   plug it in and look at the last lines of: sudo dmesg
@@ -26,7 +27,7 @@ NO_NAMES = """on this system cameras have no names, only numbers in the order of
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `cameras`."""
     add_json(parser, "one JSON object per camera")
-    parser.set_defaults(dev=Path("/dev"))
+    parser.set_defaults(dev=Path("/dev"), sys=Path("/sys"))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,11 +38,15 @@ def run(args: argparse.Namespace) -> int:
     cameras = list_cameras(args.dev)
     if not cameras:
         say(NO_CAMERA)
+    buses = usb_buses([camera.device for camera in cameras], args.sys)
     for camera in cameras:
         if args.json:
-            print(orjson.dumps(asdict(camera)).decode())
+            usb = next((c for bus in buses for c in bus.cameras if c.device == camera.device), None)
+            print(orjson.dumps(asdict(camera) | {"usb": usb}).decode())
         else:
             show(describe(camera))
+    for bus in () if args.json else buses:
+        show(describe_bus(bus))
     return 0
 
 
@@ -59,3 +64,16 @@ def describe(camera: CameraInfo) -> Iterator[str]:
     for form, sizes in abilities.formats.items() if abilities else ():
         sizes_text = ", ".join(f"{width} x {height}" for width, height in sizes)
         yield f"    {form}: {sizes_text or 'any size within a range'}"
+
+
+def describe_bus(bus: UsbBus, *, advise: bool = True) -> Iterator[str]:
+    """A root hub in words: what each camera on it reserves, and what to do where that does not fit."""
+    speed = "unknown speed" if bus.speed is None else f"{bus.speed:.0f} Mbit/s, {bus.budget:.0f} to reserve"
+    yield f"USB hub {bus.root}: {speed}"
+    for camera in bus.cameras:
+        may, now = camera.reserves(), camera.reserved
+        what = "gets what is left" if camera.bulk else "reserves an unknown part"
+        if may:
+            what = f"reserves {may:.0f} Mbit/s now" if now else f"may reserve {may:.0f} Mbit/s"
+        yield f"    {camera.device} ({camera.name}, port {camera.port}, {camera.speed:.0f} Mbit/s) {what}"
+    yield from (f"    {line}" for line in (bus.advice() if advise else ()))

@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import textwrap
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactflow.cli.cameras import describe_bus
 from tactflow.cli.options import add_json, seconds
-from tactflow.cli.terminal import progress_bar, show, show_json
-from tactflow.engine.errors import StageError
+from tactflow.cli.terminal import progress_bar, show, show_json, table
+from tactflow.config.load import load_pipeline, sensor_names
+from tactflow.config.shipped import find_pipeline
+from tactflow.engine.errors import ConfigError, StageError
 from tactflow.sources import KINDS
 from tactflow.system.signals import ending_handled, interrupt
 
@@ -29,7 +33,15 @@ SIGNS = {"good": "ok", "warning": "WARN", "fault": "FAULT", "unknown": "?"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `doctor`."""
-    parser.add_argument("--source", required=True, metavar="SRC", help=f"of the sensor: {KINDS}")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--source", metavar="SRC", help=f"check the pictures of one sensor: {KINDS}")
+    what.add_argument(
+        "pipeline",
+        nargs="?",
+        metavar="PIPELINE",
+        help="read all sensors of a pipeline file together: the frame rates that it asks for, that the "
+        "drivers promise and that arrive, and what the USB has room for",
+    )
     parser.add_argument(
         "--seconds",
         type=seconds,
@@ -50,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
     SourceError
         If the source delivers nothing.
     """
+    if args.source is None:
+        return _run_together(args)
     from tactflow.doctor import examine, observe, worst
 
     # The first signal ends only the look at the source.
@@ -72,6 +86,38 @@ def run(args: argparse.Namespace) -> int:
     else:
         show([title, *(line for finding in findings for line in _lines(finding)), summary])
     return StageError.exit_code if verdict == "fault" else 0
+
+
+def _run_together(args: argparse.Namespace) -> int:
+    """Print the rates of all sensors of a pipeline; returns 0, or 3 if one is far too slow."""
+    from tactflow.doctor import Sensor, measure_together
+
+    if args.html is not None:
+        raise ConfigError("--html is for the pictures of one sensor: give --source")
+    file = find_pipeline(args.pipeline)
+    names: list[str | None] = [*sensor_names(file)] or [None]
+    loaded = [load_pipeline(file, sensor=name) for name in names]
+    unfit = [p.source.component.name for p in loaded if p.source.component.name != "capture"]
+    if unfit:
+        raise ConfigError(f"{file}: doctor can only read sources of the stage capture, not of {unfit[0]}")
+    sensors = [Sensor.of(pipeline.sensor, pipeline.source.params) for pipeline in loaded]
+    with progress_bar(f"{len(sensors)} sensors together"):
+        together = measure_together(sensors, args.seconds)
+    if args.json:
+        show_json(asdict(together))
+    else:
+        rows = [("SENSOR", "ASKED", "PROMISED", "GOT", "SOURCE")]
+        rows += [
+            (r.sensor, _rate(r.asked), _rate(r.promised), _rate(r.got), r.description or "cannot be opened")
+            for r in together.rates
+        ]
+        show([*table(rows), *(line for bus in together.buses for line in describe_bus(bus, advise=False))])
+        show([f"  {line}" for line in together.advice] or ["every sensor delivers what was asked of it"])
+    return StageError.exit_code if together.fault else 0
+
+
+def _rate(rate: float | None) -> str:
+    return "-" if rate is None else f"{rate:.3g}/s"
 
 
 def _lines(finding: Finding) -> Iterator[str]:

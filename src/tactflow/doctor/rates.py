@@ -1,0 +1,160 @@
+"""The frame rates of all sensors of a pipeline while they run together, and what holds them down."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, Final
+
+from tactflow.engine.errors import SourceError
+from tactflow.sources import CameraRequest, open_source
+from tactflow.sources.usb import Mode, UsbBus, usb_buses
+
+LOW: Final = 0.9
+"""Part of the rate asked for, or else promised, below which a sensor is too slow."""
+VERY_LOW: Final = 0.7
+"""The same below which results are missed: the limit of the check `rate`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A sensor to try. source : as `open_source` takes it. request : what to ask a camera for."""
+
+    name: str
+    source: str
+    request: CameraRequest
+
+    @classmethod
+    def of(cls, name: str, params: Any) -> Sensor:
+        """The sensor of a pipeline. params : of its stage capture."""
+        return cls(name, params.source, CameraRequest(params.width, params.height, params.fps, params.format))
+
+
+@dataclass(slots=True)
+class Rate:
+    """How fast one sensor was beside the others.
+
+    asked : by the pipeline; promised : by the driver; got : frames per second; None where there is none.
+    description : what was opened. problem : why it could not be read, or "". size : (width, height), px.
+    live : a camera or stream; a recording is read as fast as it can be.
+    """
+
+    sensor: str
+    asked: float | None
+    promised: float | None = None
+    got: float | None = None
+    description: str = ""
+    problem: str = ""
+    size: tuple[int, int] | None = None
+    live: bool = False
+
+    @property
+    def share(self) -> float:
+        """Got over asked, or else promised; 1 of a recording and where neither is known, 0 without frames."""
+        if self.got is None:
+            return 0.0
+        wanted = self.asked or self.promised
+        return self.got / wanted if self.live and wanted else 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Together:
+    """All sensors at once. rates : of each. buses : as they were while all ran. advice : sentences."""
+
+    rates: Sequence[Rate]
+    buses: Sequence[UsbBus]
+    advice: Sequence[str]
+
+    @property
+    def fault(self) -> bool:
+        """Whether a sensor is far too slow, or cannot be read."""
+        return any(rate.share < VERY_LOW for rate in self.rates)
+
+
+def measure_together(sensors: Sequence[Sensor], seconds: float) -> Together:
+    """Read all sensors at the same time, each in a thread, and say what holds slow ones down.
+
+    seconds : from when all are open, or until all have ended.
+    """
+    rates = [Rate(sensor.name, sensor.request.fps) for sensor in sensors]
+    ready, stop = threading.Barrier(len(sensors) + 1), threading.Event()
+    with ThreadPoolExecutor(len(sensors)) as pool:
+        pairs = zip(sensors, rates, strict=True)
+        readers = [pool.submit(_count, sensor, rate, ready, stop) for sensor, rate in pairs]
+        try:
+            ready.wait()
+            wait(readers, seconds)
+            buses = usb_buses([_device(sensor.source) for sensor in sensors])
+        finally:
+            stop.set()
+    return Together(rates, buses, _advice(sensors, rates, buses))
+
+
+def _device(source: str) -> str:
+    """The device file of a camera; the source itself for others."""
+    return os.path.realpath(f"/dev/video{source}" if source.isdecimal() else source)
+
+
+def _count(sensor: Sensor, rate: Rate, ready: threading.Barrier, stop: threading.Event) -> None:
+    """Read frames until told to stop, and note how many came a second."""
+    try:
+        reader = open_source(sensor.source, camera=sensor.request)
+    except SourceError as error:
+        rate.problem = str(error)
+        ready.wait()
+        return
+    with closing(reader):
+        rate.promised, rate.description, rate.live = reader.fps, reader.description, reader.live
+        times: list[float] = []
+        try:
+            # The first frame takes as long as the camera needs to start; all wait for it.
+            reader.read()
+        except SourceError as error:
+            rate.problem = str(error)
+        ready.wait()
+        try:
+            while not (rate.problem or stop.is_set()) and reader.read() is not None:
+                times.append(time.monotonic())
+        except SourceError as error:
+            rate.problem = str(error)
+        rate.size = reader.size
+        rate.got = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
+
+
+def _advice(sensors: Sequence[Sensor], rates: Sequence[Rate], buses: Sequence[UsbBus]) -> list[str]:
+    """What to do: about hubs that are full, and about slow sensors whose hub is not."""
+    devices = {sensor.name: _device(sensor.source) for sensor in sensors}
+    names = {device: name for name, device in devices.items()}
+    modes: dict[str, Mode] = {}
+    for sensor, rate in zip(sensors, rates, strict=True):
+        fps = rate.asked or rate.promised
+        if rate.size is not None and fps is not None:
+            form = rate.description.rpartition(", ")[2]
+            modes[devices[sensor.name]] = Mode(*rate.size, fps, form)
+    lines, crowded = [], set[str]()
+    for bus in buses:
+        said = list(bus.advice(modes, names))
+        lines += said
+        crowded |= {camera.device for camera in bus.cameras} if said else set()
+    for rate in rates:
+        if rate.problem:
+            lines.append(f"{rate.sensor}: {rate.problem}")
+        elif rate.share < LOW and devices[rate.sensor] not in crowded:
+            lines.append(f"{rate.sensor} {_slow(rate)}")
+    return lines
+
+
+def _slow(rate: Rate) -> str:
+    wanted = rate.asked or rate.promised
+    text = f"gives {rate.got or 0:.1f} of {wanted:g} frames/s"
+    if rate.asked and rate.promised and rate.promised < LOW * rate.asked:
+        return f"{text}, as its driver promises {rate.promised:g}: ask for fewer pixels or format MJPG"
+    return (
+        f"{text}, and no USB hub is too full: give it a fixed short exposure with more light, or the "
+        "processor less to do"
+    )

@@ -1,0 +1,116 @@
+"""The rates of several sensors at once, from cameras that are made up."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactflow.cli.main import main
+from tactflow.doctor import Sensor, measure_together, rates
+from tactflow.engine.errors import SourceError
+from tactflow.sources import CameraRequest, FrameReader
+from tactflow.sources.usb import UsbBus, UsbCamera, read_alternates
+from tests.sources.test_usb import descriptors
+
+ALTERNATES = tuple(read_alternates(descriptors(), 480.0))
+
+
+class Clock:
+    """Stands in for `time`: each frame of a slow camera takes twice as long as asked for."""
+
+    def __init__(self, step: float) -> None:
+        self.now, self.step = 0.0, step
+
+    def monotonic(self) -> float:
+        self.now += self.step
+        return self.now
+
+
+class Camera(FrameReader):
+    """Ten frames, then it ends."""
+
+    live = True
+
+    def __init__(self, spec: str, request: CameraRequest) -> None:
+        super().__init__(spec)
+        self.fps, self.left, self.size = 30.0, 10, (640, 480)
+        self.description = f"camera {spec}, 640 x 480 at 30 fps, {request.format or 'YUYV'}"
+
+    def read(self) -> tuple[np.ndarray, float] | None:  # type: ignore[type-arg]
+        self.left -= 1
+        return (np.zeros((480, 640, 3), np.uint8), 0.0) if self.left >= 0 else None
+
+
+@pytest.fixture(autouse=True)
+def cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras under any number; `gone` cannot be opened."""
+
+    def opened(spec: str, *, camera: CameraRequest) -> FrameReader:
+        if spec == "gone":
+            raise SourceError("gone: cannot be opened; no such camera")
+        return Camera(spec, camera)
+
+    monkeypatch.setattr(rates, "open_source", opened)
+    monkeypatch.setattr(rates, "usb_buses", lambda _: [])
+
+
+def camera(device: str) -> UsbCamera:
+    return UsbCamera(device, "Gel", "usb1", "1-1", 480.0, ALTERNATES)
+
+
+def test_a_sensor_that_gives_what_was_asked_needs_no_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rates, "time", Clock(1 / 30))
+    together = measure_together([Sensor("left", "0", CameraRequest(fps=30))], 30.0)
+    (rate,) = together.rates
+    assert (rate.asked, rate.promised, rate.got) == (30, 30, pytest.approx(30))
+    assert not together.advice
+    assert not together.fault
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (60.0, "gives 15.0 of 60 frames/s, as its driver promises 30"),
+        (None, "gives 15.0 of 30 frames/s, and"),
+    ],
+)
+def test_a_slow_sensor_is_told_with_what_holds_it_down(
+    monkeypatch: pytest.MonkeyPatch, asked: float | None, words: str
+) -> None:
+    monkeypatch.setattr(rates, "time", Clock(1 / 15))
+    together = measure_together([Sensor("left", "0", CameraRequest(fps=asked))], 30.0)
+    assert together.rates[0].got == pytest.approx(15.0)
+    assert together.fault
+    assert together.advice[0].startswith(f"left {words}")
+
+
+def test_a_crowded_hub_is_named_in_place_of_each_slow_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = UsbBus("usb1", 480.0, (camera("/dev/video0"), camera("/dev/video2")))
+    monkeypatch.setattr(rates, "usb_buses", lambda _: [bus])
+    monkeypatch.setattr(rates, "time", Clock(1 / 15))
+    sensors = [Sensor("left", "0", CameraRequest()), Sensor("right", "2", CameraRequest(format="YUYV"))]
+    (said,) = measure_together(sensors, 30.0).advice
+    assert said.startswith("left and right share a 480 Mbit/s hub (usb1) and reserve 393 Mbit/s")
+    assert said.endswith("move one to another root hub, or ask for MJPG or fewer pixels")
+
+
+def test_the_command_prints_every_sensor_of_a_file_and_fails_for_one_that_is_gone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "two.yaml"
+    file.write_text(
+        "stages: {capture: {fps: 30}, preprocess: {}}\nsinks: {}\n"
+        "sensors:\n  left: {stages: {capture: {source: '0'}}}\n  right: {stages: {capture: {source: gone}}}\n"
+    )
+    assert main(["doctor", str(file), "--seconds", "30"]) == 3
+    out = capsys.readouterr().out
+    assert "SENSOR" in out
+    assert "left" in out
+    assert "right: gone: cannot be opened; no such camera" in out
+    assert main(["doctor", str(file), "--seconds", "30", "--json"]) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert [rate["sensor"] for rate in found["rates"]] == ["left", "right"]
+    assert main(["doctor", str(file), "--html", str(tmp_path / "page.html")]) == 2

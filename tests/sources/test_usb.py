@@ -1,0 +1,144 @@
+"""What shares a USB root hub, in trees that are built as Linux's sysfs lays them out."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from tactflow.sources.usb import Mode, UsbBus, read_alternates, usb_buses
+
+YUYV = Mode(640, 480, 30, "YUYV")
+SMALL = Mode(320, 240, 30, "YUYV")
+MJPG = Mode(640, 480, 30, "MJPG")
+PACKETS = (0x0080, 0x0400, 0x0C00, 0x1400)
+"""wMaxPacketSize of the settings 1 to 4: 128 and 1024 bytes, twice and three times 1024."""
+
+
+def descriptors(*, bulk: bool = False, companion: bool = False) -> bytes:
+    """A camera with a control interface, and a streaming interface with an idle setting and four others."""
+    data = bytes([18, 1]) + bytes(16) + bytes([9, 4, 0, 0, 1, 14, 1, 0, 0, 7, 5, 0x83, 3, 16, 0, 6])
+    data += bytes([9, 4, 1, 0, 0, 14, 2, 0, 0, 5, 0x24, 1, 2, 3])
+    for number, size in enumerate(PACKETS, 1):
+        data += bytes([9, 4, 1, number, 1, 14, 2, 0, 0])
+        data += struct.pack("<BBBBHB", 7, 5, 0x81, 2 if bulk else 5, size, 1)
+        data += struct.pack("<BBBBH", 6, 0x30, 15, 0, 16 * 1024) if companion else b""
+    return data
+
+
+def add_device(sys: Path, root: str, port: str, product: str, speed: str, interfaces: dict[str, str]) -> Path:
+    """A device below a root hub. interfaces : number -> class and subclass."""
+    hub = sys / "devices/pci0000:00/0000:00:14.0" / root
+    folder = hub / port
+    links = sys / "bus/usb/devices"
+    links.mkdir(parents=True, exist_ok=True)
+    for number, kind in interfaces.items():
+        interface = folder / f"{port}:{number}"
+        interface.mkdir(parents=True)
+        (interface / "bInterfaceClass").write_text(f"{kind[:2]}\n")
+        (interface / "bInterfaceSubClass").write_text(f"{kind[2:]}\n")
+        (interface / "bAlternateSetting").write_text(" 0\n")
+        (links / interface.name).symlink_to(interface)
+    (folder / "speed").write_text(f"{speed}\n")
+    (folder / "product").write_text(f"{product}\n")
+    if not (links / root).exists():
+        (hub / "speed").write_text("5000\n" if speed == "5000" else "480\n")
+        (links / root).symlink_to(hub)
+    return folder
+
+
+def add_camera(
+    sys: Path, number: int, root: str, port: str, speed: str = "480", *, bulk: bool = False
+) -> Path:
+    folder = add_device(sys, root, port, f"Gel {number}", speed, {"1.0": "0e01", "1.1": "0e02"})
+    (folder / "descriptors").write_bytes(descriptors(bulk=bulk, companion=speed == "5000"))
+    for device in (2 * number, 2 * number + 1):
+        link = sys / f"class/video4linux/video{device}"
+        link.mkdir(parents=True)
+        (link / "device").symlink_to(folder / f"{port}:1.0")
+    return folder
+
+
+def buses(sys: Path) -> list[UsbBus]:
+    return usb_buses([f"/dev/video{number}" for number in range(8)], sys)
+
+
+def advice(sys: Path, mode: Mode | None = None) -> list[str]:
+    names = {"/dev/video0": "left", "/dev/video2": "right", "/dev/video4": "thumb"}
+    modes = {} if mode is None else dict.fromkeys(names, mode)
+    return [line for bus in buses(sys) for line in bus.advice(modes, names)]
+
+
+def test_two_small_cameras_fit(tmp_path: Path) -> None:
+    add_camera(tmp_path, 0, "usb1", "1-1")
+    add_camera(tmp_path, 1, "usb1", "1-2.3")
+    (bus,) = buses(tmp_path)
+    assert [camera.name for camera in bus.cameras] == ["Gel 0", "Gel 1"]
+    assert bus.budget == 384
+    # 320 x 240 x 2 bytes x 30 = 37 Mbit/s, which 1024 bytes 8000 times a second carry.
+    assert [camera.reserves(SMALL) for camera in bus.cameras] == [65.536] * 2
+    assert advice(tmp_path, SMALL) == []
+
+
+def test_two_cameras_that_may_reserve_all_do_not_fit_until_they_stream_with_less(tmp_path: Path) -> None:
+    folders = [add_camera(tmp_path, number, "usb1", f"1-{number + 1}") for number in range(2)]
+    (said,) = advice(tmp_path, MJPG)
+    assert said == (
+        "left and right share a 480 Mbit/s hub (usb1) and reserve 393 Mbit/s at most, of 384: move one to "
+        "another root hub, or ask for fewer pixels"
+    )
+    assert "or ask for MJPG or fewer pixels" in advice(tmp_path, YUYV)[0]
+    for folder in folders:
+        (folder / f"{folder.name}:1.1" / "bAlternateSetting").write_text(" 3\n")
+    (bus,) = buses(tmp_path)
+    assert [camera.reserved for camera in bus.cameras] == [131.072] * 2
+    assert advice(tmp_path, MJPG) == []
+
+
+def test_more_raw_pictures_than_a_port_carries_are_told(tmp_path: Path) -> None:
+    add_camera(tmp_path, 0, "usb1", "1-1")
+    (said,) = advice(tmp_path, Mode(1280, 960, 30, "YUYV"))
+    assert said.startswith("left asks for 590 Mbit/s of raw pictures on a port of 480: ask for MJPG")
+
+
+@pytest.mark.parametrize(
+    ("bulk", "words"), [(False, "gets what the cameras leave"), (True, "takes bandwidth from the cameras")]
+)
+def test_a_hub_shared_with_a_disc_is_told(tmp_path: Path, bulk: bool, words: str) -> None:
+    add_camera(tmp_path, 0, "usb1", "1-1", bulk=bulk)
+    add_device(tmp_path, "usb1", "1-4", "Portable SSD", "480", {"1.0": "0806"})
+    add_device(tmp_path, "usb3", "3-1", "Another disc", "480", {"1.0": "0806"})
+    (bus,) = buses(tmp_path)
+    assert bus.discs == ("Portable SSD",)
+    (said,) = advice(tmp_path, SMALL)
+    assert said.startswith("left shares a 480 Mbit/s hub (usb1) with the disc Portable SSD")
+    assert words in said
+
+
+def test_cameras_of_usb_3_fit_on_a_hub_of_their_own(tmp_path: Path) -> None:
+    for number in range(3):
+        add_camera(tmp_path, number, "usb2", f"2-{number + 1}", "5000")
+    (bus,) = buses(tmp_path)
+    assert bus.budget == 4500
+    # The companion's 16 KiB, 8000 times a second.
+    assert {round(camera.reserves() or 0) for camera in bus.cameras} == {1049}
+    assert advice(tmp_path, Mode(1280, 960, 30, "YUYV")) == []
+
+
+def test_where_sysfs_does_not_tell_it_is_said(tmp_path: Path) -> None:
+    folder = add_camera(tmp_path, 0, "usb1", "1-1")
+    (folder / "descriptors").write_bytes(descriptors()[:40])
+    assert advice(tmp_path) == ["left: what the USB reserves is not known; compare the frame rates"]
+    (folder / "descriptors").unlink()
+    assert "not known" in advice(tmp_path)[0]
+    (tmp_path / "class/video4linux/video6").mkdir()
+    assert usb_buses(["/dev/video6", "/dev/video9"], tmp_path) == []
+
+
+@pytest.mark.parametrize("cut", range(0, 120, 7))
+def test_damaged_descriptors_end_the_list(cut: int) -> None:
+    whole = list(read_alternates(descriptors(), 480.0))
+    assert [alternate.reserves for alternate in whole] == [8.192, 65.536, 131.072, 196.608]
+    assert list(read_alternates(descriptors()[:cut], 480.0)) in [whole[:count] for count in range(5)]
+    assert list(read_alternates(b"\0" * cut, 480.0)) == []
