@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--compare", type=Path, metavar="ONNX")
     parser.add_argument("--radius", type=float, default=9.47 / 2)
     parser.add_argument("--scale", type=float, default=0.0634)
-    parser.add_argument("--epochs", type=int, default=40)
+    parser.add_argument("--epochs", type=int, default=10)
     args = parser.parse_args()
     rest = cv2.imread(str(args.presses / "background.png"))
     if rest is None:

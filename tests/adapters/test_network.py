@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from threading import Event
@@ -268,6 +269,25 @@ def test_the_encoder_of_the_examples_gives_features_to_messages_and_tables(tmp_p
         message = results[number].to_dict()
         assert message["features"] == {"values": pytest.approx(features.values.tolist()), "unit": "1"}
         assert np.array_equal(Result.from_message(message)["features"].values, features.values)
+
+
+@pytest.mark.parametrize("name", ["encoder.yaml", "gradients.yaml"])
+def test_the_examples_are_right_before_their_files_are_there(name: str) -> None:
+    assert tactflow.check(EXAMPLES / name) == []
+    with pytest.raises(StageError, match="cannot read the network"):
+        tactflow.run(
+            EXAMPLES / name,
+            source="sim:press",
+            settings={"sinks": {"jsonl": {"path": os.devnull}}},
+            max_frames=1,
+        )
+
+
+def test_wrong_settings_are_one_mistake_with_its_place(tmp_path: Path) -> None:
+    file = copied(tmp_path, "encoder.yaml")
+    mistakes = tactflow.check(file, settings={"stages.network.inputs.frames.stride": 0})
+    assert len(mistakes) == 1
+    assert "stages.network.inputs.frames.stride" in mistakes[0]
 
 
 def test_a_force_and_a_contact_mask_reach_the_message(tmp_path: Path) -> None:

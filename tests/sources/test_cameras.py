@@ -84,7 +84,7 @@ def test_without_a_camera_the_command_says_what_to_try(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(command.sys, "platform", system)
-    assert command.run(argparse.Namespace(dev=tmp_path, json=False)) == 0
+    assert command.run(argparse.Namespace(dev=tmp_path, sys=tmp_path, json=False)) == 0
     out, err = capsys.readouterr()
     assert out == ""
     assert all(word in err for word in words)

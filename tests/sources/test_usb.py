@@ -103,7 +103,7 @@ def test_more_raw_pictures_than_a_port_carries_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("bulk", "words"), [(False, "gets what the cameras leave"), (True, "takes bandwidth from the cameras")]
+    ("bulk", "words"), [(False, "gets what the cameras leave"), (True, "takes bandwidth from cameras")]
 )
 def test_a_hub_shared_with_a_disc_is_told(tmp_path: Path, bulk: bool, words: str) -> None:
     add_camera(tmp_path, 0, "usb1", "1-1", bulk=bulk)
