@@ -58,12 +58,7 @@ def load_pipeline(
         for override in source_values:
             apply(document, override, source.keys)
     for draft in drafts:
-        draft.params = _params(draft, document)
-        if draft.component is not None and draft.params is not None:
-            draft.component = configured(draft.component, draft.params)
-        elif draft.component is not None and declares(draft.component.cls):
-            # Its ports are not known, so that nothing is said of what is connected to it.
-            draft.component = None
+        _configure(draft, document)
     calibration = _calibration(document, path.parent)
     _check_files(drafts, path, calibration, document)
     wiring.connect(drafts, document)
@@ -161,6 +156,16 @@ def _source(document: Document, drafts: Sequence[Draft]) -> Draft | None:
         first = f"{sources[0].id} ({sources[0].mark})"
         document.report(extra.keys, f"a pipeline has one source, but {first} is one already", at_key=True)
     return sources[0] if sources else None
+
+
+def _configure(draft: Draft, document: Document) -> None:
+    """Read the parameters of a stage or sink, and with them the ports that depend on them."""
+    draft.params = _params(draft, document)
+    if draft.component is not None and draft.params is not None:
+        draft.component = configured(draft.component, draft.params)
+    elif draft.component is not None and declares(draft.component.cls):
+        # Its ports are not known, so that nothing is said of what is connected to it.
+        draft.component = None
 
 
 def _params(draft: Draft, document: Document) -> StageParams | None:
