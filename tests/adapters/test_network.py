@@ -57,6 +57,7 @@ def network(file: Path, settings: dict[str, Any], outputs: dict[str, Any] | None
         outputs=outputs or {"y": {"shape": ("C", "H", "W")}},
     )
     assert isinstance(stage, Network)
+    assert isinstance(stage.params, tactflow.StageParams)
     return stage
 
 
