@@ -66,6 +66,7 @@ def test_all_else_works_without_an_adapter(
     )
     assert catalogue()[1] == []
     assert not set(lost["tactflow.sinks"]) & set(names("sinks"))
+    assert not set(lost["tactflow.stages"]) & set(names("stages"))
     for key in lost["tactflow.sources"]:
         (tmp_path / f"press{key}").write_bytes(b"a file of this kind")
         spec = f"press{key}?topic=/gel" if key.startswith(".") else f"{key}:press"
