@@ -9,7 +9,7 @@
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
 # make lerobot-env  LeRobot in an environment of its own (650 MB), for the tests of its camera
 # make lerobot-datasets  the same with PyTorch (up to 6 GB), for the tests of its datasets
-# make system-deps  what the tests need from the system: a browser, ffmpeg, ROS 1 (Debian; needs root)
+# make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -20,9 +20,6 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
-
-# For the script for ROS 1; Debian 12 has them, later ones do not, and its test says so.
-ROS1_DEPS := python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs python3-zmq
 
 .PHONY: run test soak load fuzz audit lock lint types packages ros-env lerobot-env lerobot-datasets system-deps clean
 
@@ -131,9 +128,6 @@ system-deps:
 			install --yes --no-install-recommends $(SYSTEM_DEPS) >/dev/null && exit 0; \
 		echo "system-deps: attempt $$attempt failed" >&2; sleep 10; \
 	done; dpkg --status $(SYSTEM_DEPS) >/dev/null
-	@dpkg --status $(ROS1_DEPS) >/dev/null 2>&1 || DEBIAN_FRONTEND=noninteractive \
-		apt-get -qq -o DPkg::Lock::Timeout=300 install --yes --no-install-recommends $(ROS1_DEPS) >/dev/null || \
-		echo "system-deps: ROS 1 is not to be had here; its test is skipped" >&2
 
 clean:
 	rm -rf $(VENV) $(TOOLS) $(ROS) $(LEROBOT) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
