@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench.judge import Judged, chosen_elsewhere, interval, judge, main, scatter
+from tactflow.bench.judge import OUTLINES, Judged, chosen_elsewhere, interval, judge, main, scatter
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
-from tactflow.bench.labels import OUTLINES
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 

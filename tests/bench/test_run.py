@@ -93,7 +93,6 @@ def test_pictures_show_the_worst_frame_of_every_pipeline(pictures: Path) -> None
         (["--html", f"{__file__}/x.html"], "test_run.py is not a folder"),
         (["nothing.yaml"], "no such pipeline"),
         (["--scene", "nowhere"], "nowhere"),
-        (["--data", "."], "gels"),
     ],
 )
 def test_mistakes_are_refused_before_anything_is_measured(

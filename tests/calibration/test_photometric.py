@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactflow.bench.depth import BALL, RAW_MM, deepest, noisy, scale, session_of
 from tactflow.calibration.photometric import Photometry, fit_photometry
 from tactflow.calibration.presses import Session
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor
+from tests.calibration.ball_presses import BALL, RAW_MM, deepest, noisy, scale, session_of
 
 PREPROCESS = Preprocessor((800, 600), rotate=90, downsample=2)
 SCALE = scale()

@@ -1,18 +1,18 @@
-"""Whole pipelines on simulated scenes and on recordings, compared with what is known of them."""
+"""Whole pipelines on simulated scenes, compared with the truth."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from tactflow.bench.lockstep import LockstepPipeline, TimedResult, on_recording, take_turns
-from tactflow.bench.pictures import WorstFrame
+from tactflow.bench.lockstep import LockstepPipeline, on_recording, take_turns
 from tactflow.bench.quantities import Tally
-from tactflow.bench.results import RECORDING, BenchResult
-from tactflow.bench.timing import CopyUnit, Times, quiet
+from tactflow.bench.results import BenchResult
+from tactflow.bench.scenes import Rendered
+from tactflow.bench.score import PipelineScore
+from tactflow.bench.timing import CopyUnit, quiet
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 from tactflow.vision.markers.detection import NoMarkersError
@@ -22,25 +22,6 @@ PIPELINE = "pipeline"
 
 CLASSIC = "classic"
 """Name of the pipeline that is the yardstick: the original script."""
-
-
-class Judge:
-    """Compares what one pipeline finds in one recording with what is known of it.
-
-    tally : gets the errors. frames : how many were judged. worst : on which frame the pipeline was worst.
-    """
-
-    def __init__(self, tally: Tally) -> None:
-        self.tally = tally
-        self.frames = 0
-        self.worst = WorstFrame()
-
-    def add(self, result: TimedResult) -> str:
-        """Compare one frame; returns the kind of frame: "contact" or "idle"."""
-        raise NotImplementedError
-
-    def finish(self) -> None:
-        """Compare what can be compared only when the recording is over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,46 +37,23 @@ class Bench:
     scratch: Path
     pictures: Path | None = None
 
-    def measure(
-        self,
-        pipelines: Mapping[str, Pipeline],
-        scene: str,
-        parts: Sequence[tuple[Path, Callable[[Tally], Judge]]],
-    ) -> None:
-        """Run pipelines, in turns of a few frames, on a scene or on the parts of a recording.
+    def measure(self, pipelines: Mapping[str, Pipeline], rendered: Rendered) -> None:
+        """Run pipelines, in turns of a few frames, on a scene.
 
-        Parameters
-        ----------
-        pipelines : name -> pipeline. scene : name of the scene or recording in the result.
-        parts : recordings, each with a function that makes a judge for one pipeline.
+        pipelines : name -> pipeline.
         """
-        tallies = {name: Tally() for name in pipelines}
-        times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
-        frames, failures = dict.fromkeys(pipelines, 0), dict[str, str]()
-        for path, make_judge in parts:
-            judges = {name: make_judge(tally) for name, tally in tallies.items()}
-
-            def see(name: str, found: TimedResult, judges: Mapping[str, Judge] = judges) -> str:
-                judges[name].frames += 1
-                return judges[name].add(found)
-
-            ready = {name: on_recording(pipeline, path) for name, pipeline in pipelines.items()}
-            measured, failed = take_turns(ready, see, unit=self.unit)
-            failures.update(failed)
-            for name, judge in judges.items():
-                judge.finish()
-                frames[name] += judge.frames
-                for kind, samples in measured[name].items():
-                    times[name][kind] += samples
-                if self.pictures is not None:
-                    part = f"{scene}-{path.stem}" if len(parts) > 1 else scene
-                    judge.worst.write(self.pictures, f"{part.removeprefix(RECORDING)}-{name}")
-        for name, tally in tallies.items():
+        scene = rendered.case.label
+        scores = {name: PipelineScore(rendered, Tally()) for name in pipelines}
+        ready = {name: on_recording(pipeline, rendered.path) for name, pipeline in pipelines.items()}
+        times, failures = take_turns(ready, lambda name, found: scores[name].add(found), unit=self.unit)
+        for name, score in scores.items():
+            if self.pictures is not None:
+                score.worst.write(self.pictures, f"{scene}-{name}")
             if name in failures:
                 self.result.failures[f"{PIPELINE}/{name}/{scene}"] = failures[name]
             else:
-                errors = tally.errors()
-                self.result.add(PIPELINE, name, scene, errors, times=times[name], frames=frames[name])
+                errors, frames = score.tally.errors(), sum(map(len, times[name].values()))
+                self.result.add(PIPELINE, name, scene, errors, times=times[name], frames=frames)
 
     def measure_refusal(self, name: str, pipeline: Pipeline, scene: str) -> None:
         """Measure what a pipeline for markers takes for markers on a gel without: at best, it refuses to run.

@@ -21,7 +21,7 @@ def rms(values: NDArray[np.float64]) -> float:
 
 P99 = partial(np.percentile, q=99)
 """99th percentile."""
-MEAN, MEDIAN, MOST, LEAST = np.mean, np.median, np.max, np.min
+MEAN, MOST = np.mean, np.max
 """How values become one number."""
 
 
@@ -94,17 +94,6 @@ _ALL = [
     Quantity("missed_contacts", "frames with contact missed", "%", slack=4.0),
     Quantity("missed_half_depth", "contact at half depth or more missed", "%"),
     Quantity("inpaint_mae", "marker removal, mean absolute error in the mask", "grey levels", slack=0.1),
-    Quantity("depth_rms", "heights, RMS error over the greatest depth", "%", slack=0.3),
-    Quantity("depth_within_one", "greatest-depth errors within one stderr", "%", MEAN, 68.0, slack=15.0),
-    Quantity("depth_within_two", "greatest-depth errors within two stderr", "%", MEAN, 95.0, slack=5.0),
-    Quantity("volume_error", "indented volume, error, mean", "%", slack=1.0),
-    Quantity("outline_iou_p50", "outline by eye, IoU, median", "", MEDIAN, 1.0, slack=0.02),
-    Quantity("outline_iou_min", "outline by eye, IoU, worst", "", LEAST, 1.0, slack=0.05),
-    Quantity("label_distance_p50", "centre against labelled circle, median", "px", MEDIAN, slack=0.1),
-    Quantity("line_angle_p50", "direction against labelled line, median", "deg", MEDIAN, slack=0.1),
-    Quantity("line_angle_max", "direction against labelled line, maximum", "deg", MOST, slack=0.3),
-    Quantity("dots_found", "dots found, of those counted by eye", "%", MEAN, 100.0, slack=1.0),
-    Quantity("dots_beyond", "dots found beyond those counted by eye", "%", slack=1.0),
 ]
 
 QUANTITIES: Mapping[str, Quantity] = {quantity.key: quantity for quantity in _ALL}

@@ -19,12 +19,8 @@ Point = tuple[float, float]
 
 
 def points(result: BenchResult, group: str, quantity: Quantity) -> dict[str, Point]:
-    """The methods of a group that have a time, and an error in every simulated scene in which one has it."""
-    known = [
-        m
-        for m in result.measurements(group)
-        if quantity.key in m.values and m.time_ms is not None and m.simulated
-    ]
+    """The methods of a group that have a time, and an error in every scene in which one has it."""
+    known = [m for m in result.measurements(group) if quantity.key in m.values and m.time_ms is not None]
     scenes = {m.scene for m in known}
     found = {}
     for method in dict.fromkeys(m.method for m in known):
@@ -61,7 +57,7 @@ def write_bench_report(result: BenchResult, path: Path) -> None:
     text = (
         "Every method was given the same frames, taking turns, in one thread, and its answers were compared "
         "with the known truth. In the plots, down and left is better: a dot is a method at its median over "
-        "the simulated scenes, and the dashed line connects the methods that no other beats in both time and "
+        "the scenes, and the dashed line connects the methods that no other beats in both time and "
         "error. A method without an answer in some scene is not shown."
     )
     write_report(path, "Run time against error", pages, text)

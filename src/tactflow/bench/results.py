@@ -14,9 +14,6 @@ from tactflow.engine.errors import ConfigError
 
 SCHEMA = "tactflow.bench/3"
 
-RECORDING = "data:"
-"""What the scene name of a real recording starts with."""
-
 TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
 """Kind of frame -> quantity that is its median CPU time, ms."""
 
@@ -26,7 +23,7 @@ class Measurement:
     """The numbers of one method on one scene.
 
     group : what is compared: "pipeline", or the id of a stage. method : name of the pipeline, or of the way
-    to do the stage's work. scene : simulated scene, or `RECORDING` and the name of a recording.
+    to do the stage's work. scene : simulated scene.
     values : key of `QUANTITIES`, or one of `TIMES`, or "frames" for the number of frames -> finite value.
     """
 
@@ -39,16 +36,6 @@ class Measurement:
     def key(self) -> str:
         """group/method/scene."""
         return f"{self.group}/{self.method}/{self.scene}"
-
-    @property
-    def simulated(self) -> bool:
-        """Whether the scene is simulated, not a recording."""
-        return not self.scene.startswith(RECORDING)
-
-    @property
-    def recording(self) -> str:
-        """Name of the recording."""
-        return self.scene.removeprefix(RECORDING)
 
     @property
     def errors(self) -> dict[str, float]:
@@ -84,15 +71,14 @@ class BenchResult:
         errors: Mapping[str, float],
         *,
         times: Mapping[str, Collection[float]] | None = None,
-        frames: int | None = None,
+        frames: int,
     ) -> None:
         """Add the errors of a method on a scene, and the median of CPU times, s, of each kind of frame."""
         values = dict(errors)
         for kind, quantity in TIMES.items():
             if samples := (times or {}).get(kind):
                 values[quantity] = 1e3 * median(samples)
-        if frames is not None:
-            values["frames"] = float(frames)
+        values["frames"] = float(frames)
         self.measured.append(Measurement(group, method, scene, values))
 
     def measurements(self, group: str) -> list[Measurement]:
@@ -142,12 +128,10 @@ def regressions(
     stored : of `load_errors`. scenes : the simulated scenes that were chosen, or None for all.
     """
     now = {m.key: m.errors for m in result.measured}
-    measured, worse = {m.scene for m in result.measured}, []
+    worse = []
     for key, errors in stored.items():
         scene = key.rpartition("/")[2]
-        # Recordings are not everywhere; simulated scenes are, so a missing one is a regression.
-        left_out = scene.startswith(RECORDING) or (scenes is not None and scene not in scenes)
-        if scene not in measured and left_out:
+        if scenes is not None and scene not in scenes:
             continue
         for name, value in errors.items():
             quantity, current = QUANTITIES[name], now.get(key, {}).get(name)

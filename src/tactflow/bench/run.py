@@ -1,4 +1,4 @@
-"""A whole run of the bench: scenes, methods, pipelines, recordings."""
+"""A whole run of the bench: scenes, methods, pipelines."""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ from pathlib import Path
 
 import cv2
 
-from tactflow.bench import depth, gels
 from tactflow.bench.lockstep import on_recording
 from tactflow.bench.methods import measure_methods
 from tactflow.bench.pipelines import CLASSIC, Bench
 from tactflow.bench.results import BenchResult
 from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, rendered
-from tactflow.bench.score import PipelineScore
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -44,13 +42,12 @@ class Plan:
     """What to measure.
 
     files : pipeline name -> file. `DEFAULT` and `CLASSIC` must be among them.
-    quick : a short run. data : folder of real recordings, or None. scenes : only these, or None for all.
+    quick : a short run. scenes : only these, or None for all.
     pictures : folder for a picture of each pipeline's worst frame in each scene, or None.
     """
 
     files: Mapping[str, Path]
     quick: bool = False
-    data: Path | None = None
     scenes: frozenset[str] | None = None
     pictures: Path | None = None
 
@@ -61,7 +58,7 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
     Raises
     ------
     ConfigError
-        If a pipeline file is wrong, a scene is unknown, or there are no recordings where they should be.
+        If a pipeline file is wrong or a scene is unknown.
     """
     began = time.perf_counter()
     whole, alone = (QUICK, QUICK_STAGES) if plan.quick else ((*FULL, *TROUBLES), FULL_STAGES)
@@ -70,8 +67,6 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
     if unknown := sorted(scenes.difference(known)):
         measured = ", ".join(known)
         raise ConfigError(f"--scene {', '.join(unknown)}: not among the scenes measured: {measured}")
-    if plan.data is not None:
-        gels.check(plan.data)
     loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
     result, unit = BenchResult(quick=plan.quick, machine=machine()), CopyUnit()
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
@@ -86,11 +81,6 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
             for case in alone
             if case.label in scenes
         ]
-        if not plan.quick and plan.scenes is None:
-            steps.append(("heights", partial(depth.measure_simulated, bench)))
-        if plan.data is not None:
-            pipelines = (DEFAULT, loaded[DEFAULT]), (MARKERLESS, _bare(loaded)[MARKERLESS])
-            steps.append(("real gels", partial(gels.measure_gels, bench, *pipelines, plan.data)))
         for number, (what, measure) in enumerate(steps):
             progress(what, number, len(steps))
             measure()
@@ -109,7 +99,7 @@ def measure_scene(bench: Bench, loaded: Pipelines, case: Case) -> None:
         if scene.scene.settings.speckle:
             speckled = on_recording(loaded[DEFAULT], scene.path)
             bench.measure_refusal(DEFAULT, speckled, case.label)
-        bench.measure(suited, case.label, [(scene.path, partial(PipelineScore, scene))])
+        bench.measure(suited, scene)
 
 
 def _marked(loaded: Pipelines) -> dict[str, Pipeline]:

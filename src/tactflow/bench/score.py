@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.lockstep import TimedResult
-from tactflow.bench.pipelines import Judge
+from tactflow.bench.pictures import WorstFrame
 from tactflow.bench.quantities import Tally
 from tactflow.bench.scenes import Rendered
 from tactflow.sim import Truth
@@ -145,11 +145,14 @@ class MarkerScore:
         return index
 
 
-class PipelineScore(Judge):
-    """Compares the results of a whole pipeline on one scene. tally : may be shared by several scenes."""
+class PipelineScore:
+    """Compares the results of a whole pipeline on one scene.
+
+    tally : gets the errors; may be shared by several scenes. worst : the frame with the worst contact.
+    """
 
     def __init__(self, rendered: Rendered, tally: Tally) -> None:
-        super().__init__(tally)
+        self.tally, self.worst = tally, WorstFrame()
         self._rendered = rendered
         self._markers = MarkerScore(tally)
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from statistics import median
 
 import numpy as np
 
-from tactflow.bench.gels import GELS
 from tactflow.bench.pipelines import CLASSIC, PIPELINE
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import TIMES, BenchResult, Measurement
@@ -21,7 +19,6 @@ TITLES = {
     "hull": "Contact geometry",
     "tracker": "Marker tracking",
     "flow_in_mask": "Flow inside the contact",
-    "depth": "Heights in mm, by light",
 }
 """Group -> heading."""
 
@@ -33,7 +30,6 @@ PRIMARY = {
     "hull": ("angle_mean", "center_error"),
     "tracker": ("displacement_rms", "displacement_p99", "wrong_percent"),
     "flow_in_mask": ("flow_error",),
-    "depth": ("depth_rms", "volume_error", "depth_within_one", "depth_within_two"),
 }
 """Group -> quantities in its table."""
 
@@ -53,19 +49,9 @@ SCENE_COLUMNS = {
 }
 """Heading -> quantities, for the table of scenes."""
 
-GEL_COLUMNS = {
-    "dots found, beyond, %": ("dots_found", "dots_beyond"),
-    "contact at rest, %": ("false_contacts",),
-    "missed, %": ("missed_contacts",),
-    "outline IoU, median, worst": ("outline_iou_p50", "outline_iou_min"),
-    "centre, px": ("label_distance_p50",),
-    "direction, median, worst, deg": ("line_angle_p50", "line_angle_max"),
-}
-"""Heading -> quantities, for the table of gels."""
-
 
 def sections(result: BenchResult) -> list[Section]:
-    """Everything that was measured, from the summary to single scenes and recordings."""
+    """Everything that was measured, from the summary to single scenes."""
     machine = ", ".join(f"{key} {value}" for key, value in result.machine.items())
     kind = "quick" if result.quick else "full"
     summary = (
@@ -74,7 +60,7 @@ def sections(result: BenchResult) -> list[Section]:
     )
     groups = dict.fromkeys(m.group for m in result.measured)
     found = [Section("Machine", summary), *(_methods(result, group) for group in groups)]
-    found += [_scenes(result), *_gels(result)]
+    found.append(_scenes(result))
     if result.failures:
         rows = [[key, why.partition("\n")[0]] for key, why in result.failures.items()]
         found.append(Section("Failures", tables=[Table(["group/method/scene", "why"], rows)]))
@@ -83,12 +69,12 @@ def sections(result: BenchResult) -> list[Section]:
 
 def _methods(result: BenchResult, group: str) -> Section:
     """One row per method of a group."""
-    simulated = [m for m in result.measurements(group) if m.simulated]
+    measured = result.measurements(group)
     quantities = [QUANTITIES[key] for key in PRIMARY.get(group, ())]
     heads = ["method", "contact, ms", "copies", "idle, ms", "copies", *(q.heading for q in quantities)]
     rows = []
-    for method in dict.fromkeys(m.method for m in simulated):
-        own = [m.values for m in simulated if m.method == method]
+    for method in dict.fromkeys(m.method for m in measured):
+        own = [m.values for m in measured if m.method == method]
         row = [method]
         for key in TIMES.values():
             times = [values[key] for values in own if key in values]
@@ -98,43 +84,16 @@ def _methods(result: BenchResult, group: str) -> Section:
             worst = max(errors, key=quantity.distance, default=0.0)
             row.append(f"{_number(median(errors))} ({_number(worst)})" if errors else "-")
         rows.append(row)
-    text = "Median over the simulated scenes, in brackets the worst one."
+    text = "Median over the scenes, in brackets the worst one."
     return Section(TITLES.get(group, group), text, tables=[Table(heads, rows)])
 
 
 def _scenes(result: BenchResult) -> Section:
     """One row for each pipeline on each simulated scene."""
-    rows = [
-        [m.scene, m.method, *_cells(m, SCENE_COLUMNS)] for m in result.measurements(PIPELINE) if m.simulated
-    ]
+    rows = [[m.scene, m.method, *_cells(m, SCENE_COLUMNS)] for m in result.measurements(PIPELINE)]
     text = f"Time of a frame with contact, and mean errors. `{CLASSIC}` is the original script."
     table = Table(["scene", "pipeline", "ms", *SCENE_COLUMNS], rows)
     return Section("Whole pipelines, scene by scene", text, tables=[table])
-
-
-def _gels(result: BenchResult) -> Iterator[Section]:
-    """One row for each recording of a gel, with the half of the sensors that it belongs to."""
-    rows = []
-    for gel in GELS:
-        measured = [m for m in result.measurements(PIPELINE) if m.recording == gel.folder]
-        if not measured:
-            continue
-        m, *refused = measured
-        dots = "?" if gel.dots is None else str(gel.dots)
-        if refused:
-            false_markers = refused[0].values["markers_false"]
-            dots += ", refused" if not false_markers else f", took {false_markers:g} for dots"
-        half = "chosen on" if gel.chosen else "test"
-        frames = f"{m.values['frames']:g}"
-        rows.append([gel.folder, gel.sensor, half, frames, dots, *_cells(m, GEL_COLUMNS)[1:]])
-    if rows:
-        text = (
-            "With the settings as they are shipped, but for `rotate: 0` and a `downsample` of 1 or 2. "
-            "Constants were chosen on one half of the sensors; the other half is the test. Refused: the "
-            "pipeline for gels with dots reports that there are none."
-        )
-        heads = ["recording", "sensor", "half", "frames", "dots by eye", *GEL_COLUMNS]
-        yield Section("Real gels of many labs", text, tables=[Table(heads, rows)])
 
 
 def _cells(measurement: Measurement, columns: dict[str, tuple[str, ...]]) -> list[str]:

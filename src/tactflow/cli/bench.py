@@ -39,12 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="only this scene of the simulated sensor; repeatable",
     )
     add(
-        "--data",
-        type=Path,
-        metavar="DIR",
-        help="also measure on the recordings of real gels in DIR/gels",
-    )
-    add(
         "--json",
         type=Path,
         default=Path("bench.json"),
@@ -56,8 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pictures",
         type=Path,
         metavar="DIR",
-        help="write a picture of every pipeline's worst frame in every scene, and of the worst frame with an "
-        "outline in each recording of a gel in --data, the truth beside the answer",
+        help="write a picture of every pipeline's worst frame in every scene, the truth beside the answer",
     )
     add(
         "--against",
@@ -76,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) is not None:
             refuse_output(f"--{name}", getattr(args, name), overwrite=True)
     scenes = frozenset(args.scene) if args.scene else None
-    plan = Plan(_files(args.pipelines), args.quick, args.data, scenes, args.pictures)
+    plan = Plan(_files(args.pipelines), args.quick, scenes, args.pictures)
     with notes("ERROR"), progress_bar("rendering") as update:
         result = run_bench(plan, lambda what, n, total: update(description=what, completed=n, total=total))
     show(markdown(sections(result)))
