@@ -155,12 +155,9 @@ def test_a_file_name_that_is_not_utf8_is_pointed_at(tmp_path: Path) -> None:
 # -- reports of a run -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("option", ["--stats", "--trace"])
-def test_statistics_replace_only_older_statistics(
-    tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_statistics_replace_only_older_statistics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "numbers.json"
-    command = ["run", "--quiet", "--set", "sinks={}", "--source", "sim:press?frames=2", option, str(file)]
+    command = ["run", "--quiet", "--set", "sinks={}", "--source", "sim:press?frames=2", "--stats", str(file)]
     assert main(command) == main(command) == 0
     file.write_text("a year of work")
     assert main(command) == 2
@@ -168,13 +165,12 @@ def test_statistics_replace_only_older_statistics(
     assert file.read_text() == "a year of work"
 
 
-@pytest.mark.parametrize("option", ["--stats", "--trace"])
-def test_a_report_replaces_no_results(
-    tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_statistics_replace_no_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     command = ["run", "--quiet", "--set", "sinks={}", "--source", "sim:press?frames=2"]
-    assert main([*command, "--jsonl", "a.jsonl", option, "./a.jsonl"]) == 3
+    assert main([*command, "--jsonl", "a.jsonl", "--stats", "./a.jsonl"]) == 3
     assert "a.jsonl" in capsys.readouterr().err
     assert '"frames"' not in Path("a.jsonl").read_text()
 

@@ -343,7 +343,7 @@ def test_one_signal_ends_all_sensors_well(folder: Path, number: int) -> None:
         ),
         *[
             (GRAPH, [option, "new/"], f"{option} new/: required a file, not a folder")
-            for option in ("--jsonl", "--stats", "--trace")
+            for option in ("--jsonl", "--stats")
         ],
         (GRAPH.replace("rotate: 0", "rotate: 7"), [], "pipeline.yaml:8:28"),
         (GRAPH.replace("  left: {stages:", "  left: {stagse:"), [], "did you mean stages?"),

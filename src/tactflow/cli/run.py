@@ -8,7 +8,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
-from tactflow.engine.trace import TRACE_BEGINS, Trace
 from tactflow.fleet.heartbeat import HANG_AFTER, progress_of, start_heartbeat
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
@@ -32,8 +31,8 @@ from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED
 
-REPORTS = {"--stats": '{\n "frames":', "--trace": TRACE_BEGINS}
-"""Option that names a file -> how the file begins. A file that begins otherwise is not replaced."""
+STATISTICS_BEGIN = '{\n "frames":'
+"""How a statistics file begins. A file that begins otherwise is not replaced."""
 
 Sinks = dict[str, dict[str, Any]]
 """Option of the command line -> settings of the sink that it adds."""
@@ -64,11 +63,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of a pipeline with several sensors, run only this one, in this process",
     )
     parser.add_argument("--stats", metavar="PATH", help="write run statistics as JSON at exit")
-    parser.add_argument(
-        "--trace",
-        metavar="FILE",
-        help="write what each thread did when, as Chrome trace events; open it at ui.perfetto.dev",
-    )
     parser.add_argument(
         "--end-with-stdin",
         action="store_true",
@@ -115,10 +109,9 @@ def _run_all(args: argparse.Namespace, file: Path, sensors: Sequence[str]) -> in
             f"--source: the pipeline has {len(sensors)} sensors, each with its own source; choose one with "
             f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
         )
-    reports = _reports(args)
-    files = {"--jsonl": args.jsonl, "--video": args.video, "--out": args.out}
+    files = {"--jsonl": args.jsonl, "--video": args.video, "--out": args.out, "--stats": args.stats}
     named = {option: str(path) for option, path in files.items() if path is not None}
-    problems += name_problems(named | reports, sensors)
+    problems += name_problems(named, sensors)
     if problems:
         raise ConfigError("\n".join(problems))
     sinks = {sensor: _added_sinks(args, sensor) for sensor in sensors}
@@ -127,7 +120,7 @@ def _run_all(args: argparse.Namespace, file: Path, sensors: Sequence[str]) -> in
         file,
         args.overrides,
         added={option for added in sinks.values() for option in added},
-        files=reports,
+        files={} if args.stats is None else {"--stats": args.stats},
         hang_after=args.hang_after,
         options=_options(args),
     )
@@ -139,12 +132,6 @@ def _options(args: argparse.Namespace) -> list[str]:
     words = [] if args.max_frames is None else ["--max-frames", str(args.max_frames)]
     flags = (("--realtime", args.realtime), ("--quiet", args.quiet), ("--check", args.check))
     return words + [flag for flag, is_set in flags if is_set]
-
-
-def _reports(args: argparse.Namespace) -> dict[str, str]:
-    """Option -> the file of statistics, or of events, that it names."""
-    paths = {"--stats": args.stats, "--trace": args.trace}
-    return {option: path for option, path in paths.items() if path is not None}
 
 
 def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
@@ -174,17 +161,14 @@ def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks
 
 def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     """Run one sensor's pipeline in this process."""
-    trace = None if args.trace is None else Trace(f"tactflow {pipeline.sensor}")
-    runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check, trace=trace)
+    runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check)
     if args.end_with_stdin:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
     if args.sign_of_life is not None:
         start_heartbeat(args.sign_of_life, progress_of(runner.calls))
     with notes(), ended_by_signals(runner) as caught:
-        for option, path in _reports(args).items():
-            problem = _report_problem(option, path)
-            if problem is not None:
-                raise ConfigError(f"{option} {path}: {problem}")
+        if args.stats is not None and (problem := _statistics_problem(args.stats)):
+            raise ConfigError(f"--stats {args.stats}: {problem}")
         logger = logging.getLogger("tactflow")
         for warning in runner.pipeline.warnings:
             logger.warning("%s", warning)
@@ -195,47 +179,43 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
         code = 0 if result.exit_code == INTERRUPTED and len(caught) == 1 else result.exit_code
         if result.error is not None:
             say(f"tactflow: {result.error}")
-        contents = {
-            "--trace": trace.lines() if trace else [],
-            "--stats": [json.dumps(result.stats, indent=1)],
-        }
-        written = [_write_report(option, path, contents[option]) for option, path in _reports(args).items()]
+        written = args.stats is None or _write_statistics(args.stats, result.stats)
         if not args.quiet:
             say(summary(result, runner))
-        return code or (0 if all(written) else StageError.exit_code)
+        return code or (0 if written else StageError.exit_code)
 
 
-def _report_problem(option: str, path: str) -> str | None:
-    """Why a report cannot be written to a file, or None. Makes the file."""
+def _statistics_problem(path: str) -> str | None:
+    """Why statistics cannot be written to a file, or None. Makes the file."""
     try:
         with open(path, "ab"):
             pass
         if is_device(path):
             return None
         with open(path, encoding="utf-8", errors="replace") as file:
-            beginning = file.read(len(REPORTS[option]))
+            beginning = file.read(len(STATISTICS_BEGIN))
     except OSError as error:
         return f"cannot be written: {error.strerror or error}"
-    if beginning not in ("", REPORTS[option]):
+    if beginning not in ("", STATISTICS_BEGIN):
         return "holds something else; choose another file, or delete it"
     return None
 
 
-def _write_report(option: str, path: str, lines: Iterable[str]) -> bool:
-    """Write statistics or events; returns whether it was written. A partial file is truncated to zero."""
+def _write_statistics(path: str, statistics: Mapping[str, Any]) -> bool:
+    """Returns whether they were written. A partial file is truncated to zero."""
     # A sink may have written to it meanwhile.
-    problem = _report_problem(option, path)
+    problem = _statistics_problem(path)
     if problem is None:
         try:
             with open(path, "w", encoding="utf-8") as file:
-                file.writelines(f"{line}\n" for line in lines)
+                file.write(json.dumps(statistics, indent=1) + "\n")
         except OSError as error:
             problem = f"cannot be written: {error.strerror or error}"
             # A device cannot be truncated.
             with suppress(OSError):
                 os.truncate(path, 0)
     if problem is not None:
-        say(f"tactflow: {option} {path}: {problem}")
+        say(f"tactflow: --stats {path}: {problem}")
     return problem is None
 
 

@@ -22,7 +22,6 @@ from tactflow.engine.plan import Plan, make_plan
 from tactflow.engine.priority import ask_for_realtime
 from tactflow.engine.segment import NewReferences, NodeFailedError, Segment
 from tactflow.engine.stats import Durations, NodeStats
-from tactflow.engine.trace import Trace
 from tactflow.system.signals import INTERRUPTED
 
 logger = logging.getLogger("tactflow")
@@ -61,8 +60,7 @@ class Runner:
     """One run of a pipeline; what sinks may ask of it is documented in `tactflow.engine.control.Control`.
 
     pipeline : validated. max_frames : stop after so many captured frames. check : check arrays against
-    their port types, and hand inputs over read-only, in every tick. trace : filled with what each thread
-    does when; write it when the run has ended.
+    their port types, and hand inputs over read-only, in every tick.
 
     Raises
     ------
@@ -76,14 +74,12 @@ class Runner:
         *,
         max_frames: int | None = None,
         check: bool = False,
-        trace: Trace | None = None,
     ) -> None:
         if max_frames is not None and max_frames < 1:
             raise ConfigError(f"max_frames: required a whole number from 1, got {max_frames}")
         self.pipeline = pipeline
         self.max_frames = max_frames
         self.check = check
-        self.trace = trace
         self.latency = Durations()
         self.nodes: dict[str, RunningNode] = {}
         self.plan: Plan = make_plan(pipeline)
@@ -257,8 +253,7 @@ class Runner:
     def _start(self) -> None:
         """Connect the segments and start their threads."""
         for name in self.plan.segments:
-            track = None if self.trace is None else self.trace.track(name)
-            self._segments[name] = Segment(name, self, track)
+            self._segments[name] = Segment(name, self)
         for link_plan in self.plan.links:
             link: Link[TickState] = Link(link_plan.name, link_plan.capacity, link_plan.when_full)
             self._links.append(link)
@@ -386,8 +381,6 @@ class Runner:
             if not frame.captured:
                 frame = replace(frame, captured=ended)
             self._source_stats.durations.add(ended - began)
-            if segment.track is not None:
-                segment.track.add(name, began, ended, {"seq": frame.seq})
             self._frames += frame.seq >= 0
             demand = frozenset([node.id for node in sinks if _wants(node, frame)])
             tick = TickState(index, frame, demand, slots)

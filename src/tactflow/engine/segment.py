@@ -20,7 +20,6 @@ from tactflow.engine.failure import describe_failure
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.link import Link
 from tactflow.engine.node import RunningNode, TickState
-from tactflow.engine.trace import Track
 
 if TYPE_CHECKING:
     from tactflow.engine.run import Runner
@@ -69,7 +68,7 @@ class NewReferences:
 class Segment:
     """Evaluates the nodes of one segment for a tick.
 
-    name, run : of the plan, and whose segment it is. track : where to note what is done when, if anywhere.
+    name, run : of the plan, and whose segment it is.
 
     Attributes
     ----------
@@ -79,10 +78,9 @@ class Segment:
     frames references that its stages ask for; None where other stages may have seen those frames already.
     """
 
-    def __init__(self, name: str, run: Runner, track: Track | None = None) -> None:
+    def __init__(self, name: str, run: Runner) -> None:
         self.name = name
         self.run = run
-        self.track = track
         ids = run.plan.segments[name]
         self.nodes = [run.nodes[id_] for id_ in ids if id_ in run.nodes]
         mine = {node.id: node for node in self.nodes}
@@ -120,18 +118,8 @@ class Segment:
 
     def handle(self, tick: TickState) -> None:
         """Compute this segment's part of a tick and hand the tick on."""
-        track = self.track
-        began = perf_counter()
-        if track is not None:
-            for link in self.inputs:
-                track.arrow("f", link.name, tick.index, began)
         self._execute(tick)
         self._forward(tick)
-        if track is not None:
-            mine = {slot: node.id for node in self.nodes for slot in node.slots}
-            skipped = {mine[slot]: reason for slot, reason in list(tick.reasons.items()) if slot in mine}
-            name = f"frame {tick.frame.seq}" if tick.frame.seq >= 0 else "reference image"
-            track.add(name, began, perf_counter(), {"seq": tick.frame.seq, "skipped": skipped})
 
     def _execute(self, tick: TickState) -> None:
         """Compute what this tick needs from this segment."""
@@ -193,10 +181,7 @@ class Segment:
         except Exception as error:
             self._failed(node, tick, inputs, error)
             return
-        ended = perf_counter()
-        node.stats.durations.add(ended - began)
-        if self.track is not None:
-            self.track.add(node.id, began, ended, {"seq": tick.frame.seq})
+        node.stats.durations.add(perf_counter() - began)
         node.publish(tick, outputs)
         if node.stage is not None and node.stage.wants_reference is not None:
             self._renew(node.stage, node.id, tick.frame)
@@ -234,8 +219,6 @@ class Segment:
         """Hand the tick to the next segments. One that holds only sinks gets it only if one of them asked."""
         for link, only_sinks in self.outputs:
             if only_sinks is None or not only_sinks.isdisjoint(tick.demand):
-                if self.track is not None:
-                    self.track.arrow("s", link.name, tick.index, perf_counter())
                 link.put(tick, keep=tick.frame.reference)
 
     def _next_tick(self) -> TickState | None:
