@@ -246,23 +246,6 @@ def test_two_calls_do_not_work_in_one_folder_but_two_shards_do(
     assert "another tactflow batch is using it" in call.stderr
 
 
-@pytest.mark.parametrize("format_", ["jsonl", "parquet"])
-def test_two_pipelines_are_compared_frame_by_frame(call: Call, format_: str) -> None:
-    if format_ == "parquet":
-        pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'tactflow[parquet]'")
-    (call.folder / "other.yaml").write_text(PIPELINE.replace("rotate: 0", "rotate: 180"))
-    assert call("--compare", "other.yaml", format_=format_) == 0
-    assert "prepare their pictures differently (rotate)" in call.stderr
-    page = (call.folder / "out" / "compare.html").read_text()
-    row = page[page.index("<td>a/press.npy") :].partition("</tr>")[0]
-    cells = re.findall(r"<td[^>]*>([^<]*)", row)
-    # The square of 20 x 16 px at (20, 16) stands at (24, 16) once 64 x 48 px are turned by half.
-    assert cells[:5] == ["a/press.npy", "6", "4", "0", "0"]
-    assert float(cells[5]) == pytest.approx(16 / 24, abs=0.05)
-    assert float(cells[8]) == pytest.approx(4.0, abs=0.1)
-    assert (call.folder / "out" / "compare" / "index.html").is_file()
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -2,5 +2,5 @@
 
 `recordings` finds the recordings, `run` submits outdated ones to `workers`, `work` processes one recording,
 `summary` collects its curves and pictures, `store` manages the output folder, `report` writes the table and
-page of all runs, `compare` tabulates how two pipelines differ.
+page of all runs.
 """

@@ -93,16 +93,6 @@ def load(request: Request) -> Pipeline:
     return replace(pipeline, nodes=nodes, opencv_threads=1)
 
 
-def prepared_differently(first: Request, second: Request) -> list[str]:
-    """Parameters of `preprocess` that place its pixels, and in which two pipelines differ."""
-    params: list[dict[str, Any]] = [
-        next((n.params.model_dump() for n in load(r).nodes.values() if n.component.name == "preprocess"), {})
-        for r in (first, second)
-    ]
-    places = ("undistort", "homography", "crop", "rotate", "downsample")
-    return [name for name in places if params[0].get(name) != params[1].get(name)]
-
-
 _loaded = functools.lru_cache(maxsize=2)(load)
 
 

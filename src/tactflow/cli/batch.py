@@ -11,19 +11,17 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from tactflow.batch.compare import compare
 from tactflow.batch.recordings import Recording, find_recordings
 from tactflow.batch.report import Runs, require_pyarrow, write_page, write_runs
 from tactflow.batch.run import Batch, Plan, Result, make_plan
 from tactflow.batch.store import Outcome, Store
-from tactflow.batch.work import Request, prepared_differently, resolved
+from tactflow.batch.work import Request, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
 from tactflow.cli.options import add_overrides, add_quiet, add_sensor, positive
 from tactflow.cli.terminal import progress_bar, say
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.report import Section, write_report
 from tactflow.system.signals import INTERRUPTED, ending_handled
 
 LONGEST = 200
@@ -64,12 +62,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="do only the I-th of N parts of the recordings, as in a job array; one more call without it "
         "gathers the table and the page",
     )
-    parser.add_argument(
-        "--compare",
-        metavar="OTHER",
-        help="run this pipeline over the same recordings too, into DIR/compare, and write a table of how the "
-        "results differ; --set changes the first pipeline alone",
-    )
     parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
     add_quiet(parser)
 
@@ -90,27 +82,22 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(
             f"{file} has the sensors {', '.join(sensors)}; a recording is of one: give --sensor {sensors[0]}"
         )
-    requests = [resolved(file, args.overrides, args.sensor, args.format)]
-    if args.compare is not None:
-        requests.append(resolved(find_pipeline(args.compare), [], args.sensor, args.format))
-    call = _Call(args, find_recordings(words))
-    results = [call.run(request, store) for request, store in zip(requests, call.stores, strict=False)]
-    if len(requests) > 1:
-        call.compare(requests)
-    undone = any(result.undone for result in results)
-    if call.signals and undone:
+    request = resolved(file, args.overrides, args.sensor, args.format)
+    call = _Call(args, request, find_recordings(words))
+    result = call.run()
+    if call.signals and result.undone:
         return INTERRUPTED
-    return StageError.exit_code if undone or any(result.failed for result in results) else 0
+    return StageError.exit_code if result.undone or result.failed else 0
 
 
 class _Call:
-    """One call of the command, about one pipeline or two."""
+    """One call of the command."""
 
-    def __init__(self, args: argparse.Namespace, recordings: Sequence[Recording]) -> None:
-        out = args.out.absolute()
-        self.stores = (Store(out), Store(out / "compare"))
+    def __init__(self, args: argparse.Namespace, request: Request, recordings: Sequence[Recording]) -> None:
         self.signals = 0
         self._args = args
+        self._request = request
+        self._store = Store(args.out.absolute())
         self._recordings = recordings
 
     def _say(self, text: str) -> None:
@@ -120,8 +107,9 @@ class _Call:
     def _count_signal(self, _number: int, _frame: object) -> None:
         self.signals += 1
 
-    def run(self, request: Request, store: Store) -> Result:
-        """Do what is missing of one pipeline; write the table of runs and the page."""
+    def run(self) -> Result:
+        """Do what is missing; write the table of runs and the page."""
+        request, store = self._request, self._store
         number, of = self._args.shard
         with ExitStack() as stack:
             scratch = stack.enter_context(store.claimed(f"{number}-of-{of}"))
@@ -130,17 +118,17 @@ class _Call:
             self._say(f"{request.file}: {plan}{'' if of == 1 else f' (part {number} of {of})'}")
             result = Result(dict(plan.done))
             if plan.left and not self.signals:
-                result = self._work(request, store, scratch, plan)
+                result = self._work(scratch, plan)
             # Before the table is written, which a full disk may not take.
             for line in _closing(result, len(plan.done)):
                 self._say(line)
-            runs = self._runs(request, store, result)
+            runs = self._runs(result)
             write_runs(store, runs, self._args.format)
             page = write_page(store, runs, f"{Path(request.file).stem}: {len(runs)} recordings")
             self._say(f"look at {page}")
         return result
 
-    def _work(self, request: Request, store: Store, scratch: Path, plan: Plan) -> Result:
+    def _work(self, scratch: Path, plan: Plan) -> Result:
         args = self._args
         workers = (
             DaskCluster(args.scheduler)
@@ -148,16 +136,16 @@ class _Call:
             else LocalProcesses(args.workers or _processors())
         )
         self._say(f"on {workers.description}")
-        batch = Batch(store, scratch, request, workers, lambda: self.signals, args.fail_fast)
+        batch = Batch(self._store, scratch, self._request, workers, lambda: self.signals, args.fail_fast)
         with self._progress(len(plan.left)) as batch.on_outcome:
             return batch.run(plan)
 
-    def _runs(self, request: Request, store: Store, result: Result) -> Runs:
+    def _runs(self, result: Result) -> Runs:
         """All recordings, also those of other shards, each with its outcome."""
         runs = []
         for recording in self._recordings:
-            outcome = result.outcomes.get(recording.source) or store.outcome(recording)
-            if outcome is None or outcome.pipeline != request.digest:
+            outcome = result.outcomes.get(recording.source) or self._store.outcome(recording)
+            if outcome is None or outcome.pipeline != self._request.digest:
                 outcome = Outcome(recording.source, recording.name, "not done")
             runs.append((recording, outcome))
         return runs
@@ -181,25 +169,6 @@ class _Call:
                 update(completed=done, description=text)
 
             yield on_outcome
-
-    def compare(self, requests: Sequence[Request]) -> None:
-        """Write how the results of two pipelines differ, for recordings that both have done."""
-        found = []
-        for recording in self._recordings:
-            outcomes = [store.outcome(recording) for store in self.stores]
-            paths = [s.path / o.result for s, o in zip(self.stores, outcomes, strict=True) if o and o.result]
-            if len(paths) == 2:
-                found.append((recording.name, paths[0], paths[1]))
-        names = " and ".join(request.file for request in requests)
-        text = f"{names}, in pixels of the processed frame. Overrides of the first: "
-        text += ", ".join(requests[0].overrides) or "none"
-        if differing := prepared_differently(*requests):
-            warning = f"the two prepare their pictures differently ({', '.join(differing)}): positions differ"
-            say(f"tactflow: WARNING: --compare: {warning}")
-            text += f". Mind that {warning}"
-        page = self.stores[0].path / "compare.html"
-        write_report(page, "Two pipelines", [Section("Differences", text, tables=[compare(found)])])
-        self._say(f"look at {page}")
 
 
 def _pipeline_and_sources(words: Sequence[str]) -> tuple[Path, Sequence[str]]:
