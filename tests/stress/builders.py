@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,20 +100,6 @@ def elliptical(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.flo
     along = (x - CONTACT[0]) * np.cos(turn) - (y - CONTACT[1]) * np.sin(turn)
     across = (x - CONTACT[0]) * np.sin(turn) + (y - CONTACT[1]) * np.cos(turn)
     return np.hypot(along / AXES[0], across / AXES[1])
-
-
-def apart(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Hausdorff distance of two masks, px: no pixel of one is farther from the other than this.
-
-    0 for two empty masks, infinite where only one is empty.
-    """
-    if not a.any() or not b.any():
-        return 0.0 if a.any() == b.any() else float("inf")
-    far = 0.0
-    for one, other in ((a, b), (b, a)):
-        away = cv2.distanceTransform((other == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        far = max(far, float(away[one > 0].max()))
-    return far
 
 
 # -- every method of every stage that looks at pictures ---------------------------------------------------
