@@ -73,10 +73,6 @@ def test_a_picture_is_new_and_the_inputs_stay_as_they_are() -> None:
     np.testing.assert_array_equal(MASK, mask)
 
 
-def test_nothing_given_and_no_text_is_the_frame_itself() -> None:
-    np.testing.assert_array_equal(Annotator(text=False)(GRAY), GRAY)
-
-
 @pytest.mark.parametrize(
     ("status", "colour"),
     [(MarkerStatus.TRACKED, (0, 255, 255)), (MarkerStatus.INFERRED, (255, 255, 255))],
@@ -89,12 +85,6 @@ def test_arrows_run_from_the_origin_and_show_the_status(status: MarkerStatus, co
         assert np.abs(picture[60, x].astype(int) - colour).max() <= 30
     np.testing.assert_array_equal(picture[60, 90], GRAY[0, 0])
     np.testing.assert_array_equal(picture[50, 65], GRAY[0, 0])
-
-
-def test_lost_markers_are_dim() -> None:
-    picture = np.zeros_like(GRAY)
-    draw_arrows(picture, markers([[50, 60]], [[80, 60]], [MarkerStatus.LOST]))
-    assert 0 < picture.max() <= 130
 
 
 def test_an_arrow_moves_with_its_marker_by_fractions_of_a_pixel() -> None:
@@ -134,12 +124,6 @@ def test_a_contact_without_direction_has_a_centre_and_no_axis() -> None:
     picture = Annotator(text=False)(GRAY, contact=disc)
     assert picture[120, 100, 2] > 200
     np.testing.assert_array_equal(picture[120, 112], GRAY[0, 0])
-
-
-def test_an_ellipse_is_drawn_only_where_asked_for() -> None:
-    bare = Annotator(text=False)(GRAY, contact=contact())
-    with_ellipse = Annotator(text=False, ellipse=True)(GRAY, contact=contact())
-    assert not np.array_equal(bare, with_ellipse)
 
 
 def test_a_drawn_ellipse_goes_through_the_ends_of_its_axes() -> None:

@@ -29,13 +29,6 @@ def frame(width: int = 80, height: int = 60, seed: int = 0) -> Frame:
     return Frame("main", 0, 0.0, image)
 
 
-def test_without_parameters_the_frame_is_left_as_it_is() -> None:
-    given = frame()
-    result = stage().process(given)
-    np.testing.assert_array_equal(result.image, given.image)
-    assert result.mapping.to_raw([3.5, 4.25]).tolist() == [3.5, 4.25]
-
-
 def test_every_parameter_reaches_the_mapping() -> None:
     result = stage(
         rotate=270,

@@ -91,14 +91,6 @@ def test_everything_else_is_left_as_measured_and_the_input_too() -> None:
     assert 0 < smoothed.center[1] < 6
 
 
-def test_after_a_pause_smoothing_starts_afresh() -> None:
-    smoother = ContactSmoother()
-    smoother.update(contact(0, 0, 0), 0.0)
-    smoother.reset()
-    smoothed = smoother.update(contact(50, 60, 70), 0.1)
-    assert (smoothed.center, smoothed.angle) == ((50, 60), 70)
-
-
 def test_time_that_does_not_advance_starts_afresh() -> None:
     smoother = ContactSmoother()
     smoother.update(contact(0, 0, 0), 5.0)

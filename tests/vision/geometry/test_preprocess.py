@@ -263,21 +263,6 @@ def test_a_picture_that_is_left_as_it_is_comes_back_read_only() -> None:
     assert image.flags.writeable
 
 
-def test_no_points_are_no_points() -> None:
-    for lens in LENSES.values():
-        mapping = Preprocessor((200, 160), **lens).mapping
-        assert mapping.to_raw(np.empty((0, 2))).shape == (0, 2)
-        assert mapping.to_processed(np.empty((0, 2))).shape == (0, 2)
-
-
-def test_numbers_may_be_those_of_numpy() -> None:
-    plain = Preprocessor((40, 30), rotate=90, downsample=2, crop=(4, 0, 20, 10)).mapping
-    rotate, factor, *crop = np.array([90, 2, 4, 0, 20, 10])
-    mapping = Preprocessor((40, 30), rotate=rotate, downsample=factor, crop=tuple(crop)).mapping
-    assert mapping.size == plain.size
-    np.testing.assert_array_equal(mapping.matrix, plain.matrix)
-
-
 LINE = [[0, 0], [10, 10], [20, 20], [0, 30]]
 SQUARE = [[0, 0], [30, 0], [0, 30], [30, 30]]
 
