@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import ContactMask, MarkerMask, Touching, Unmarked, Valid
 from tactflow.vision.contact import ContactDetector, LearnedDetector
+from tactflow.vision.contact.reference import ReferenceCheck
 from tactflow.vision.types import Markers
 
 
@@ -24,6 +26,8 @@ class Difference(Stage):
     """Compare the unmarked frame with the untouched gel.
 
     It learns from all frames marked as reference (`colour`: from the last one), or else from the first frame.
+    Where the gel is smoother than in the reference, it was the reference that was touched: that is no
+    contact, and while it lasts, a new reference is asked for.
     """
 
     memory = "stateful"
@@ -70,12 +74,20 @@ class Difference(Stage):
             lt=1,
             description="network: probability from which a region is a contact; higher misses lighter ones",
         )
+        patience: int = Field(
+            30,
+            ge=0,
+            description="frames in a row in which the reference turns out to have been touched, after which "
+            "a new one is taken; 0: none",
+        )
         distance: float = Field(24.0, gt=0, le=441, description="colour: change that is contact, grey levels")
 
     _detector: ContactDetector | LearnedDetector
 
     def __init__(self, params: Params) -> None:
         super().__init__(params)
+        self._check: ReferenceCheck | None = None
+        self._doubted = 0
         if params.method == "network":
             self._detector = LearnedDetector(certainty=params.certainty, relaxation=params.relaxation)
             return
@@ -93,6 +105,7 @@ class Difference(Stage):
     def reset(self) -> None:
         """Forget the reference; a new one follows."""
         self._detector.reset()
+        self._check, self._doubted = None, 0
 
     def process(
         self,
@@ -108,8 +121,15 @@ class Difference(Stage):
         """
         if frame.reference or not self._detector.has_reference:
             self._detector.add_reference(unmarked, valid)
+            self._check = self._check or ReferenceCheck(unmarked)
         if isinstance(self._detector, LearnedDetector):
             result = self._detector.detect(unmarked, marker_mask, markers)
         else:
             result = self._detector.detect(unmarked, marker_mask)
-        return ContactPorts(result.mask, result.touching)
+        if self._check is None or not self._check.was_touched(unmarked, result.mask):
+            self._doubted = 0
+            return ContactPorts(result.mask, result.touching)
+        self._doubted += 1
+        if self._doubted == self.params.patience > 0:
+            self.wants_reference = "reference_touched"
+        return ContactPorts(np.zeros_like(result.mask), False)

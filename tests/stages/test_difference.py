@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import tactflow
 from tactflow.engine.frame import Frame
 from tactflow.sim import open_scene
 from tactflow.stages.difference import Difference
@@ -68,3 +69,29 @@ def test_reset_forgets_the_reference() -> None:
     stage.process(untouched, _frame(untouched, 0, reference=True))
     stage.reset()
     assert not stage.process(touched, _frame(touched, 1, reference=True)).touching
+
+
+@pytest.mark.parametrize("method", ["noise", "network"])
+def test_a_reference_that_was_touched_is_replaced_after_the_release(method: str) -> None:
+    untouched, touched = _touched()
+    stage, asked = _stage(method=method, patience=3), []
+    stage.process(touched, _frame(touched, 0, reference=True))
+    for seq in range(1, 5):
+        ports = stage.process(untouched, _frame(untouched, seq))
+        assert not ports.touching
+        assert not ports.contact_mask.any()
+        asked.append(stage.wants_reference)
+        stage.wants_reference = None
+    assert asked == [None, None, "reference_touched", None]
+
+
+def test_a_whole_run_recovers_from_a_touched_first_frame() -> None:
+    scene = open_scene("unmarked?frames=60")
+    pressed, free = scene.frame(25), scene.frame(1)
+    pictures = [*[pressed] * 5, *[free] * 12, *[pressed] * 5]
+    settings = {"stages.capture.settle": 0, "stages.difference.patience": 5, "skipping": False}
+    results = list(tactflow.stream("markerless", source=pictures, settings=settings))
+    assert [result.contact is not None for result in results] == [False] * 17 + [True] * 5
+    assert [result.skipped["reference"] for result in results if "reference" in result.skipped] == [
+        "reference_touched"
+    ]
