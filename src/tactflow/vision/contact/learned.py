@@ -21,7 +21,7 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit  # type: ignore[import-untyped]
+from scipy.special import expit
 
 from tactflow.vision.arrays import Flags, Floats32, Mask, check_color_image, check_mask
 from tactflow.vision.contact.change import CLEAR, Change, Untouched
