@@ -1,4 +1,4 @@
-"""Stage `probe`: has anything changed since the last frame that was worked on?"""
+"""Stage `probe`: what does this frame need?"""
 
 from __future__ import annotations
 
@@ -8,68 +8,58 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.ports import Changed
-from tactflow.vision.change import ChangeHold, ChangeProbe
+from tactflow.ports import Changed, Suspect
+from tactflow.vision.change import RestTest
 from tactflow.vision.geometry.valid_area import bounding_box, valid_area
 
 
 class ProbePorts(NamedTuple):
-    """changed : whether the frame differs from the last one that was worked on."""
+    """changed : whether anything may have moved. suspect : whether the contact may be another one."""
 
     changed: Changed
+    suspect: Suspect
 
 
 class Probe(Stage):
-    """Looks at samples of the raw frame, so that stages with `when: changed` repeat their results."""
+    """Looks at samples of the raw frame. With `when: changed`, stages repeat their results while nothing can
+    have changed; with `when: suspect`, as long as nothing touches the gel either."""
 
     memory = "stateful"
+    watches = "touching"
 
     class Params(StageParams):
         """How careful to be."""
 
         false_alarms: float = Field(
-            1e-3,
-            gt=0,
-            le=0.5,
-            description="share of still frames that are worked on all the same; a smaller share lets larger "
-            "changes pass unseen",
-        )
-        tile: int = Field(
-            40, ge=8, description="edge of the tiles that are tested on their own, px of the raw frame"
-        )
-        hold: int = Field(
-            5,
-            ge=0,
-            description="frames for which a change keeps the stages at work; the last of them are compared "
-            "with the one that changed, so that what moves too slowly for one frame adds up",
+            1e-3, gt=0, le=0.5, description="share of still frames that are worked on all the same"
         )
         at_least_every: int = Field(
             30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
         )
 
     def __init__(self, params: Params, skipping: bool = True) -> None:
-        """Prepare; the first frame says where to look. Where nothing is skipped, nothing is looked at."""
+        """Prepare. skipping : if not, nothing is looked at."""
         super().__init__(params)
         self._skipping = skipping
-        self._probe: ChangeProbe | None = None
-        self._gel = slice(None), slice(None)
-        self._hold = ChangeHold(params.hold, params.at_least_every)
+        self.reset()
 
     def reset(self) -> None:
-        """A new reference follows: choose the places to look at anew."""
-        self._probe = None
+        """A new reference follows."""
+        self._test: RestTest | None = None
+        self._gel = slice(None), slice(None)
+        self._since_work = 0
 
     def process(self, frame: Frame) -> ProbePorts:
-        """Compare with the last frame that was worked on. A reference frame always is.
-
-        Only the smallest rectangle that holds all of the gel is looked at.
-        """
+        """Compare with the frames before. Only the smallest rectangle that holds all of the gel is looked at;
+        a reference frame is always worked on."""
         if not self._skipping:
-            return ProbePorts(True)
-        if self._probe is None:
+            return ProbePorts(True, True)
+        if self._test is None:
             self._gel = bounding_box(valid_area(frame.image))
-            self._probe = ChangeProbe(
-                frame.image[self._gel], false_alarms=self.params.false_alarms, tile=self.params.tile
-            )
-        gel = frame.image[self._gel]
-        return ProbePorts(self._hold.works_on(gel, self._probe, reference=frame.reference))
+            self._test = RestTest(frame.image[self._gel], false_alarms=self.params.false_alarms)
+        self._since_work += 1
+        due = frame.reference or self._since_work >= self.params.at_least_every
+        look = self._test.look(frame.image[self._gel], touching=self.watched, due=due)
+        if look.suspect:
+            self._since_work = 0
+        return ProbePorts(look.changed, look.suspect)

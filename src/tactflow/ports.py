@@ -44,7 +44,10 @@ Slipping = Annotated[bool, SignalPort("slipping", closed="no_slip")]
 """True while what touches the gel slides over it."""
 
 Changed = Annotated[bool, SignalPort("changed", closed="unchanged", otherwise="repeat")]
-"""True when the frame differs from the last one that was worked on by more than the sensor's noise."""
+"""True when anything may have moved by more than its tolerance since the last frame that was looked at."""
+
+Suspect = Annotated[bool, SignalPort("suspect", closed="at_rest", otherwise="repeat")]
+"""True when the contact may be another one than in the last frame that was worked on in full."""
 
 Held = Annotated[bool, SignalPort("held", closed=None)]
 """Another signal, held true for longer."""

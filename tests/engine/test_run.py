@@ -172,6 +172,14 @@ def test_a_repeating_gate_gives_its_last_value_and_says_why(toy_runner: MakeRunn
     assert by_frame[6][4] == {}
 
 
+@pytest.mark.parametrize("below", [{}, {"segment": "b"}], ids=["same segment", "another"])
+def test_a_stage_knows_a_signal_of_the_frame_before(toy_runner: MakeRunner, below: dict[str, str]) -> None:
+    runner = toy_runner({"level": {"use": "Watcher"}, "pulse": below})
+    ran(runner)
+    before = [False, *(3 <= seq % 10 <= 6 for seq in range(19))]
+    assert runner.nodes["level"].instance.rows == (before if not below else [False, *[True] * 19])
+
+
 @pytest.mark.parametrize("cut", [{}, SEGMENTS["each"]], ids=["default", "each"])
 def test_a_pure_stage_is_not_run_again_on_inputs_it_has_seen(
     toy_runner: MakeRunner, cut: dict[str, Any]

@@ -168,6 +168,18 @@ class Gated(Counted, Stage):
         return GatedPorts(Number(heavy.value + 0.5))
 
 
+class Watcher(Counted, Stage):
+    """Notes what the signal of the stages below was in the frame before."""
+
+    memory = "stateful"
+    watches = "active"
+
+    def process(self, frame: Frame) -> LevelPorts:
+        self.saw(frame.seq)
+        self.rows.append(self.watched)
+        return LevelPorts(Number(float(frame.seq)), frame.image[:, :, 0].copy())
+
+
 class TotalPorts(NamedTuple):
     total: Number
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.drawing.results import Annotator
-from tactflow.vision.change import ChangeProbe
+from tactflow.vision.change import RestTest
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
@@ -40,7 +40,7 @@ MARKERS = Markers(PLAIN.origin, PLAIN.position, np.zeros(24, np.uint8), np.full(
 
 
 def _probed(reference: Array, image: Array) -> Any:
-    probe = ChangeProbe(reference)
+    probe = RestTest(reference)
     return [probe.look(picture) for picture in (reference,) * 8 + (image, image)]
 
 

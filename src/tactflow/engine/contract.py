@@ -138,6 +138,14 @@ class Stage(Part):
     """Whether it waits in pipelines for a sink that may be added. That nothing needs it is then not worth a
     warning, and collecting every port leaves it out."""
 
+    watches: ClassVar[str | None] = None
+    """A signal of stages below that it wants to know from the frame before, by the name of its port."""
+
+    watched: bool = False
+    """The value of that signal, set by the engine before `process`: of the last stage that has it. True where
+    it is not known: it is absent, or computed in another segment. False before the first frame, and where no
+    stage has it."""
+
     wants_reference: str | None = None
     """Why a new reference is needed, a short snake_case word, or None. `process` sets it on `self`; the
     engine clears it and makes the next frame a reference in a new epoch, so that all stages are reset. With

@@ -80,8 +80,8 @@ class Tick(Mapping[str, Any]):
     frame : the captured frame; its image is the raw one.
     values : port -> value or `Absent`. Not copied.
     skipped : port -> reason, for values that were not computed in this tick: absent ones, and those that
-        repeat the last frame's (`unchanged`). "reference" -> reason, where a stage asked for this frame to
-        become a new reference. None: the reasons of the absent values.
+        repeat the last frame's (`unchanged`, `at_rest`). "reference" -> reason, where a stage asked for this
+        frame to become a new reference. None: the reasons of the absent values.
 
     Examples
     --------

@@ -9,7 +9,7 @@ that a closed gate runs none of the work before it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -90,6 +90,12 @@ class Segment:
                 node.signal_makers = _of(mine, [gate.signal.node for gate in node.node.gates])
         roots = run.plan.roots(name)
         self._roots = [(mine[id_], sinks) for id_, sinks in roots.items() if id_ in mine]
+        self._watchers = [
+            (node.stage, maker, slot)
+            for node in self.nodes
+            if node.stage is not None
+            for maker, slot in _last_with(node.stage.watches, run.nodes.values())
+        ]
         self._data_sinks = [n for n in self.nodes if n.sink is not None and not n.sink.observer]
         self.inputs: list[Link[TickState]] = []
         self.outputs: list[tuple[Link[TickState], frozenset[str] | None]] = []
@@ -135,6 +141,9 @@ class Segment:
         for node in self.nodes:
             if node.pulled != tick.index:
                 node.stats.skips["no_demand"] += 1
+        for stage, maker, slot in self._watchers:
+            # Another segment may be ahead or behind.
+            stage.watched = maker not in self.nodes or tick.values[slot] is not False
         self.current = None
         if tick.demand and self._data_sinks:
             self.run.latency.add(perf_counter() - tick.frame.captured)
@@ -260,3 +269,10 @@ class Segment:
 def _of(mine: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode]:
     """Those of the nodes that are among `mine`, each once."""
     return [mine[id_] for id_ in dict.fromkeys(ids) if id_ in mine]
+
+
+def _last_with(port: str | None, nodes: Iterable[RunningNode]) -> list[tuple[RunningNode, int]]:
+    """The last of the nodes that has a signal, and where it enters it; an empty list where none has."""
+    if port is None:
+        return []
+    return [(node, node.signals[port][0]) for node in nodes if port in node.signals][-1:]

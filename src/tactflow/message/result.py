@@ -30,7 +30,7 @@ class Result(Tick):
     no stage of the pipeline computes it. `result["brightness"]` is the output of a stage of your own.
 
     frame : as captured: `seq`, `t`, and the raw image, (0, 0, 3) where pictures were not kept.
-    skipped : port -> why it was not computed in this frame: `unchanged` repeats the last value.
+    skipped : port -> why it was not computed in this frame: `unchanged` and `at_rest` repeat the last value.
     image : (H, W, 3) uint8 BGR, the processed frame.
     contact, flow, markers : what touches the gel, how the gel has moved inside, and its dots.
     contact_mask : (H, W) uint8, 255 in contact.

@@ -105,7 +105,9 @@ class _MarkersModel(_Strict):
     """The markers; index i is the same physical marker for the whole run."""
 
     origin: list[_Point] = Field(description="positions in the reference frame, px")
-    position: list[_Point] = Field(description="positions now, px")
+    position: list[_Point] = Field(
+        description="positions now, px; repeated while none can have moved by more than 0.05"
+    )
     status: list[Literal["tracked", "inferred", "lost"]] = Field(description="how each position is known")
     stderr: list[_NotNegative | None] = Field(
         default_factory=list, description="standard error of each position, px; null when unknown (detail)"
@@ -191,7 +193,8 @@ class _Message(_Strict):
         None, description="of a network (only where a stage network gives features)"
     )
     skipped: dict[str, str] = Field(
-        description="port -> why this frame did not need it; reference -> why this frame became a new one"
+        description="port -> why this frame did not need it: unchanged and at_rest repeat the last value, by "
+        "which a contact begins and ends at most one frame late; reference -> why this frame became a new one"
     )
 
 

@@ -1,12 +1,10 @@
-"""Is anything different from the last frame that was worked on, and is the light of a camera steady yet?
+"""What a frame at rest looks like, and whether the light of a camera is steady yet.
 
-`probe` compares frames by the sums over `tiles`, with what `noise` makes of them; `hold` decides by that
-which frames are worked on. `settling` looks at the first frames of a source for the untouched gel in steady
-light.
+`rest` tells from a raw frame which results could differ from those before. `settling` looks at the first
+frames of a source for the untouched gel in steady light.
 """
 
-from tactflow.vision.change.hold import ChangeHold
-from tactflow.vision.change.probe import ChangeProbe
+from tactflow.vision.change.rest import RestTest
 from tactflow.vision.change.settling import Settling
 
-__all__ = ["ChangeHold", "ChangeProbe", "Settling"]
+__all__ = ["RestTest", "Settling"]

@@ -1,0 +1,267 @@
+"""Does anything touch the gel that did not, has anything moved? A cheap look at a raw frame.
+
+A few lines of the frame are summed over tiles: the light of each channel, and the least-squares displacement
+of the gel's edges (Lucas and Kanade, 1981). All are taken against the untouched gel, after the exposure, as
+single tiles and over windows of 3 and 7. What a sensor's compression, flicker and noise do to them is learned
+tile by tile from the differences between frames in a row (von Neumann, 1941): the calmest of all blocks of
+frames counts, so that motion is not taken for noise. The bound of all tests together is set from the share of
+still frames that may fail (Bonferroni).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from statistics import NormalDist
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.arrays import Floats32
+from tactflow.vision.compiled import kernel
+
+TILES: Final = 24
+"""Tiles along the longer side of a frame: a contact of 4 % of its width fills one."""
+LINES: Final = 6
+"""Lines of a tile that are read; more cost time."""
+WINDOWS: Final = (1, 3, 7)
+"""Widths of the windows of tiles, tiles: a faint contact shows in the mean over its own size."""
+WARM_UP: Final = 4
+"""Differences of frames from which the first noise is learned."""
+BLOCK: Final = 8
+"""The same of every later block. The least of many blocks of 8, smoothed over 25 tiles, is 15 % too low."""
+FORGET: Final = 1.02
+"""Growth of the learned variance from block to block, so that a sensor may become noisier: it doubles in 280
+frames, some ten seconds."""
+LEVEL: Final = 1.0
+"""Grey levels: a smaller departure of a tile from the untouched gel is no contact, as pictures are rounded to
+whole levels; of a window, that over its width, as a mean is known better."""
+SHIFT: Final = 0.05
+"""px: tolerance of the dots' positions."""
+RECENT: Final = 5
+"""Frames whose strongest change is what the gel shows at rest, so that a flicker of five frames is part of
+it: a sixth of a second."""
+ROUNDING: Final = 1 / 12
+"""Variance of rounding to whole grey levels, squared levels."""
+
+
+class Look(NamedTuple):
+    """What a frame needs.
+
+    changed : whether anything may have moved by more than the tolerance; if not, all results are repeated.
+    suspect : whether something may touch the gel that did not in the last frame that was worked on in full;
+        implies `changed`. If not, the contact stays, and only the dots are looked at.
+    """
+
+    changed: bool
+    suspect: bool
+
+
+class RestTest:
+    """Tells from a raw frame what of its results could differ from those of the frames before.
+
+    A contact may begin only where the light departs further from that of the untouched gel than it did in the
+    last frames that showed no contact; a gel that creeps back does not begin one. While something touches,
+    every frame is worked on in full. Dots have moved if edges near them have, by the sensor's own noise,
+    since the last frame in which they were looked at; on a sensor with which 0.05 px cannot be told from
+    noise, they always may have.
+
+    frame : (H, W, 3) uint8 BGR, the untouched gel.
+    false_alarms : share of still frames that are worked on all the same, in (0, 0.5].
+
+    Raises ValueError for a frame of another kind or shape, or a parameter out of range.
+
+    >>> still = np.full((48, 64, 3), 100, np.uint8)
+    >>> test = RestTest(still)
+    >>> test.look(still)
+    Look(changed=True, suspect=True)
+    >>> [test.look(still + np.uint8(level)).suspect for level in (0, 1, 0, 1, 0, 1, 1)]
+    [True, True, True, True, True, False, False]
+    """
+
+    def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-3) -> None:
+        if not 0 < false_alarms <= 0.5:
+            raise ValueError(f"required false_alarms in (0, 0.5], got {false_alarms}")
+        self._shape = _checked(frame).shape
+        step = max(1, round(max(self._shape) / (TILES * LINES)))
+        tile = min(step * LINES, *self._shape[:2])
+        rows, columns = self._shape[0] // tile, self._shape[1] // tile
+        self._used = slice(step // 2, rows * tile, step), slice(0, columns * tile)
+        gray = np.asarray(frame[..., 1], np.float32)
+        slopes = [cv2.Sobel(gray, cv2.CV_32F, *axis, scale=1 / 8)[self._used] for axis in ((1, 0), (0, 1))]
+        self._slopes: Floats32 = np.asarray(np.stack(slopes), np.float32)
+        self._resting: NDArray[np.uint8] = np.ascontiguousarray(frame[self._used][..., 1])
+        self._lines = np.empty((*self._slopes.shape[1:], 3), np.uint8)
+        width = self._slopes.shape[2]
+        self._heaps = np.empty(3 * width, np.uint16), np.empty((2, width), np.float32)
+        self._sums = np.empty((rows, columns, 5), np.float32)
+        self._pixels = tile * len(self._lines) / rows
+        energy = np.square(self._slopes).reshape(2, rows, -1, columns, tile).sum(axis=(2, 4))
+        energy = cv2.blur(energy.transpose(1, 2, 0), (3, 3)) + np.float32(ROUNDING * self._pixels)
+        self._per_energy = np.asarray(1 / energy, np.float32)
+        planes = 3 * len(WINDOWS) + 2
+        count = rows * columns * planes
+        self._z = -NormalDist().inv_cdf(false_alarms / (2 * count))
+        floor = ROUNDING / self._pixels / np.repeat(np.square(WINDOWS), 3)
+        self._level = np.repeat(LEVEL / np.array(WINDOWS, np.float32), 3)
+        self._floor = np.concatenate(
+            [np.broadcast_to(floor, (rows, columns, len(floor))), ROUNDING / energy / 9], axis=2
+        ).astype(np.float32)
+        self._rest = self._light(frame)
+        self._frame: NDArray[np.uint8] | None = None
+        self._last: Floats32 | None = None
+        self._moved: Floats32 | None = None
+        self._squares: Floats32 = np.zeros((rows, columns, planes), np.float32)
+        self._count = 0
+        self._variance: Floats32 | None = None
+        self._bound: Floats32 | None = None
+        self._sees_shifts = False
+        self._recent: deque[Floats32] = deque(maxlen=RECENT)
+        self._envelope: Floats32 | None = None
+        self._worked = True
+
+    def look(self, frame: NDArray[np.uint8], *, touching: bool = False, due: bool = False) -> Look:
+        """Compare a frame with those before.
+
+        frame : of the first one's shape. It is kept until the next, and must not be written to meanwhile.
+        touching : whether something touched the gel in the frame before. due : that the frame is worked on
+        in full whatever it shows.
+        """
+        if _checked(frame).shape != self._shape:
+            raise ValueError(f"required a frame of shape {self._shape}, got {frame.shape}")
+        before, self._frame = self._frame, frame
+        if touching:
+            # Nothing is looked at, and the rest begins anew behind the contact.
+            self._last = None
+            self._recent.clear()
+            return Look(True, True)
+        if self._last is None and before is not None:
+            # In the frame before, nothing touched any more.
+            self._last = self._planes(before)
+            self._decide(self._last, changed=True, suspect=True)
+        last, self._last = self._last, (now := self._planes(frame))
+        if last is None or before is None:
+            return self._decide(now, changed=True, suspect=True)
+        step = now - last
+        if not step.any() and np.array_equal(frame, before):
+            return self._decide(now, changed=True, suspect=True) if due else Look(False, False)
+        self._learn(step)
+        if self._worked:
+            self._envelope = np.max(self._recent, axis=0)
+        suspect = due or self._bound is None or self._departs(now)
+        return self._decide(now, changed=suspect or self._moves(now), suspect=suspect)
+
+    def _decide(self, now: Floats32, *, changed: bool, suspect: bool) -> Look:
+        """Note what is done with a frame."""
+        self._recent.append(np.abs(now[..., :-2]))
+        if changed:
+            self._moved = now[..., -2:]
+        self._worked = suspect
+        return Look(changed, suspect)
+
+    def _departs(self, now: Floats32) -> bool:
+        """Whether the light of any window has departed from that of the untouched gel."""
+        assert self._envelope is not None
+        assert self._bound is not None
+        excess = np.abs(now[..., :-2]) - self._envelope
+        if bool((excess > self._bound[..., :-2] + self._level).any()):
+            return True
+        # What has crept back may not come again unseen.
+        np.minimum(self._envelope, np.max(self._recent, axis=0), out=self._envelope)
+        return False
+
+    def _moves(self, now: Floats32) -> bool:
+        """Whether an edge may have moved since the dots were last looked at."""
+        if not self._sees_shifts or self._moved is None or self._bound is None:
+            return True
+        return bool((np.abs(now[..., -2:] - self._moved) > self._bound[..., -2:]).any())
+
+    def _planes(self, frame: NDArray[np.uint8]) -> Floats32:
+        """(rows, columns, 11): against the untouched gel, the light of each channel in windows of each width,
+        grey levels, and the displacement in windows of 3 tiles, px."""
+        light = self._light(frame)
+        ratio = ((light[::2, ::2] + 1) / (self._rest[::2, ::2] + 1)).reshape(-1, 3)
+        change = light - self._rest * np.partition(ratio, len(ratio) // 2, axis=0)[len(ratio) // 2]
+        shift = cv2.blur(self._sums[..., 3:], (3, 3)) * self._per_energy
+        return np.dstack([*(cv2.blur(change, (width, width)) for width in WINDOWS), shift])
+
+    def _light(self, frame: NDArray[np.uint8]) -> Floats32:
+        """(rows, columns, 3): mean light of each channel; the sums of all kinds are in `_sums` then."""
+        self._lines[...] = frame[self._used]
+        green = np.asarray(cv2.extractChannel(self._lines, 1), np.uint8)
+        flat = self._lines.reshape(len(green), -1)
+        sum_tiles(flat, green, self._resting, self._slopes, *self._heaps, self._sums)
+        return np.asarray(self._sums[..., :3] / np.float32(self._pixels), np.float32)
+
+    def _learn(self, step: Floats32) -> None:
+        """Take in the difference of two frames in a row."""
+        self._squares += step * step
+        self._count += 1
+        if self._count < (WARM_UP if self._variance is None else BLOCK):
+            return
+        seen = self._squares / np.float32(2 * self._count)
+        # Neighbouring tiles are alike; one that is much louder than they are is louder.
+        near = [cv2.blur(np.ascontiguousarray(plane), (5, 5)) for plane in np.dsplit(seen, seen.shape[2])]
+        seen = np.maximum(np.maximum(np.dstack(near), seen / 2), self._floor)
+        older = self._variance
+        self._variance = seen if older is None else np.minimum(older * np.float32(FORGET), seen)
+        self._bound = np.sqrt(2 * self._variance) * np.float32(self._z)
+        self._sees_shifts = bool(np.median(self._bound[..., -2:]) <= SHIFT)
+        self._squares[...] = 0
+        self._count = 0
+
+
+def _checked(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8 or 0 in frame.shape:
+        raise ValueError(
+            f"required an image (height, width, 3) of uint8, got {frame.dtype} of shape {frame.shape}"
+        )
+    return frame
+
+
+@kernel(
+    "void(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, :, ::1], uint16[::1], float32[:, ::1], "
+    "float32[:, :, ::1])"
+)
+def sum_tiles(
+    lines: NDArray[np.uint8],
+    green: NDArray[np.uint8],
+    resting: NDArray[np.uint8],
+    slopes: Floats32,
+    light: NDArray[np.uint16],
+    shift: Floats32,
+    sums: Floats32,
+) -> None:
+    """Sums over tiles of blue, green and red, and of the change of green times its slopes along x and y.
+
+    lines : (n * rows, m * columns * 3), n < 258. green : (n * rows, m * columns), its green; resting : that
+    of the untouched gel. slopes : (2, n * rows, m * columns), levels per px. light, shift : (m * columns
+    * 3,) and (2, m * columns), written over. sums : (rows, columns, 5), to be written.
+    """
+    rows, columns, _ = sums.shape
+    thick, wide = green.shape[0] // rows, green.shape[1] // columns
+    for row in range(rows):
+        light[:] = 0
+        shift[:] = 0
+        for y in range(row * thick, (row + 1) * thick):
+            for x in range(light.size):
+                light[x] += lines[y, x]
+            for x in range(green.shape[1]):
+                more = np.float32(green[y, x]) - np.float32(resting[y, x])
+                shift[0, x] += more * slopes[0, y, x]
+                shift[1, x] += more * slopes[1, y, x]
+        for column in range(columns):
+            blue, middle, red = 0, 0, 0
+            right, down = np.float32(0), np.float32(0)
+            for x in range(column * wide, (column + 1) * wide):
+                blue += light[3 * x]
+                middle += light[3 * x + 1]
+                red += light[3 * x + 2]
+                right += shift[0, x]
+                down += shift[1, x]
+            sums[row, column, 0] = blue
+            sums[row, column, 1] = middle
+            sums[row, column, 2] = red
+            sums[row, column, 3] = right
+            sums[row, column, 4] = down

@@ -1,0 +1,184 @@
+"""The rest test: what it must see, what it must not, and how often it errs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.vision.change import RestTest
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+PITCH = 24
+
+
+@lru_cache(maxsize=1)
+def gel(shift: float = 0.0) -> Floats:
+    """A gel with soft dark dots of radius 4 px on a grid, moved to the right by `shift` px."""
+    y, x = np.mgrid[0:240, 0:320].astype(np.float32)
+    dx, dy = (x - shift + PITCH / 2) % PITCH - PITCH / 2, (y + PITCH / 2) % PITCH - PITCH / 2
+    dots = 80 / (1 + np.exp((np.hypot(dx, dy) - 4) / 0.5))
+    return np.repeat((150 - dots)[:, :, None], 3, axis=2).astype(np.float32)
+
+
+def noisy(image: Floats, seed: int, sigma: float = 2.0) -> Image:
+    """The image as a camera with Gaussian noise sees it."""
+    noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(image + np.float32(sigma) * noise), 0, 255).astype(np.uint8)
+
+
+def at_rest(frames: int = 20, sigma: float = 2.0) -> RestTest:
+    """A test that has seen a still scene."""
+    test = RestTest(noisy(gel(), 0, sigma))
+    for seed in range(frames):
+        test.look(noisy(gel(), seed, sigma))
+    return test
+
+
+def jpeg(quality: int) -> Callable[[int], Image]:
+    def frame(seed: int) -> Image:
+        data = cv2.imencode(".jpg", noisy(gel(), seed), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+    return frame
+
+
+def exposed(seed: int) -> Image:
+    """Light that flickers by up to 4 % in a beat of five frames."""
+    return noisy(gel() * np.float32(1 + 0.02 * np.sin(2 * np.pi * seed / 5)), seed)
+
+
+def banded(seed: int) -> Image:
+    """Bands of a rolling shutter, which run over the picture and are back after five frames."""
+    rows = np.sin(2 * np.pi * (np.arange(240) / 120 + seed / 5))[:, None, None]
+    return noisy(gel() + np.float32(2) * rows.astype(np.float32), seed)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [lambda seed: noisy(gel(), seed), jpeg(30), jpeg(60), jpeg(90), exposed, banded],
+    ids=["noise", "jpeg 30", "jpeg 60", "jpeg 90", "flicker", "bands"],
+)
+def test_a_still_scene_stays_at_rest_whatever_the_camera_does(frame: Callable[[int], Image]) -> None:
+    test = RestTest(frame(0))
+    looks = [test.look(frame(seed)) for seed in range(1, 101)]
+    assert sum(not look.suspect for look in looks) >= 85
+
+
+def test_false_alarms_keep_to_the_share_that_was_asked_for() -> None:
+    """At 20 % asked for, Bonferroni allows no more: of 100 frames 20, and 4 standard deviations are 16."""
+    test = RestTest(noisy(gel(), 0), false_alarms=0.2)
+    looks = [test.look(noisy(gel(), seed)) for seed in range(1, 141)]
+    assert sum(look.suspect for look in looks[40:]) < 20 + 16
+
+
+def spot(radius: int, level: float) -> Floats:
+    return level * cv2.circle(np.zeros((240, 320, 3), np.float32), (100, 90), radius, (1, 1, 1), -1)
+
+
+# In the mean over a window of 7 tiles, a deviation of noise is far below 0.01 levels, and LEVEL / 7 is 0.14.
+@pytest.mark.parametrize(
+    ("what", "image"),
+    [
+        ("a small bright spot", gel() + spot(8, 30)),
+        ("a dark spot of one tile", gel() + spot(8, -10)),
+        ("a shadow of 2 levels over a sixth of the width", gel() + spot(26, -2)),
+        ("a faint shadow of 1 level over a third of the width", gel() + spot(50, -1)),
+        ("colour changes, brightness does not", gel() + spot(40, 1) * np.float32([2, -1, -1])),
+    ],
+)
+def test_what_may_be_a_touch_is_suspect_in_its_first_frame(what: str, image: Floats) -> None:
+    assert at_rest().look(noisy(image, 99)).suspect, what
+
+
+def test_a_touch_in_a_frame_of_its_own_is_seen_and_what_follows_is_rest_again() -> None:
+    test = at_rest()
+    assert test.look(noisy(gel() + spot(8, 30), 99)).suspect
+    # While something touches, all is worked on; the first frame after it still counts as touched.
+    assert test.look(noisy(gel(), 100), touching=True).suspect
+    assert not test.look(noisy(gel(), 101)).suspect
+    assert test.look(noisy(gel() + spot(8, 30), 102)).suspect
+
+
+def test_light_that_creeps_back_is_rest_and_light_that_departs_is_not() -> None:
+    test = at_rest()
+    for frame in range(10):
+        test.look(noisy(gel() + spot(30, 10), 200 + frame), touching=True)
+    back = [test.look(noisy(gel() + spot(30, 10 - frame), 220 + frame)).suspect for frame in range(10)]
+    assert sum(back) <= 1
+    away = [test.look(noisy(gel() + spot(30, 0.1 * frame), 240 + frame)).suspect for frame in range(60)]
+    # One level over the window of 3 tiles is seen at a third of it, and so on from there.
+    assert sum(away) >= 6
+
+
+def test_a_slow_drag_is_looked_at_before_dots_are_off_by_their_tolerance() -> None:
+    test = at_rest(sigma=0.5)
+    looked_at, worst, repeated = 0.0, 0.0, 0
+    for frame in range(40):
+        shift = 0.02 * max(0, frame - 10)
+        if test.look(noisy(gel(shift), 300 + frame, 0.5)).changed:
+            looked_at = shift
+        else:
+            repeated += 1
+        worst = max(worst, shift - looked_at)
+    assert repeated >= 8
+    assert worst <= 0.05
+
+
+def test_a_frame_that_comes_twice_is_repeated_and_teaches_nothing() -> None:
+    test = at_rest()
+    frame = noisy(gel(), 99)
+    test.look(frame)
+    assert [test.look(frame.copy()) for _ in range(60)] == [(False, False)] * 60
+    assert not test.look(noisy(gel(), 100)).suspect
+
+
+def test_what_moves_for_long_is_not_taken_for_noise() -> None:
+    test = at_rest()
+    for frame in range(60):
+        test.look(noisy(gel() + spot(30, 10 * (frame % 2)), 400 + frame), touching=True)
+    for frame in range(10):
+        test.look(noisy(gel(), 500 + frame))
+    assert test.look(noisy(gel() + spot(30, 3), 600)).suspect
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (7, 9), (31, 33), (601, 799)])
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_any_size_and_any_constant_frame_has_an_answer(shape: tuple[int, int], level: int) -> None:
+    frame = np.full((*shape, 3), level, np.uint8)
+    test = RestTest(frame)
+    assert test.look(frame) == (True, True)
+    assert [test.look(frame) for _ in range(5)] == [(False, False)] * 5
+    assert test.look(frame, due=True) == (True, True)
+
+
+def test_views_and_read_only_frames_are_fine_and_left_alone() -> None:
+    view = np.asfortranarray(noisy(gel(), 3))
+    kept = view.copy()
+    view.flags.writeable = False
+    test, plain = RestTest(view), RestTest(kept)
+    for _ in range(3):
+        assert test.look(view) == plain.look(kept)
+    np.testing.assert_array_equal(view, kept)
+
+
+@pytest.mark.parametrize(
+    ("frame", "options", "words"),
+    [
+        (np.zeros((4, 4, 3), np.float32), {}, "required an image"),
+        (np.zeros((0, 4, 3), np.uint8), {}, "required an image"),
+        (np.zeros((4, 4), np.uint8), {}, "required an image"),
+        (np.zeros((4, 4, 3), np.uint8), {"false_alarms": 0}, "false_alarms in"),
+        (np.zeros((4, 4, 3), np.uint8), {"false_alarms": float("nan")}, "false_alarms in"),
+    ],
+)
+def test_what_it_cannot_work_with_is_refused(frame: Image, options: dict[str, float], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        RestTest(frame, **options)
+    with pytest.raises(ValueError, match="required a frame of shape"):
+        RestTest(np.zeros((4, 4, 3), np.uint8)).look(np.zeros((5, 4, 3), np.uint8))
