@@ -91,10 +91,11 @@ $(LEROBOT)/.installed: lerobot_plugin/requirements.txt lerobot_plugin/pyproject.
 		--no-deps --no-build-isolation --editable . --editable lerobot_plugin
 	@touch $@
 
-# On a machine without CUDA, `pip config set global.extra-index-url` with PyTorch's index for CPUs saves 4 GB.
+# Bounds as in LeRobot 0.4.4. On a machine without CUDA, `pip config set global.extra-index-url` with PyTorch's index for CPUs saves 4 GB.
 lerobot-datasets: $(LEROBOT)/.installed
 	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		torch torchvision "accelerate<2" datasets pandas pyarrow av jsonlines einops
+		"torch<2.11" "torchvision<0.26" "accelerate<2" "datasets<5" "huggingface-hub<0.36" "av<16" \
+		pandas pyarrow jsonlines einops
 
 $(TOOLS)/.installed:
 	python3 -m venv $(TOOLS)
