@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import signal
 from collections.abc import Callable, Iterator
@@ -186,3 +187,32 @@ def test_one_ctrl_c_ends_the_look_at_the_source_and_the_next_one_ends_the_comman
         assert ": 5 frames looked at" in capsys.readouterr().out
         monkeypatch.setattr("tactflow.doctor.examine", signalled)
         assert main(words) == 130
+
+
+def test_the_file_for_a_bug_report_has_a_picture_only_if_asked_and_no_secrets(tmp_path: Path) -> None:
+    pipeline, report = tmp_path / "mine.yaml", tmp_path / "report.json"
+    pipeline.write_text(
+        "stages: {capture: {source: rtsp://me:password@camera/1}}\nsinks: {view: {token: abcdefgh}}"
+    )
+    command = [
+        "doctor",
+        "--source",
+        "sim:press?frames=4",
+        "--pipeline",
+        str(pipeline),
+        "--report",
+        str(report),
+    ]
+    main(command)
+    written = json.loads(report.read_text())
+    assert written["frames"]["count"] == 4
+    assert {check["name"] for check in written["checks"]} >= {"rate", "focus", "dots"}
+    assert written["versions"]["python"]
+    assert "rtsp://camera/..." in written["pipeline"]
+    assert not any(secret in report.read_text() for secret in ("password", "abcdefgh"))
+    assert written["picture"] is None
+    main([*command, "--picture"])
+    png = np.frombuffer(base64.b64decode(json.loads(report.read_text())["picture"]), np.uint8)
+    first = cv2.imdecode(png, cv2.IMREAD_COLOR)
+    assert first is not None
+    assert np.array_equal(first, open_scene("press").frame(0))

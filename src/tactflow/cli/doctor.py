@@ -52,6 +52,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_json(parser)
     parser.add_argument("--html", type=Path, metavar="FILE", help="also write the table as a page")
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="FILE",
+        help="also write what a bug report needs into one JSON file: versions, pipeline, measurements; "
+        "without passwords and tokens",
+    )
+    parser.add_argument("--pipeline", dest="reported", metavar="PIPELINE", help="for --report: as for run")
+    parser.add_argument("--picture", action="store_true", help="for --report: include the first frame")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -59,13 +68,17 @@ def run(args: argparse.Namespace) -> int:
 
     Raises
     ------
+    ConfigError
+        If there is no such pipeline, or the report cannot be written.
     SourceError
         If the source delivers nothing.
     """
     if args.source is None:
         return _run_together(args)
     from tactflow.doctor import examine, observe, worst
+    from tactflow.doctor.bug_report import write_bug_report
 
+    pipeline = find_pipeline(args.reported)
     # The first signal ends only the look at the source.
     with ending_handled(interrupt), progress_bar("0 frames") as update:
         seen = observe(args.source, args.seconds, lambda count: update(description=f"{count} frames"))
@@ -80,6 +93,11 @@ def run(args: argparse.Namespace) -> int:
         summary = "nothing is wrong with these pictures"
     if args.html is not None:
         _write_page(args.html, title, summary, seen, findings)
+    if args.report is not None:
+        try:
+            write_bug_report(args.report, seen, findings, pipeline.read_text("utf-8"), picture=args.picture)
+        except OSError as error:
+            raise ConfigError(f"--report: {args.report} cannot be written: {error.strerror}") from None
     if args.json:
         facts = {"source": seen.source, "frames": seen.frames, "verdict": verdict}
         show_json({**facts, "checks": findings})
@@ -92,8 +110,9 @@ def _run_together(args: argparse.Namespace) -> int:
     """Print the rates of all sensors of a pipeline; returns 0, or 3 if one is far too slow."""
     from tactflow.doctor import Sensor, measure_together
 
-    if args.html is not None:
-        raise ConfigError("--html is for the pictures of one sensor: give --source")
+    if args.html is not None or args.report is not None:
+        option = "--report" if args.html is None else "--html"
+        raise ConfigError(f"{option} is for the pictures of one sensor: give --source")
     file = find_pipeline(args.pipeline)
     names: list[str | None] = [*sensor_names(file)] or [None]
     loaded = [load_pipeline(file, sensor=name) for name in names]
