@@ -5,6 +5,7 @@
 # make fuzz         damaged input to every parser, SECONDS for each
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
+# make docs         the site in build/site, from docs/ and examples/gallery (an environment of its own)
 # make packages     the wheel and the sdist in dist/, checked as a package index does
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
 # make lerobot-env  LeRobot in an environment of its own (650 MB), for the tests of its camera
@@ -16,12 +17,13 @@ PY := $(VENV)/bin/python
 TOOLS := $(VENV)-tools
 ROS := $(VENV)-ros
 LEROBOT := $(VENV)-lerobot
+DOCS := $(VENV)-docs
 PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak load fuzz audit lock lint types packages ros-env lerobot-env lerobot-datasets system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types docs packages ros-env lerobot-env lerobot-datasets system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -64,6 +66,17 @@ $(VENV)/.installed-test: pyproject.toml setup.py requirements-test.txt | $(VENV)
 	$(PIP) install --require-hashes --requirement requirements-test.txt
 	$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@ $(VENV)/.installed
+
+docs: $(DOCS)/.installed
+	$(DOCS)/bin/python docs/site/build.py build/site
+
+$(DOCS)/.installed: pyproject.toml setup.py docs/site/requirements.txt
+	python3 -m venv $(DOCS)
+	$(DOCS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		--require-hashes --requirement docs/site/requirements.txt
+	$(DOCS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		--no-deps --no-build-isolation --editable .
+	@touch $@
 
 packages: $(TOOLS)/.installed
 	rm -rf build dist
@@ -115,6 +128,9 @@ lock: $(TOOLS)/.installed
 	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
 		--custom-compile-command "make lock" $(LOCK) --override lerobot_plugin/left_out.txt \
 		--output-file lerobot_plugin/requirements.txt lerobot_plugin/requirements.in
+	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
+		--custom-compile-command "make lock" $(LOCK) --constraint requirements-test.txt --extra plot \
+		--output-file docs/site/requirements.txt docs/site/requirements.in pyproject.toml
 
 ADVISORIES := https://pypi.org/pypi/numpy/2.0.0/json
 audit: $(TOOLS)/.installed
@@ -131,4 +147,4 @@ system-deps:
 	done; dpkg --status $(SYSTEM_DEPS) >/dev/null
 
 clean:
-	rm -rf $(VENV) $(TOOLS) $(ROS) $(LEROBOT) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(TOOLS) $(ROS) $(LEROBOT) $(DOCS) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
 import threading
 from itertools import count
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -48,6 +50,17 @@ def test_the_gripper_closes_until_touch_holds_and_tightens_while_it_slips() -> N
     sink.close()
     closing, holding, tightening, held = widths
     assert closing >= holding > tightening >= held
+
+
+@pytest.mark.parametrize(
+    "example", sorted((EXAMPLES / "gallery").glob("plot_*.py")), ids=lambda path: path.stem
+)
+def test_every_example_of_the_gallery_runs(example: Path) -> None:
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("agg")
+    runpy.run_path(str(example))
+    assert pyplot.get_fignums()
+    pyplot.close("all")
 
 
 def said(stdout: Any, sink: Zmq, results: Results) -> str:

@@ -1,0 +1,181 @@
+"""Build the site: `make docs`, or `python docs/site/build.py OUT` with docs/site/requirements.txt installed.
+
+The pages are README.md, docs/*.md, CONTRIBUTING.md and CHANGELOG.md as they are. Here they are copied into
+one folder, with links to where the site has them, pages for the public names and for the gallery are added,
+and Sphinx makes the site, with warnings as errors. Building twice gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Final
+from urllib.parse import unquote
+from zipfile import ZipFile, ZipInfo
+
+HERE: Final = Path(__file__).resolve().parent
+REPOSITORY: Final = HERE.parents[1]
+NAMES: Final = {
+    "README.md": "index.md",
+    "docs/README.md": "guide.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changes.md",
+}
+"""Page -> its name on the site; a page `docs/NAME.md` is `NAME.md`."""
+BESIDE_THE_GUIDE: Final = {"guide", "index", "changes", "accuracy", "peers"}
+"""Pages that have their own place in the navigation, not within the guide."""
+LINKED: Final = ("examples", "pipelines", "ros")
+"""Folders with files that pages link to."""
+ROOT: Final = """
+```{toctree}
+:hidden:
+
+guide
+gallery/index
+api
+accuracy
+changes
+```
+"""
+
+
+def stage(source: Path) -> None:
+    """Write all pages of the site, as Markdown and Python, into a new folder."""
+    for page in [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md")]:
+        path = page.relative_to(REPOSITORY).as_posix()
+        text = page.read_text(encoding="utf-8")
+        (source / site_name(path)).write_text(with_links(text, page.parent), encoding="utf-8")
+    for picture in REPOSITORY.glob("docs/**/*.jpg"):
+        copy = source / picture.relative_to(REPOSITORY / "docs")
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copyfile(picture, copy)
+    for folder in LINKED:
+        shutil.copytree(REPOSITORY / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    with (source / "index.md").open("a", encoding="utf-8") as index:
+        index.write(ROOT)
+    pages = sorted({page.stem for page in source.glob("*.md")} - BESIDE_THE_GUIDE)
+    with (source / "guide.md").open("a", encoding="utf-8") as guide:
+        guide.write("\n".join(["", "```{toctree}", ":hidden:", "", *pages, "```", ""]))
+    (source / "api.md").write_text(reference(), encoding="utf-8")
+    shutil.copyfile(HERE / "conf.py", source / "conf.py")
+    shutil.copytree(HERE / "static", source / "static")
+
+
+def site_name(path: str) -> str:
+    """File name on the site of a page, given relative to the repository."""
+    return NAMES.get(path, path.removeprefix("docs/"))
+
+
+def with_links(text: str, folder: Path) -> str:
+    """The text of a page of `folder` with the relative links that the site has."""
+
+    def moved(link: re.Match[str]) -> str:
+        path = (folder / link[2]).resolve().relative_to(REPOSITORY).as_posix()
+        return f"{link[1]}{site_name(path)}"
+
+    return re.sub(r"(\]\(|src=\")(?!\w+:|#)([^)\s#\"]+)", moved, text)
+
+
+def reference() -> str:
+    """The page of the public names, in the order of `tactflow.__all__`: functions and types."""
+    import tactflow
+
+    lines = [
+        "# Python reference",
+        "",
+        "What `import tactflow` provides. Every example is run by the tests.",
+        "",
+    ]
+    groups = {"Functions": str.islower, "Classes": lambda name: not name.islower()}
+    for title, belongs in groups.items():
+        names = [name for name in tactflow.__all__ if belongs(name)]
+        rows = [
+            "```{eval-rst}",
+            ".. currentmodule:: tactflow",
+            "",
+            ".. autosummary::",
+            "   :toctree: api",
+            "",
+        ]
+        lines += [f"## {title}", "", *rows, *(f"   {name}" for name in names), "```", ""]
+    return "\n".join(lines)
+
+
+class Page(HTMLParser):
+    """Collects the local links of a page and its anchors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: set[str] = set()
+        self.anchors: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:  # noqa: ARG002
+        """Note what the tag leads to and what it is called."""
+        for key, value in attrs:
+            if value and key in ("href", "src") and not re.match(r"\w+:|//", value):
+                self.links.add(value)
+            elif value and key == "id":
+                self.anchors.add(value)
+
+
+def broken_links(site: Path) -> list[str]:
+    """Local links of all pages that lead to no file or no anchor, as `PAGE: LINK`."""
+    pages = {}
+    for file in [file for file in site.rglob("*.html") if "_static" not in file.parts]:
+        pages[file] = Page()
+        pages[file].feed(file.read_text(encoding="utf-8"))
+    broken = []
+    for file, page in pages.items():
+        for link in sorted(page.links):
+            path, _, anchor = unquote(link).partition("#")
+            there = (file.parent / path.partition("?")[0]).resolve() if path else file
+            known = pages[there].anchors if there in pages else set()
+            if not there.exists() or (there in pages and anchor and anchor not in known):
+                broken.append(f"{file.relative_to(site)}: {link}")
+    return broken
+
+
+def without_dates(archive: Path) -> None:
+    """Write a zip file again with the first date of the format for all that it holds."""
+    with ZipFile(archive) as old:
+        contents = {name: old.read(name) for name in old.namelist()}
+    with ZipFile(archive, "w") as new:
+        for name, content in contents.items():
+            new.writestr(ZipInfo(name), content)
+
+
+def main() -> int:
+    """Build, and check the links; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", type=Path, help="folder for the site; what is there is removed")
+    out = parser.parse_args().out.resolve()
+    # Sphinx and matplotlib write this time, instead of the clock's, into what they make.
+    os.environ["SOURCE_DATE_EPOCH"] = "0"
+    from sphinx.cmd.build import build_main
+
+    shutil.rmtree(out, ignore_errors=True)
+    work = out.with_name(f"{out.name}-source")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    stage(work)
+    code = build_main(["--fail-on-warning", "--quiet", "-d", f"{work}/.doctrees", str(work), str(out)])
+    if code == 0:
+        (out / ".buildinfo").unlink(missing_ok=True)
+        (out / ".nojekyll").touch()
+        for archive in out.rglob("*.zip"):
+            without_dates(archive)
+        broken = broken_links(out)
+        print("\n".join([*broken, f"{out}: {len(broken)} broken links"]))
+        code = bool(broken)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
