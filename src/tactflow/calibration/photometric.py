@@ -140,22 +140,23 @@ class _Sample:
         return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
 
 
-def fit_photometry(session: Session, scale: Scale, ball_radius: float) -> Photometry:
-    """Learn slopes from presses of a ball.
+def fit_photometry(session: Session, scale: Scale, ball_radius: float | Sequence[float]) -> Photometry:
+    """Learn slopes from presses of a ball, or of several.
 
     Presses that fit badly are rejected. The errors come from two fits to one half of the presses each, tried
     on the other half.
 
     Parameters
     ----------
-    session : what `find_presses` found. scale : mm per px. ball_radius : mm.
+    session : what `find_presses` found. scale : mm per px. ball_radius : mm, of all presses or of each.
 
     Raises
     ------
     ConfigError : too few presses, all in one place, or contacts larger than the ball.
     """
-    check_presses(session, scale, ball_radius)
-    samples = _prepared(session, scale, ball_radius)
+    radii = np.broadcast_to(np.asarray(ball_radius, np.float64), len(session.presses))
+    check_presses(session, scale, radii)
+    samples = _prepared(session, scale, radii)
     kept = np.ones(len(samples), np.bool_)
     for _ in range(ROUNDS):
         weights, starts = _fit(samples, np.flatnonzero(kept))
@@ -169,10 +170,10 @@ def fit_photometry(session: Session, scale: Scale, ball_radius: float) -> Photom
         weights, _ = _fit(samples, np.flatnonzero(kept))
     good = np.flatnonzero(kept)
     found = PhotometricEntry(
-        ball_radius=ball_radius,
+        ball_radius=float(np.median(radii)),
         presses=len(good),
         rejected=len(samples) - len(good),
-        steepest=max(samples[i].reach for i in good) / ball_radius,
+        steepest=max(samples[i].reach / samples[i].ball_radius for i in good),
         **_held_out(session, samples, good, scale),
     )
     pixels = centers / (scale.x, scale.y) + scale.origin
@@ -184,18 +185,38 @@ def try_photometry(session: Session, model: SlopeModel, scale: Scale, ball_radiu
 
     session : what `find_presses` found, at least one press. ball_radius : mm.
     """
+    return _summary(press_errors(session, model, scale, ball_radius))
+
+
+def press_errors(
+    session: Session, model: SlopeModel, scale: Scale, ball_radius: float | Sequence[float]
+) -> list[list[float]]:
+    """Errors of a model on each press of a ball.
+
+    session : what `find_presses` found. ball_radius : mm, of all presses or of each.
+
+    Returns
+    -------
+    (n, 5): mean angle of the normals, degrees; relative error of the ball's radius; RMS distance of the
+    heights from it, mm; relative errors of its depth and its volume, from the middle to the rim of the
+    contact: the gel around it is not known. The last four are NaN where a contact is too small.
+    """
     weights = model.coefficients.transpose(2, 0, 1).reshape(2, -1).astype(np.float64)
-    samples = _prepared(session, scale, ball_radius)
+    radii = np.broadcast_to(np.asarray(ball_radius, np.float64), len(session.presses))
+    samples = _prepared(session, scale, radii)
     rest, surface = Rest(session.untouched), Surface(model, scale)
     pairs = zip(session.presses, samples, strict=True)
-    return _summary([_errors(s, weights, _heights(surface, p, rest, s.window)) for p, s in pairs])
+    return [_errors(s, weights, surface.heights(p.image, rest, p.mask)[s.window.part]) for p, s in pairs]
 
 
-def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
-    """Raise ConfigError if the presses cannot give a calibration, with what was found and what to do."""
+def check_presses(session: Session, scale: Scale, radii: Floats) -> None:
+    """Raise ConfigError if the presses cannot give a calibration, with what was found and what to do.
+
+    radii : (n,) float64, mm, of the ball of each press.
+    """
     presses = session.presses
-    if not (np.isfinite(ball_radius) and ball_radius > 0):
-        raise ConfigError(f"calibrate: required a ball radius > 0 mm, got {ball_radius:g}")
+    if not (np.isfinite(radii) & (radii > 0)).all():
+        raise ConfigError(f"calibrate: required a ball radius > 0 mm, got {radii.min():g}")
     if not presses:
         raise ConfigError(
             f"calibrate: nothing touched the gel in {session.frames} frames; the first frame must show it "
@@ -215,6 +236,7 @@ def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
             f"{high:g} % of its height, required {100 * SPREAD:.0f} %; press all over the gel"
         )
     radius = usual_radius(presses) * (scale.x * scale.y) ** 0.5
+    ball_radius = float(np.median(radii))
     if radius > TOO_LARGE * ball_radius:
         raise ConfigError(
             f"calibrate: the contacts have a radius of {radius:.2f} mm in the median, which a ball of radius "
@@ -222,15 +244,17 @@ def check_presses(session: Session, scale: Scale, ball_radius: float) -> None:
         )
 
 
-def _prepared(session: Session, scale: Scale, ball_radius: float) -> list[_Sample]:
-    across, down = SMOOTHED * ball_radius / scale.x, SMOOTHED * ball_radius / scale.y
+def _prepared(session: Session, scale: Scale, radii: Floats) -> list[_Sample]:
+    """radii : (n,), mm, of the ball of each press."""
+    across, down = SMOOTHED * np.median(radii) / (scale.x, scale.y)
 
     def smoothed(image: NDArray[np.uint8]) -> NDArray[np.float32]:
         # Not rounded to grey levels again: that would be as much noise as a camera's.
         return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), across, sigmaY=down), np.float32)
 
     rests = Rest(session.untouched), Rest(smoothed(session.untouched))
-    return [_prepare(press, smoothed(press.image), rests, scale, ball_radius) for press in session.presses]
+    pairs = zip(session.presses, radii.tolist(), strict=True)
+    return [_prepare(press, smoothed(press.image), rests, scale, radius) for press, radius in pairs]
 
 
 def _prepare(
@@ -238,11 +262,12 @@ def _prepare(
 ) -> _Sample:
     """smoothed : the picture of the press. rests : the untouched gel, as it is and smoothed."""
     rest = rests[0]
-    window = surroundings(press.mask, rest.window, 0).window
-    change = colour_change(smoothed, rests[1], window)
+    window = surroundings(press.mask, rest.window).window
+    light = rest.around(press.image, press.mask).light
+    change = colour_change(smoothed, rests[1], window, light)
     size = (window.width, window.height)
     dark = cv2.resize(smoothed[window.whole], size, interpolation=cv2.INTER_AREA).min(axis=2) < DARK
-    change[dark] = colour_change(press.image, rest, window)[dark]
+    change[dark] = colour_change(press.image, rest, window, light)[dark]
     place = place_terms((rest.window.right, rest.window.bottom))[(slice(None), *window.part)]
     terms = place.reshape(PLACE_TERMS, 1, -1) * colour_terms(change)
     rows, columns = np.mgrid[window.part]
@@ -287,7 +312,6 @@ def _solve(presses: Sequence[tuple[_Sample, Floats]]) -> tuple[Floats, Floats]:
 
     The second comes from a constant beside the terms: where no change of colour would have a slope.
     """
-    ball_radius = presses[0][0].ball_radius
     count = PLACE_TERMS * COLOUR_TERMS
     inside = np.zeros((count + 1, count + 1))
     aim = np.zeros((2, count + 1))
@@ -295,9 +319,11 @@ def _solve(presses: Sequence[tuple[_Sample, Floats]]) -> tuple[Floats, Floats]:
     for sample, center in presses:
         dx, dy = sample.x - center[0], sample.y - center[1]
         ball = sample.on_ball(center)
-        terms = np.column_stack([sample.terms[ball], np.ones(np.count_nonzero(ball), np.float32)])
+        # A common offset of the centres tilts a small ball's normals more.
+        shifted = np.full(np.count_nonzero(ball), 1 / sample.ball_radius, np.float32)
+        terms = np.column_stack([sample.terms[ball], shifted])
         inside += terms.T @ terms
-        aim += np.stack([dx[ball], dy[ball]]) / ball_radius @ terms
+        aim += np.stack([dx[ball], dy[ball]]) / sample.ball_radius @ terms
         outer = np.flatnonzero(~sample.hidden & ~ball & sample.inner)
         around += _roundness(sample.terms[outer], dx[outer], dy[outer])
     matrix = np.kron(np.eye(2), inside)
@@ -306,7 +332,7 @@ def _solve(presses: Sequence[tuple[_Sample, Floats]]) -> tuple[Floats, Floats]:
     ridge = np.append(np.repeat([RIDGE, *[PLACE_RIDGE] * (PLACE_TERMS - 1)], COLOUR_TERMS), RIDGE)
     matrix += np.diag(np.tile(ridge, 2) * np.diag(matrix) + 1e-9 * np.trace(matrix) / len(matrix))
     solved = np.linalg.solve(matrix, aim.ravel()).reshape(2, count + 1)
-    return solved[:, :count], ball_radius * solved[:, count]
+    return solved[:, :count], solved[:, count]
 
 
 def _roundness(terms: NDArray[np.float32], dx: Floats, dy: Floats) -> Floats:
@@ -343,17 +369,10 @@ def _held_out(
         weights, _ = _fit(samples, learned)
         surface = Surface(SlopeModel(_shaped(weights)), scale)
         for i in others:
-            heights = _heights(surface, session.presses[i], rest, samples[i].window)
+            press = session.presses[i]
+            heights = surface.heights(press.image, rest, press.mask)[samples[i].window.part]
             errors.append(_errors(samples[i], weights, heights))
     return _summary(errors)
-
-
-def _heights(surface: Surface, press: Press, rest: Rest, window: Window) -> NDArray[np.float32]:
-    """(h, w): heights in a window, as a run finds them in its own, larger one; at rest beyond that."""
-    around = surroundings(press.mask, rest.window)
-    whole = np.zeros((rest.window.height, rest.window.width), np.float32)
-    whole[around.window.part] = surface.heights(press.image, rest, around)
-    return whole[window.part]
 
 
 def _errors(sample: _Sample, weights: Floats, heights: NDArray[np.float32]) -> list[float]:

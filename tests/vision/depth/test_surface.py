@@ -9,7 +9,7 @@ import pytest
 from tactflow.vision.depth.poisson import integrate
 from tactflow.vision.depth.slopes import BAND, STEEPEST, SlopeModel, coordinates, place_terms
 from tactflow.vision.depth.surface import Rest, Surface, colour_change
-from tactflow.vision.depth.surroundings import LEAST_MARGIN, surroundings
+from tactflow.vision.depth.surroundings import LEAST_MARGIN, OpenSides, resting, surroundings
 from tactflow.vision.types import Scale
 
 GEL = np.full((80, 120, 3), (90, 120, 100), np.uint8)
@@ -20,8 +20,25 @@ def test_heights_are_those_of_the_surface_that_has_the_slopes() -> None:
     y, x = np.mgrid[:40, :60].astype(np.float32)
     surface = 8 * np.exp(-((x - 25) ** 2 + (y - 18) ** 2) / 60)
     slope_y, slope_x = np.gradient(surface)
-    found = integrate(np.stack([slope_x, slope_y]).astype(np.float32), (1, 1))
-    assert np.abs(found - found[0, 0] - (surface - surface[0, 0])).max() < 0.2
+    slope = np.stack([slope_x, slope_y]).astype(np.float32)
+    assert np.abs(integrate(slope, (1, 1)) - surface).max() < 0.2
+    open_sides = integrate(slope, (1, 1), OpenSides(True, True, True, True))
+    assert np.abs(open_sides - open_sides[0, 0] - (surface - surface[0, 0])).max() < 0.2
+
+
+@pytest.mark.parametrize("cut", OpenSides._fields)
+def test_a_surface_that_one_side_of_the_window_cuts_off_is_at_rest_at_the_others(cut: str) -> None:
+    y, x = np.mgrid[:80, :80].astype(np.float32)
+    surface = 8 * np.exp(-((x - 40) ** 2 + (y - 40) ** 2) / 90)
+    slope = np.stack(np.gradient(surface)[::-1]).astype(np.float32)
+    part = {
+        "left": np.s_[:, 40:],
+        "right": np.s_[:, :40],
+        "top": np.s_[40:, :],
+        "bottom": np.s_[:40, :],
+    }[cut]
+    found = integrate(slope[(slice(None), *part)], (1, 1), OpenSides(**{cut: True}))
+    assert np.abs(found - surface[part]).max() < 0.25
 
 
 @pytest.mark.parametrize("size", [(40, 61), (37, 60), (2, 8)])
@@ -34,7 +51,7 @@ def test_sides_of_any_length_are_integrated(size: tuple[int, int]) -> None:
         slope[0, :, column] = 2 * np.diff(surface, axis=1)[:, column - 1] - slope[0, :, column - 1]
     for row in range(1, size[0]):
         slope[1, row] = 2 * np.diff(surface, axis=0)[row - 1] - slope[1, row - 1]
-    found = integrate(slope.astype(np.float32), (1, 1))
+    found = integrate(slope.astype(np.float32), (1, 1), OpenSides(True, True, True, True))
     assert found - found[0, 0] == pytest.approx(surface - surface[0, 0], abs=1e-2)
 
 
@@ -50,6 +67,37 @@ def test_the_window_is_inside_the_picture_and_the_contact_in_the_window(corner: 
     rows = near.repeat(BAND, axis=0)[: window.height]
     assert rows.shape == (window.height, window.width)
     assert (rows[mask[window.whole][::2, ::2] > 0] > 0).all()
+
+
+@pytest.mark.parametrize("reach", [40, 80, 140])
+def test_the_gel_is_at_rest_where_its_light_has_faded_and_a_change_of_all_the_light_does_not_count(
+    reach: int,
+) -> None:
+    y, x = np.mgrid[:48, :64] * 8 + 4
+    mask = np.where(np.hypot(x - 250, y - 200) < 40, 255, 0).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+    faded = np.clip(1 - (np.hypot(x - 250, y - 200) - 40) / reach, 0, 1)
+    light = np.array([0.1, 0.2, 0.3], np.float32)
+    change = faded[..., None] * np.array([0.3, -0.2, 0.1]) + light
+    found = resting(change.astype(np.float32), mask[::8, ::8].repeat(8, 0).repeat(8, 1)[:384, :512])
+    assert abs(2 * found.margin - reach) <= 12
+    assert found.light == pytest.approx(light, abs=1e-4)
+
+
+def test_a_press_has_no_step_along_the_border_of_its_heights() -> None:
+    y, x = np.mgrid[:160, :200]
+    model = np.zeros((6, 19, 2))
+    # The first two channels are the two parts of the normal.
+    model[0, 0, 0] = model[0, 1, 1] = 1
+    inward = np.exp(-((x - 100.0) ** 2 + (y - 80.0) ** 2) / 400)
+    gel = np.full((160, 200, 3), 100, np.uint8)
+    change = np.stack([inward * (x - 100), inward * (y - 80), 0 * x], axis=2) / 40
+    image = np.rint(gel + 120 * change).astype(np.uint8)
+    mask = np.where(np.hypot(x - 100, y - 80) < 20, 255, 0).astype(np.uint8)
+    depth = Surface(SlopeModel(model), Scale(0.1, 0.1, (0, 0), (0, 0))).depth(image, Rest(gel), mask)
+    rows, columns = (np.flatnonzero(depth.heights.any(axis=axis)) for axis in (1, 0))
+    around = [depth.heights[rows[[0, -1]]].max(), depth.heights[:, columns[[0, -1]]].max()]
+    assert max(around) < 0.01 * depth.greatest
+    assert depth.greatest == pytest.approx(0.1 * 200 / 40, rel=0.15)
 
 
 def test_of_a_slanting_contact_only_the_gel_beside_it_is_looked_at() -> None:
@@ -89,7 +137,7 @@ def test_a_grainy_gel_that_is_not_touched_has_no_change_of_colour_however_its_me
 ) -> None:
     gel = np.random.default_rng(3).integers(80, 140, GEL.shape).astype(dtype)
     rest = Rest(gel)
-    assert np.abs(colour_change(gel, rest, rest.window)).max() == 0
+    assert np.abs(colour_change(gel, rest, rest.window, np.zeros(3, np.float32))).max() == 0
 
 
 def test_slopes_are_those_of_normals_that_are_a_polynomial_of_colour_and_place_and_never_too_steep() -> None:

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 import scipy.fft
 
 from tactflow.vision.arrays import Floats32
+from tactflow.vision.depth.surroundings import OpenSides
+
+AT_REST: Final = OpenSides()
+"""No side is open."""
+_TRANSFORMS: Final = {
+    (True, True): (scipy.fft.dct, scipy.fft.idct, 2, 0.0),
+    (True, False): (scipy.fft.dct, scipy.fft.idct, 4, 0.5),
+    (False, True): (scipy.fft.dst, scipy.fft.idst, 4, 0.5),
+    (False, False): (scipy.fft.dst, scipy.fft.idst, 2, 1.0),
+}
+"""Whether the first and the last side of an axis are open -> transform, its inverse, their type, and the
+frequency of the first component, in half waves. All of them mirror the surface half a pixel outside: as it is
+where it goes on, upside down where it is at rest."""
 
 
-def integrate(slope: Floats32, step: tuple[float, float]) -> Floats32:
-    """Heights whose slopes come closest to the given ones, in least squares; their mean is 0.
+def integrate(slope: Floats32, step: tuple[float, float], sides: OpenSides = AT_REST) -> Floats32:
+    """Heights whose slopes come closest to the given ones, in least squares.
 
-    Poisson's equation with free borders, solved by cosine transforms.
+    Poisson's equation, solved by cosine and sine transforms. Where all sides are open the mean height is 0.
 
     Parameters
     ----------
     slope : (2, h, w) float32, growth to the right and down; quick where h and w are products of 2, 3 and 5.
     step : from a pixel to the next one, to the right and down, in the unit of the heights.
+    sides : which of them are open.
 
     Returns
     -------
@@ -30,25 +46,45 @@ def integrate(slope: Floats32, step: tuple[float, float]) -> Floats32:
     Examples
     --------
     >>> slope = np.stack([np.full((4, 6), 2, np.float32), np.zeros((4, 6), np.float32)])
-    >>> np.round(integrate(slope, (0.5, 0.5))[0], 3).tolist()
+    >>> np.round(integrate(slope, (0.5, 0.5), OpenSides(True, True, True, True))[0], 3).tolist()
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
+    >>> np.round(integrate(slope, (0.5, 0.5), OpenSides(False, True, True, True))[0], 3).tolist()
+    [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
     """
-    spectrum = scipy.fft.dctn(_divergence(slope, step), norm="ortho", overwrite_x=True)
-    down, across = (2 * np.cos(np.pi * np.arange(side) / side) - 2 for side in spectrum.shape)
-    eigenvalues = np.add.outer(down, across)
-    # The mean is not known from slopes.
-    eigenvalues[0, 0] = np.inf
+    across, across_back, across_type, first_across = _TRANSFORMS[sides.left, sides.right]
+    down, down_back, down_type, first_down = _TRANSFORMS[sides.top, sides.bottom]
+    spectrum = across(_divergence(slope, step, sides), across_type, axis=1, norm="ortho", overwrite_x=True)
+    spectrum = down(spectrum, down_type, axis=0, norm="ortho", overwrite_x=True)
+    height, width = spectrum.shape
+    eigenvalues = np.add.outer(_eigenvalues(height, first_down), _eigenvalues(width, first_across))
+    if all(sides):
+        # The mean is not known from slopes.
+        eigenvalues[0, 0] = np.inf
     spectrum /= eigenvalues
-    return np.asarray(scipy.fft.idctn(spectrum, norm="ortho", overwrite_x=True), np.float32)
+    spectrum = down_back(spectrum, down_type, axis=0, norm="ortho", overwrite_x=True)
+    return np.asarray(across_back(spectrum, across_type, axis=1, norm="ortho", overwrite_x=True), np.float32)
 
 
-def _divergence(slope: Floats32, step: tuple[float, float]) -> Floats32:
+def _eigenvalues(count: int, first: float) -> Floats32:
+    """(count,): of the second difference, for the components of a transform."""
+    return np.asarray(2 * np.cos(np.pi * (np.arange(count) + first) / count) - 2, np.float32)
+
+
+def _divergence(slope: Floats32, step: tuple[float, float], sides: OpenSides) -> Floats32:
     """(h, w): by how much more the surface rises behind each pixel than before it.
 
-    Between two pixels it rises by the mean of their slopes, beyond the border not at all.
+    Between two pixels it rises by the mean of their slopes; beyond an open side not at all, and at a side at
+    rest from its mirror image on.
     """
     slope_x, slope_y = slope
-    across = (slope_x[:, 1:] + slope_x[:, :-1]) * np.float32(step[0] / 2)
-    down = (slope_y[1:] + slope_y[:-1]) * np.float32(step[1] / 2)
-    rise = np.diff(np.pad(across, ((0, 0), (1, 1))), axis=1) + np.diff(np.pad(down, ((1, 1), (0, 0))), axis=0)
-    return np.asarray(rise, np.float32)
+    across = np.pad((slope_x[:, 1:] + slope_x[:, :-1]) * np.float32(step[0] / 2), ((0, 0), (1, 1)))
+    down = np.pad((slope_y[1:] + slope_y[:-1]) * np.float32(step[1] / 2), ((1, 1), (0, 0)))
+    if not sides.left:
+        across[:, 0] = slope_x[:, 0] * np.float32(step[0])
+    if not sides.right:
+        across[:, -1] = slope_x[:, -1] * np.float32(step[0])
+    if not sides.top:
+        down[0] = slope_y[0] * np.float32(step[1])
+    if not sides.bottom:
+        down[-1] = slope_y[-1] * np.float32(step[1])
+    return np.asarray(np.diff(across, axis=1) + np.diff(down, axis=0), np.float32)

@@ -1,7 +1,8 @@
 """The height map of a pressed gel, from its colour.
 
 Only a window around the contact is looked at (`surroundings`), at half resolution: colours become slopes
-(`slopes`), slopes become heights (`poisson`), and the border of the window, outside the contact, is at rest.
+(`slopes`), slopes become heights (`poisson`). The window ends where the gel is found at rest, at height 0, or
+where the picture ends.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from tactflow.vision.arrays import Floats32
 from tactflow.vision.depth.slopes import Bytes, SlopeModel, coordinates
-from tactflow.vision.depth.surroundings import Surroundings, Window, surroundings
+from tactflow.vision.depth.surroundings import CELL, Resting, Surroundings, Window, resting, surroundings
 from tactflow.vision.types import Depth, Scale
 
 DIM: Final = 20.0
@@ -61,19 +62,26 @@ class Rest:
         self.light = _halved(untouched, self.window)
         self.weight: Floats32 = np.reciprocal(self.light + np.float32(DIM), dtype=np.float32)
         self.x, self.y = coordinates((self.window.right, self.window.bottom))
+        self._cells = _in_cells(untouched)
+        self._cell_weight = np.reciprocal(self._cells + np.float32(DIM), dtype=np.float32)
+
+    def around(self, image: Bytes | Floats32, mask: Bytes) -> Resting:
+        """Where the gel around a contact is at rest. image, mask : as `Surface.depth` takes them."""
+        change = np.asarray(cv2.subtract(_in_cells(image), self._cells, dtype=cv2.CV_32F), np.float32)
+        return resting(change * self._cell_weight, mask)
 
 
-def colour_change(image: Bytes | Floats32, rest: Rest, window: Window) -> Floats32:
+def colour_change(image: Bytes | Floats32, rest: Rest, window: Window, light: Floats32) -> Floats32:
     """(h, w, 3) float32: change of the light at half resolution, relative to the light at rest.
 
     image : (H, W, 3) uint8 or float32, grey levels, BGR, without markers; means of 2 x 2 pixels of uint8 are
-    rounded. What the window's border shows, a change of the light as a whole, is taken out.
+    rounded. light : (3,), `Resting.light`, a change of the light as a whole, which is taken out.
     """
     halved = _halved(image, window)
     change = np.asarray(cv2.subtract(halved, rest.light[window.part], dtype=cv2.CV_32F), np.float32)
     change *= rest.weight[window.part]
     # In numpy this takes nine times as long, for the three channels are the inner loop.
-    cv2.subtract(change, (*_median(_border(change)).tolist(), 0.0), change)  # type: ignore[call-overload]
+    cv2.subtract(change, (*light.tolist(), 0.0), change)  # type: ignore[call-overload]
     return change
 
 
@@ -112,14 +120,15 @@ class Surface:
         gradients : (H, W, 2), `tactflow.ports.Gradients`, in place of those by the model; then no errors are
         known.
         """
-        around = surroundings(mask, rest.window)
+        at_rest = rest.around(image, mask)
+        around = surroundings(mask, rest.window, at_rest.margin)
         window = around.window
         if gradients is None:
-            slope, steep = self._slopes(image, rest, around)
+            slope, steep = self._slopes(image, rest, around, at_rest.light)
         else:
             # The model's slopes fall where the gel is pushed in.
             slope, steep = -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32), 0.0
-        low = self._integrated(slope)
+        low = self._integrated(slope, window, rest.window)
         heights = np.zeros(mask.shape, np.float32)
         size = (2 * window.width, 2 * window.height)
         cv2.resize(low, size, heights[window.whole], interpolation=cv2.INTER_LINEAR)
@@ -134,22 +143,33 @@ class Surface:
             volume_error = volume * math.hypot(balls.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
         return Depth(heights, greatest, depth_error, volume, volume_error, pressed)
 
-    def heights(self, image: Bytes, rest: Rest, around: Surroundings) -> Floats32:
-        """(h, w) float32: how far the gel is pushed in, mm >= 0, in a window at half resolution."""
-        return self._integrated(self._slopes(image, rest, around)[0])
+    def heights(self, image: Bytes, rest: Rest, mask: Bytes) -> Floats32:
+        """(h, w) float32: how far the gel is pushed in, mm >= 0, at half resolution; see `depth`."""
+        at_rest = rest.around(image, mask)
+        around = surroundings(mask, rest.window, at_rest.margin)
+        slope, _ = self._slopes(image, rest, around, at_rest.light)
+        whole = np.zeros((rest.window.height, rest.window.width), np.float32)
+        whole[around.window.part] = self._integrated(slope, around.window, rest.window)
+        return whole
 
-    def _slopes(self, image: Bytes, rest: Rest, around: Surroundings) -> tuple[Floats32, float]:
+    def _slopes(
+        self, image: Bytes, rest: Rest, around: Surroundings, light: Floats32
+    ) -> tuple[Floats32, float]:
         """(2, h, w) float32, and the part of all slope that is steeper than the ball has shown, 0 to 1."""
-        change = colour_change(image, rest, around.window)
+        change = colour_change(image, rest, around.window, light)
         assert self._model is not None, "without a model, gradients are given"
         rows, columns = around.window.part
         slope = self._model.slopes(change, rest.x[columns], rest.y[rows], around.near)
         return slope, 0.0 if self._errors is None else _steep_part(slope, self._errors.steepest)
 
-    def _integrated(self, slope: Floats32) -> Floats32:
+    def _integrated(self, slope: Floats32, window: Window, whole: Window) -> Floats32:
         # Two processed pixels a step. Slopes rise towards the camera, where the gel is pushed to.
-        heights = self._integrate(slope, (-2 * self._scale.x, -2 * self._scale.y))
-        heights -= _median(_border(heights[..., None]))
+        sides = window.cut_by(whole)
+        heights = self._integrate(slope, (-2 * self._scale.x, -2 * self._scale.y), sides)
+        if all(sides):
+            # The picture shows no border at rest; most of its border lies outside the contact.
+            border = np.concatenate([heights[0], heights[-1], heights[:, 0], heights[:, -1]])
+            heights -= np.median(border)
         return np.maximum(heights, 0, out=heights)
 
 
@@ -169,12 +189,8 @@ def _halved(image: Bytes | Floats32, window: Window) -> Bytes | Floats32:
     return cv2.resize(image[window.whole], (window.width, window.height), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
-def _border(values: Floats32) -> Floats32:
-    """(n, c): the outermost pixels of (h, w, c)."""
-    return np.concatenate([values[0], values[-1], values[:, 0], values[:, -1]])
-
-
-def _median(values: Floats32) -> Floats32:
-    """(c,): the middle ones of (n, c). `np.partition` takes up to five times as long, if many are equal."""
-    ordered = np.sort(values, axis=0)
-    return np.asarray(ordered[len(values) // 2], np.float32)
+def _in_cells(image: Bytes | Floats32) -> Bytes | Floats32:
+    """(h, w, 3) of the picture's dtype: its means over cells; a rest that fills none is left out."""
+    height, width = (max(side // CELL, 1) for side in image.shape[:2])
+    whole = image[: height * CELL, : width * CELL]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.depth.slopes import BAND, Bytes
 from tactflow.vision.geometry.region import measure_region
 
-MARGIN: Final = 1.25
-"""How far the gel may have sunk beyond the contact, relative to half of the contact's shorter axis. Chosen on
-the simulator: with 0.8 `finger` has errors of 2.6 % under `photometric` instead of 0.7."""
 LEAST_MARGIN: Final = 12
-"""The same at least, pixels at half resolution; a calibration looks no farther. With 8, errors under `mixed`
-are two to seven times as large; with 14, those of a box there are 5.4 % instead of 4.2."""
+"""How far the gel may have sunk beyond the contact at least, pixels at half resolution; a calibration looks
+no farther. With 8, errors under `mixed` are two to seven times as large."""
+CELL: Final = 8
+"""Side of the cells in which the distance at which the gel is at rest is looked for, px of the picture."""
+FADED: Final = 0.05
+"""Change of the light, over that at the rim of the contact and beyond what it is far away, at which the gel
+counts as at rest: what lies beyond adds a hundredth to the depth."""
+
+
+class OpenSides(NamedTuple):
+    """Sides of a window beyond which the surface goes on; beyond the others it is at rest, at height 0."""
+
+    left: bool = False
+    right: bool = False
+    top: bool = False
+    bottom: bool = False
 
 
 class Window(NamedTuple):
@@ -37,6 +48,15 @@ class Window(NamedTuple):
         """Columns."""
         return self.right - self.left
 
+    def cut_by(self, whole: Window) -> OpenSides:
+        """Which of its sides the picture cuts off. whole : the picture."""
+        return OpenSides(
+            self.left == whole.left,
+            self.right == whole.right,
+            self.top == whole.top,
+            self.bottom == whole.bottom,
+        )
+
     @property
     def part(self) -> tuple[slice, slice]:
         """Rows and columns at half resolution."""
@@ -56,14 +76,12 @@ class Surroundings(NamedTuple):
     near: Bytes
 
 
-def surroundings(mask: Bytes, whole: Window, relative: float = MARGIN) -> Surroundings:
+def surroundings(mask: Bytes, whole: Window, margin: int = LEAST_MARGIN) -> Surroundings:
     """Around the contact of a mask (H, W) uint8, 255 in contact; not all 0.
 
-    relative : how far, in halves of the contact's shorter axis; `LEAST_MARGIN` at least.
+    margin : how far from the contact, pixels at half resolution.
     """
-    contact = measure_region(mask)
-    x, y, width, height = contact[:4]
-    margin = max(LEAST_MARGIN, round(relative * math.sqrt(contact.moments().principal[1])))
+    x, y, width, height = measure_region(mask)[:4]
     left, right = max(0, x // 2 - margin), min((x + width + 1) // 2 + margin, whole.right)
     # Rows of such a length are transformed in a third of the time.
     columns = min(cv2.getOptimalDFTSize(right - left), whole.right)
@@ -71,6 +89,48 @@ def surroundings(mask: Bytes, whole: Window, relative: float = MARGIN) -> Surrou
     top, bottom = max(0, y // 2 - margin), min((y + height + 1) // 2 + margin, whole.bottom)
     window = Window(top, bottom, left, left + columns)
     return Surroundings(window, _near(mask, window, margin))
+
+
+class Resting(NamedTuple):
+    """Where the gel around a contact is at rest.
+
+    margin : distance from the contact, pixels at half resolution. light : (3,) float32, change of the light
+    there, relative to the light at rest.
+    """
+
+    margin: int
+    light: Floats32
+
+
+def resting(change: Floats32, mask: Bytes) -> Resting:
+    """Find from where on the gel around a contact is at rest.
+
+    The light changes ever less with the distance from the contact: of all rings around it the gel is at rest
+    from the first on in which the mean change has faded (`FADED`).
+
+    change : (h, w, 3) float32, relative change of the light in cells of `CELL` x `CELL` pixels. mask : (H, W)
+    uint8, 255 in contact; not all 0.
+    """
+    height, width = change.shape[:2]
+    contact = cv2.resize(mask[: height * CELL, : width * CELL], (width, height), interpolation=cv2.INTER_AREA)
+    if contact.all() or not contact.any():
+        return Resting(LEAST_MARGIN, np.zeros(3, np.float32))
+    distance = cv2.distanceTransform((contact == 0).view(np.uint8), cv2.DIST_L2, 5)
+    ring = distance.astype(np.intp)
+    light = _median(change[ring >= min(LEAST_MARGIN * 2 // CELL, ring.max())])
+    strength = np.sqrt(((change - light) ** 2).sum(axis=2)).ravel()
+    rings = ring.ravel()
+    profile = np.bincount(rings, strength) / np.maximum(np.bincount(rings), 1)
+    far = float(profile[1:].min())
+    faded = np.flatnonzero(profile[1:] <= far + FADED * (profile[1] - far))
+    first = int(faded[0]) + 1
+    return Resting(max(LEAST_MARGIN, first * CELL // 2), _median(change[ring >= first]))
+
+
+def _median(values: Floats32) -> Floats32:
+    """(c,): the middle ones of (n, c). `np.partition` takes up to five times as long, if many are equal."""
+    ordered = np.sort(values, axis=0)
+    return np.asarray(ordered[len(values) // 2], np.float32)
 
 
 def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
