@@ -77,8 +77,12 @@ def _divergence(slope: Floats32, step: tuple[float, float], sides: OpenSides) ->
     rest from its mirror image on.
     """
     slope_x, slope_y = slope
-    across = np.pad((slope_x[:, 1:] + slope_x[:, :-1]) * np.float32(step[0] / 2), ((0, 0), (1, 1)))
-    down = np.pad((slope_y[1:] + slope_y[:-1]) * np.float32(step[1] / 2), ((1, 1), (0, 0)))
+    height, width = slope_x.shape
+    across, down = np.zeros((height, width + 1), np.float32), np.zeros((height + 1, width), np.float32)
+    np.add(slope_x[:, 1:], slope_x[:, :-1], across[:, 1:-1])
+    np.add(slope_y[1:], slope_y[:-1], down[1:-1])
+    across *= np.float32(step[0] / 2)
+    down *= np.float32(step[1] / 2)
     if not sides.left:
         across[:, 0] = slope_x[:, 0] * np.float32(step[0])
     if not sides.right:
@@ -87,4 +91,4 @@ def _divergence(slope: Floats32, step: tuple[float, float], sides: OpenSides) ->
         down[0] = slope_y[0] * np.float32(step[1])
     if not sides.bottom:
         down[-1] = slope_y[-1] * np.float32(step[1])
-    return np.asarray(np.diff(across, axis=1) + np.diff(down, axis=0), np.float32)
+    return across[:, 1:] - across[:, :-1] + down[1:] - down[:-1]

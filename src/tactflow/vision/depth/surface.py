@@ -192,5 +192,8 @@ def _halved(image: Bytes | Floats32, window: Window) -> Bytes | Floats32:
 def _in_cells(image: Bytes | Floats32) -> Bytes | Floats32:
     """(h, w, 3) of the picture's dtype: its means over cells; a rest that fills none is left out."""
     height, width = (max(side // CELL, 1) for side in image.shape[:2])
-    whole = image[: height * CELL, : width * CELL]
-    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+    cells = image[: height * CELL, : width * CELL]
+    # Three halvings take a quarter of the time of one step, for OpenCV has a loop of its own for them.
+    for side in (CELL // 2, CELL // 4, 1):
+        cells = cv2.resize(cells, (width * side, height * side), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+    return cells

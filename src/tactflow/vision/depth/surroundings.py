@@ -112,25 +112,21 @@ def resting(change: Floats32, mask: Bytes) -> Resting:
     uint8, 255 in contact; not all 0.
     """
     height, width = change.shape[:2]
-    contact = cv2.resize(mask[: height * CELL, : width * CELL], (width, height), interpolation=cv2.INTER_AREA)
+    middle = CELL // 2
+    contact = mask[middle : height * CELL : CELL, middle : width * CELL : CELL]
     if contact.all() or not contact.any():
         return Resting(LEAST_MARGIN, np.zeros(3, np.float32))
-    distance = cv2.distanceTransform((contact == 0).view(np.uint8), cv2.DIST_L2, 5)
-    ring = distance.astype(np.intp)
-    light = _median(change[ring >= min(LEAST_MARGIN * 2 // CELL, ring.max())])
-    strength = np.sqrt(((change - light) ** 2).sum(axis=2)).ravel()
+    ring = cv2.distanceTransform((contact == 0).view(np.uint8), cv2.DIST_L2, 5).astype(np.intp)
+    outside = change[ring >= min(2 * LEAST_MARGIN // CELL, ring.max())]
+    # The middle of three sorted columns; `np.median` takes three times as long.
+    light = np.sort(outside.T.copy(), axis=1)[:, len(outside) // 2]
+    off = change - light
+    strength = np.sqrt(np.einsum("ijk,ijk->ij", off, off)).ravel()
     rings = ring.ravel()
     profile = np.bincount(rings, strength) / np.maximum(np.bincount(rings), 1)
     far = float(profile[1:].min())
     faded = np.flatnonzero(profile[1:] <= far + FADED * (profile[1] - far))
-    first = int(faded[0]) + 1
-    return Resting(max(LEAST_MARGIN, first * CELL // 2), _median(change[ring >= first]))
-
-
-def _median(values: Floats32) -> Floats32:
-    """(c,): the middle ones of (n, c). `np.partition` takes up to five times as long, if many are equal."""
-    ordered = np.sort(values, axis=0)
-    return np.asarray(ordered[len(values) // 2], np.float32)
+    return Resting(max(LEAST_MARGIN, (int(faded[0]) + 1) * CELL // 2), light)
 
 
 def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
