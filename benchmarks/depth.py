@@ -22,6 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 
 import tactflow
 from tactflow.calibration.photometric import Photometry, fit_photometry, press_errors
@@ -118,7 +119,7 @@ def judge(fitted: Photometry, session: Session, scale: Scale, radii: list[float]
     )
 
 
-def border(heights: np.ndarray) -> float:
+def border(heights: NDArray[np.float32]) -> float:
     """Greatest height along the border of what is not 0, inside the picture, mm."""
     rows, columns = (np.flatnonzero(heights.any(axis=axis)) for axis in (1, 0))
     if not rows.size:

@@ -246,7 +246,8 @@ def check_presses(session: Session, scale: Scale, radii: Floats) -> None:
 
 def _prepared(session: Session, scale: Scale, radii: Floats) -> list[_Sample]:
     """radii : (n,), mm, of the ball of each press."""
-    across, down = SMOOTHED * np.median(radii) / (scale.x, scale.y)
+    width = SMOOTHED * float(np.median(radii))
+    across, down = width / scale.x, width / scale.y
 
     def smoothed(image: NDArray[np.uint8]) -> NDArray[np.float32]:
         # Not rounded to grey levels again: that would be as much noise as a camera's.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 import numpy as np
 import scipy.fft
@@ -10,9 +11,11 @@ import scipy.fft
 from tactflow.vision.arrays import Floats32
 from tactflow.vision.depth.surroundings import OpenSides
 
+_Transform = Callable[..., Any]
+
 AT_REST: Final = OpenSides()
 """No side is open."""
-_TRANSFORMS: Final = {
+_TRANSFORMS: Final[Mapping[tuple[bool, bool], tuple[_Transform, _Transform, int, float]]] = {
     (True, True): (scipy.fft.dct, scipy.fft.idct, 2, 0.0),
     (True, False): (scipy.fft.dct, scipy.fft.idct, 4, 0.5),
     (False, True): (scipy.fft.dst, scipy.fft.idst, 4, 0.5),
