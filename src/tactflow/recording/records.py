@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -42,6 +43,11 @@ RECORD_HEAD = 9
 MOST_RECORDS = 1_000_000
 """Records of a chunk, above which it counts as damaged: hours of a sensor's messages."""
 
+_FOOTER = struct.Struct("<QQI8s")
+"""Where the index begins, where its offsets do, its checksum, and `MAGIC`: the last bytes of a file."""
+_PIECE = 1 << 20
+"""Bytes that are read at once for a checksum."""
+
 _DATA = (Attachment, Channel, Header, Message, Metadata, Schema)
 """All records outside of chunks but the index, which follows from the rest."""
 
@@ -63,14 +69,36 @@ class Damage:
 
 
 def read_summary(file: BinaryIO) -> Summary | None:
-    """The index at the end of the file, or None where it was cut off, or the file is of another kind."""
+    """The index at the end of the file, or None where it is damaged, cut off, or of another kind of file."""
     size = file.seek(0, io.SEEK_END)
-    file.seek(0)
     try:
+        if not _index_is_intact(file, size):
+            return None
+        file.seek(0)
         return SeekingReader(file, record_size_limit=size).get_summary()
     except (*DAMAGE, OSError):
         # The file is shorter than a footer, or does not end with one.
         return None
+
+
+def _index_is_intact(file: BinaryIO, size: int) -> bool:
+    """Whether the index has the checksum that the footer states, where it states one.
+
+    size : of the file, bytes. Raises OSError or struct.error if the file is shorter than a footer.
+    """
+    file.seek(size - _FOOTER.size)
+    start, _, checksum, magic = _FOOTER.unpack(file.read(_FOOTER.size))
+    if magic != MAGIC or not checksum or start >= size:
+        return magic == MAGIC and start < size
+    file.seek(start)
+    # All from the index on but the checksum itself and the magic bytes behind it.
+    left, found = size - start - len(MAGIC) - 4, 0
+    while left > 0:
+        piece = file.read(min(left, _PIECE))
+        left, found = left - len(piece), zlib.crc32(piece, found)
+        if not piece:
+            return False
+    return found == checksum
 
 
 def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
@@ -100,7 +128,10 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
         reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=size)
         try:
             for record in reader.records:
-                start, at = at, file.tell()
+                start, end = at, file.tell()
+                if end > next((chunk for chunk in chunks if chunk > start), size):
+                    raise ValueError("a record reaches into the next chunk")
+                at = end
                 if not isinstance(record, Header):
                     yield from described
                     described = []

@@ -77,7 +77,7 @@ class RestTest:
     >>> test.look(still)
     Look(changed=True, suspect=True)
     >>> [test.look(still + np.uint8(level)).suspect for level in (0, 1, 0, 1, 0, 1, 1)]
-    [True, True, True, True, True, False, False]
+    [False, True, True, True, False, False, False]
     """
 
     def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-3) -> None:
