@@ -126,7 +126,7 @@ class Difference(Stage):
             result = self._detector.detect(unmarked, marker_mask, markers)
         else:
             result = self._detector.detect(unmarked, marker_mask)
-        if self._check is None or not self._check.was_touched(unmarked, result.mask):
+        if not result.touching or self._check is None or not self._check.was_touched(unmarked, result.mask):
             self._doubted = 0
             return ContactPorts(result.mask, result.touching)
         self._doubted += 1

@@ -44,8 +44,10 @@ class ReferenceCheck:
 
         image : (H, W, 3) uint8 BGR, of the reference's size, without markers. changed : (H, W) uint8.
         """
+        if self.confirmed:
+            return False
         region = to_cells(changed, self._size) > HALF
-        if self.confirmed or not region.any():
+        if not region.any():
             return False
         now, before = (
             float(_squared_slopes(light)[:, region].sum())
