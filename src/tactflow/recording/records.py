@@ -84,12 +84,12 @@ def read_summary(file: BinaryIO) -> Summary | None:
 def _index_is_intact(file: BinaryIO, size: int) -> bool:
     """Whether the index has the checksum that the footer states, where it states one.
 
-    size : of the file, bytes. Raises OSError or struct.error if the file is shorter than a footer.
+    size : of the file, bytes. Raises OSError, ValueError or struct.error if the file is shorter.
     """
     file.seek(size - _FOOTER.size)
     start, _, checksum, magic = _FOOTER.unpack(file.read(_FOOTER.size))
     if magic != MAGIC or not checksum or start >= size:
-        return magic == MAGIC and start < size
+        return bool(magic == MAGIC and start < size)
     file.seek(start)
     # All from the index on but the checksum itself and the magic bytes behind it.
     left, found = size - start - len(MAGIC) - 4, 0
@@ -98,7 +98,7 @@ def _index_is_intact(file: BinaryIO, size: int) -> bool:
         left, found = left - len(piece), zlib.crc32(piece, found)
         if not piece:
             return False
-    return found == checksum
+    return bool(found == checksum)
 
 
 def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
