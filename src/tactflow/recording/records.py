@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import BinaryIO
@@ -43,8 +44,8 @@ RECORD_HEAD = 9
 MOST_RECORDS = 1_000_000
 """Records of a chunk, above which it counts as damaged: hours of a sensor's messages."""
 
-_FOOTER = struct.Struct("<QQI8s")
-"""Where the index begins, where its offsets do, its checksum, and `MAGIC`: the last bytes of a file."""
+_FOOTER = struct.Struct("<QQI")
+"""Where the index begins, where its offsets do, and its checksum: the last bytes of a file before `MAGIC`."""
 _PIECE = 1 << 20
 """Bytes that are read at once for a checksum."""
 
@@ -86,10 +87,10 @@ def _index_is_intact(file: BinaryIO, size: int) -> bool:
 
     size : of the file, bytes. Raises OSError, ValueError or struct.error if the file is shorter.
     """
-    file.seek(size - _FOOTER.size)
-    start, _, checksum, magic = _FOOTER.unpack(file.read(_FOOTER.size))
-    if magic != MAGIC or not checksum or start >= size:
-        return bool(magic == MAGIC and start < size)
+    file.seek(size - _FOOTER.size - len(MAGIC))
+    start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
+    if not checksum:
+        return True
     file.seek(start)
     # All from the index on but the checksum itself and the magic bytes behind it.
     left, found = size - start - len(MAGIC) - 4, 0
@@ -129,7 +130,7 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
         try:
             for record in reader.records:
                 start, end = at, file.tell()
-                if end > next((chunk for chunk in chunks if chunk > start), size):
+                if end > _first_behind(start, chunks, size):
                     raise ValueError("a record reaches into the next chunk")
                 at = end
                 if not isinstance(record, Header):
@@ -143,10 +144,16 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
                     yield from [] if summary is None else [record]
                     return
         except DAMAGE:
-            after = next((chunk for chunk in chunks if chunk > at), size)
+            after = _first_behind(at, chunks, size)
             if at < after:
                 yield Damage(at, after)
             at = after
+
+
+def _first_behind(place: int, chunks: Sequence[int], size: int) -> int:
+    """Where the first of the sorted chunks behind a place begins; the size of the file if there is none."""
+    index = bisect_right(chunks, place)
+    return chunks[index] if index < len(chunks) else size
 
 
 def _unpacked(chunk: Chunk, place: Damage) -> Iterator[McapRecord | Damage]:
