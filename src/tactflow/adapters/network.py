@@ -29,6 +29,7 @@ from tactflow.ports import (
 )
 from tactflow.system.extras import missing
 from tactflow.system.files import expanded
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import Depth, Features, Force, Markers
 
@@ -37,7 +38,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tactflow")
 
+Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+_READ: Final = "Array(uint8, 2, 'C', readonly=True)"
 Side = int | None
 """Length of an axis; None where only a frame tells, or any will do."""
 
@@ -265,7 +268,7 @@ class Network(Stage):
     def reset(self) -> None:
         """Forget earlier frames."""
         for feed in self._feeds.values():
-            feed.past.clear()
+            feed.reset()
 
     def process(self, *inputs: Any) -> tuple[Any, ...]:
         """Run the network on the values of the ports that `declare` names, in this order."""
@@ -277,7 +280,9 @@ class Network(Stage):
         by_name = dict(zip(dict.fromkeys(self._wanted), found, strict=True))
         results: list[Any] = []
         for name, (port, value) in zip(self._wanted, self.params.outputs.items(), strict=True):
-            array = np.asarray(by_name[name], np.float32) * np.float32(value.scale)
+            array = np.asarray(by_name[name], np.float32)
+            if value.scale != 1:
+                array = array * np.float32(value.scale)
             if not np.isfinite(array).all():
                 raise StageError(f"{self._file}: output {name} is not finite in this frame")
             results += self._result(port, value, array)
@@ -292,7 +297,7 @@ class Network(Stage):
         if port == "gradients":
             return [self._first.picture(array, 2)]
         if port == "contact_mask":
-            mask = np.where(self._first.picture(array, 1)[..., 0] > params.threshold, 255, 0).astype(np.uint8)
+            mask = (self._first.picture(array, 1)[..., 0] > params.threshold) * np.uint8(255)
             return [mask, bool(mask.any())]
         return [array[0] if array.ndim == len(params.shape) + 1 else array]
 
@@ -307,20 +312,17 @@ class _Geometry(NamedTuple):
 
 
 class _Feed:
-    """Makes what one input of the network gets. Buffers are used again in the next frame."""
+    """Makes what one input of the network gets, in memory that the next frame uses again."""
 
     def __init__(self, params: InputParams) -> None:
         self.params = params
-        self.past: deque[Floats] = deque(maxlen=(params.frames - 1) * params.stride + 1)
+        self._past: deque[NDArray[Any]] = deque(maxlen=(params.frames - 1) * params.stride + 1)
         self._where = ""
         self._sides: tuple[Side, ...] = ()
         self._size = params.size
         self._dtype: type[Any] = np.float32
-        self._geometry: _Geometry | None = None
-        self._background: tuple[Any, list[NDArray[Any]]] | None = None
-        self._tensor: Floats | None = None
-        self._factors: list[float] = []
-        self._offsets: list[float] = []
+        self._shape: tuple[int, ...] = ()
+        self._background: Untouched | None = None
 
     def fit(self, where: str, shape: Sequence[Any], dtype: str) -> None:
         """Compare with the input of the file. Raises StageError with both shapes if they do not fit."""
@@ -342,122 +344,117 @@ class _Feed:
                 "(without a batch); see port, size, frames and layout of this input"
             )
 
+    def reset(self) -> None:
+        """Forget earlier frames."""
+        self._past.clear()
+
     def __call__(self, value: Any, background: Untouched | None) -> NDArray[Any]:
         """What the network gets of this frame."""
-        array = _array(value)
-        height, width = array.shape[:2]
-        if self._geometry is None or self._geometry.size != (width, height):
-            self._geometry, self._background = self._placed(width, height), None
-            self._tensor = None
-            self.past.clear()
-        self.past.append(self._planes(array, background))
-        tensor = self._joined()
+        p, array = self.params, _array(value)
+        if array.shape != self._shape:
+            self._prepare(array)
+        if p.background != "none" and background is not self._background:
+            assert background is not None
+            self._background, self._rest = background, self._resized(background)
+        oldest = self._past[0] if len(self._past) == self._past.maxlen and self._owned else None
+        self._past.append(self._resized(array, oldest))
+        places = [max(0, len(self._past) - 1 - back * p.stride) for back in range(p.frames)]
+        for place, part in zip(places if p.newest_first else places[::-1], self._parts, strict=True):
+            self._write(self._past[place], part)
         if self._dtype is np.float32:
-            return tensor
-        limits = (0, 255) if self._dtype is np.uint8 else (None, None)
-        return np.clip(np.rint(tensor) if limits[1] else tensor, *limits).astype(self._dtype)
+            return self._tensor
+        if self._dtype is np.uint8:
+            return np.clip(np.rint(self._tensor), 0, 255).astype(np.uint8)
+        return self._tensor.astype(self._dtype)
 
-    def _placed(self, width: int, height: int) -> _Geometry:
-        outer = self._size or (width, height)
-        inner = outer
-        if self.params.pad:
-            ratio = min(outer[0] / width, outer[1] / height)
-            inner = max(1, round(width * ratio)), max(1, round(height * ratio))
-        corner = (outer[0] - inner[0]) // 2, (outer[1] - inner[1]) // 2
-        return _Geometry((width, height), inner, corner, outer)
+    def _prepare(self, array: NDArray[Any]) -> None:
+        """Make room for frames like this one."""
+        p, (height, width) = self.params, array.shape[:2]
+        self._geometry = _placed((width, height), self._size or (width, height), p.pad)
+        self.reset()
+        self._background, self._shape = None, array.shape
+        resized = self._resized(array)
+        # Whether resized pictures are ours to write to.
+        self._owned = resized is not array
+        height, width, count = np.atleast_3d(resized).shape
+        channels = count * (2 if p.background == "concat" else 1)
+        shape = p.shape(channels + 2 * p.coordinates, height, width)
+        self._compare(shape)
+        affine = self._coefficients(channels)
+        self._affines = [affine[:, first : first + count].copy() for first in range(0, channels, count)]
+        self._rest = self._nothing = np.zeros(resized.shape, resized.dtype)
+        batch = (1,) if len(self._sides) > len(shape) else ()
+        self._tensor = np.empty((*batch, *(side or 0 for side in shape)), np.float32)
+        axes = (-1, height, width) if p.layout == "chw" else (height, width, -1)
+        self._parts = self._tensor.reshape(p.frames, *axes)
+        planes = np.empty((1, channels + 2 * p.coordinates, height, width), np.float32)
+        self._planes = planes = self._parts if p.layout == "chw" else planes
+        if p.coordinates:
+            planes[:, -2] = np.arange(width, dtype=np.float32) / width
+            planes[:, -1] = np.arange(height, dtype=np.float32)[:, None] / height
 
-    def _channels(self, array: NDArray[Any]) -> list[NDArray[Any]]:
-        """The channels of a picture in the network's size and order, each (h, w)."""
-        p, geometry = self.params, self._geometry
-        assert geometry is not None
-        if geometry.inner != geometry.size:
-            method = cv2.INTER_AREA if p.interpolation == "area" else cv2.INTER_LINEAR
-            array = cv2.resize(array, geometry.inner, interpolation=method)
-        if geometry.inner != geometry.outer:
-            (left, top), (width, height) = geometry.corner, geometry.inner
-            right, bottom = geometry.outer[0] - left - width, geometry.outer[1] - top - height
-            array = cv2.copyMakeBorder(array, top, bottom, left, right, cv2.BORDER_CONSTANT)
-        if array.ndim == 3 and array.shape[2] == 3 and p.colour == "grey":
-            array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY)
-        channels = list(cv2.split(array))
-        return channels[::-1] if p.colour == "rgb" and len(channels) == 3 else channels
-
-    def _planes(self, array: NDArray[Any], background: Untouched | None) -> Floats:
-        """(C, h, w) float32 of one frame, in a buffer of an earlier one that is no longer needed."""
-        p = self.params
-        channels = self._channels(array)
-        behind: list[NDArray[Any]] = []
-        if background is not None and p.background != "none":
-            if self._background is None or self._background[0] is not background:
-                self._background = background, self._channels(background)
-            behind = self._background[1]
-        both = [*channels, *behind] if p.background == "concat" else channels
-        if len(self._factors) != len(both):
-            self._factors, self._offsets = self._affine(len(both))
-        factors, offsets = self._factors, self._offsets
-        planes = self._buffer(len(both), channels[0].shape[:2])
-        for index, channel in enumerate(both):
-            factor, offset = factors[index], offsets[index]
-            subtracts = p.background in ("subtract", "subtract_half")
-            other, weight = (behind[index], -factor) if subtracts else (channel, 0.0)
-            cv2.addWeighted(channel, factor, other, weight, offset, planes[index], cv2.CV_32F)
-            if p.background == "subtract_half":
-                # 0 and 1 before mean and std are taken off.
-                low = offset - 0.5 / self._std(index)
-                np.clip(planes[index], low, low + 1 / self._std(index), out=planes[index])
-        return planes
-
-    def _std(self, index: int) -> float:
-        return self.params.std[min(index, len(self.params.std) - 1)]
-
-    def _affine(self, count: int) -> tuple[list[float], list[float]]:
-        """Factor and offset of each channel: scale, 0.5, mean and std in one."""
+    def _coefficients(self, count: int) -> Floats:
+        """(4, count) of the channels of pictures: factor, offset, least and greatest value."""
         p = self.params
         for name, numbers in (("mean", p.mean), ("std", p.std)):
             if len(numbers) not in (1, count):
                 raise StageError(f"{self._where}: {name} has {len(numbers)} numbers for {count} channels")
-        half = 0.5 if p.background == "subtract_half" else 0.0
-        means = [p.mean[min(index, len(p.mean) - 1)] for index in range(count)]
-        factors = [p.scale / self._std(index) for index in range(count)]
-        return factors, [(half - mean) / self._std(index) for index, mean in enumerate(means)]
+        half = p.background == "subtract_half"
+        bounds = (0.0, 1.0) if half else (-np.inf, np.inf)
+        mean, std = np.resize(p.mean, count), np.resize(p.std, count)
+        factor = np.full(count, p.scale) / std
+        affine = np.array([factor, *((value - mean) / std for value in (0.5 * half, *bounds))], np.float32)
+        if p.colour == "rgb" and count % 3 == 0:
+            affine = affine.reshape(4, -1, 3)[:, :, ::-1].reshape(4, count)
+        return affine
 
-    def _buffer(self, count: int, size: tuple[int, ...]) -> Floats:
-        """Memory for the planes of a frame, those of the coordinates filled in."""
-        oldest = self.past[0] if len(self.past) == self.past.maxlen else None
-        if oldest is not None:
-            return oldest
-        height, width = size
-        planes = np.empty((count + 2 * self.params.coordinates, height, width), np.float32)
-        if self.params.coordinates:
-            planes[-2] = np.arange(width, dtype=np.float32) / width
-            planes[-1] = np.arange(height, dtype=np.float32)[:, None] / height
-        return planes
+    def _resized(self, array: NDArray[Any], into: NDArray[Any] | None = None) -> NDArray[Any]:
+        """A picture in the network's size, grey if asked for. into : memory that may be used."""
+        p, geometry = self.params, self._geometry
+        given = array
+        if p.colour == "grey" and array.ndim == 3 and array.shape[2] == 3:
+            array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY)
+        if geometry.inner != geometry.size:
+            method = cv2.INTER_AREA if p.interpolation == "area" else cv2.INTER_LINEAR
+            array = cv2.resize(array, geometry.inner, into, interpolation=method)
+        if geometry.inner != geometry.outer:
+            (left, top), (width, height) = geometry.corner, geometry.inner
+            right, bottom = geometry.outer[0] - left - width, geometry.outer[1] - top - height
+            array = cv2.copyMakeBorder(array, top, bottom, left, right, cv2.BORDER_CONSTANT, into)
+        # Others may write to theirs before it is needed again.
+        return array.copy() if array is given and p.frames > 1 else array
 
-    def _joined(self) -> Floats:
-        """The frames in the layout of the network, with a batch of one where it has one."""
+    def _write(self, picture: NDArray[Any], part: Floats) -> None:
+        """Fill the part of the tensor that belongs to one frame."""
         p = self.params
-        places = [max(0, len(self.past) - 1 - back * p.stride) for back in range(p.frames)]
-        planes = [self.past[place] for place in (places if p.newest_first else places[::-1])]
-        channels, height, width = planes[0].shape
-        shape = p.shape(channels, height, width)
-        self._compare(shape)
-        if p.layout == "chw" and p.frames == 1:
-            tensor = planes[0]
-        else:
-            if self._tensor is None:
-                self._tensor = np.empty([side or 0 for side in shape], np.float32)
-            tensor = self._tensor
-            for part, plane in zip(tensor.reshape(p.frames, -1), planes, strict=True):
-                if p.layout == "chw":
-                    part[:] = plane.ravel()
-                else:
-                    cv2.merge(list(plane), part.reshape(height, width, channels))
-        return tensor[None] if len(self._sides) > len(shape) else tensor
+        if p.layout == "pixels" and part.shape[2] == 5 and p.coordinates and picture.dtype == np.uint8:
+            _pixels(*_lines(picture, self._rest), p.colour == "rgb", self._affines[0], part)
+            return
+        planes = part if p.layout == "chw" else self._planes[0]
+        rest = self._nothing if p.background == "concat" else self._rest
+        for index, affine in enumerate(self._affines):
+            count = affine.shape[1]
+            own = planes[index * count : (index + 1) * count]
+            self._convert(self._rest if index else picture, rest, affine, own)
+        if p.layout != "chw":
+            cv2.merge(list(planes), part)
+
+    def _convert(self, picture: NDArray[Any], rest: NDArray[Any], affine: Floats, planes: Floats) -> None:
+        """Fill planes (C, h, w) with (picture - rest) * factor + offset, within its limits."""
+        rgb = self.params.colour == "rgb" and len(planes) == 3
+        if picture.dtype == np.uint8 and len(planes) == 3:
+            _planes(*_lines(picture, rest), rgb, affine, planes)
+            return
+        channels = zip(cv2.split(picture), cv2.split(rest), affine.T, strict=True)
+        for plane, (channel, less, own) in zip(planes[::-1] if rgb else planes, channels, strict=True):
+            factor, offset, least, greatest = map(float, own)
+            cv2.addWeighted(channel, factor, less, -factor, offset, plane, cv2.CV_32F)
+            if np.isfinite(least):
+                np.clip(plane, least, greatest, plane)
 
     def picture(self, array: Floats, channels: int) -> Floats:
         """(H, W, channels) float32: an output of the size of the network's picture, at that of the port."""
         geometry = self._geometry
-        assert geometry is not None
         width, height = geometry.outer
         shape = (channels, height, width) if self.params.layout == "chw" else (height, width, channels)
         if array.size != channels * height * width:
@@ -470,6 +467,73 @@ class _Feed:
         if geometry.inner != geometry.size:
             inner = np.asarray(cv2.resize(inner, geometry.size, interpolation=cv2.INTER_LINEAR), np.float32)
         return inner.reshape(*geometry.size[::-1], channels)
+
+
+def _lines(picture: NDArray[Any], rest: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """(h, 3 w) each."""
+    return picture.reshape(len(picture), -1), rest.reshape(len(rest), -1)
+
+
+def _placed(size: tuple[int, int], outer: tuple[int, int], pad: bool) -> _Geometry:
+    """Where a picture of a size lies in what the network sees. pad : whether it keeps its aspect."""
+    inner = outer
+    if pad:
+        ratio = min(outer[0] / size[0], outer[1] / size[1])
+        inner = max(1, round(size[0] * ratio)), max(1, round(size[1] * ratio))
+    return _Geometry(size, inner, ((outer[0] - inner[0]) // 2, (outer[1] - inner[1]) // 2), outer)
+
+
+@kernel(f"void({_READ}, {_READ}, boolean, float32[:, ::1], float32[:, :, ::1])")
+def _planes(picture: Bytes, rest: Bytes, rgb: bool, affine: Floats, planes: Floats) -> None:
+    """Fill `planes`, (3, h, w), from `picture` and `rest`, (h, 3 w). affine : as of `_Feed._coefficients`."""
+    change = np.empty(picture.shape[1], np.int16)
+    first, last = (2, 0) if rgb else (0, 2)
+    for y in range(picture.shape[0]):
+        _line(picture[y], rest[y], affine, change, planes[first, y], planes[1, y], planes[last, y])
+
+
+@kernel(f"void({_READ}, {_READ}, boolean, float32[:, ::1], float32[:, :, ::1])")
+def _pixels(picture: Bytes, rest: Bytes, rgb: bool, affine: Floats, pixels: Floats) -> None:
+    """Fill `pixels`, (h, w, 5): the three colors as in `_planes`, then x / w and y / h."""
+    height, width, _ = pixels.shape
+    change, line = np.empty(picture.shape[1], np.int16), np.empty((4, width), np.float32)
+    first, last = (2, 0) if rgb else (0, 2)
+    for x in range(width):
+        line[3, x] = np.float32(x) / np.float32(width)
+    for y in range(height):
+        _line(picture[y], rest[y], affine, change, line[first], line[1], line[last])
+        row, down = pixels[y].reshape(-1), np.float32(y) / np.float32(height)
+        # All five, for a gap would keep whole vectors from being written.
+        for x in range(width):
+            row[5 * x] = line[0, x]
+            row[5 * x + 1] = line[1, x]
+            row[5 * x + 2] = line[2, x]
+            row[5 * x + 3] = line[3, x]
+            row[5 * x + 4] = down
+
+
+@helper
+def _line(
+    picture: Bytes,
+    rest: Bytes,
+    affine: Floats,
+    change: NDArray[np.int16],
+    blue: Floats,
+    green: Floats,
+    red: Floats,
+) -> None:
+    """Fill one line, (w,), of each color. change : (3 w,), memory that stays in the cache."""
+    for x in range(change.size):
+        change[x] = np.int16(picture[x]) - np.int16(rest[x])
+    factor, offset, least, greatest = affine[0], affine[1], affine[2], affine[3]
+    f0, f1, f2 = factor[0], factor[1], factor[2]
+    o0, o1, o2 = offset[0], offset[1], offset[2]
+    l0, l1, l2 = least[0], least[1], least[2]
+    g0, g1, g2 = greatest[0], greatest[1], greatest[2]
+    for x in range(blue.size):
+        blue[x] = min(max(np.float32(change[3 * x]) * f0 + o0, l0), g0)
+        green[x] = min(max(np.float32(change[3 * x + 1]) * f1 + o1, l1), g1)
+        red[x] = min(max(np.float32(change[3 * x + 2]) * f2 + o2, l2), g2)
 
 
 def _ports(name: str, params: OutputParams) -> list[Port]:
