@@ -237,7 +237,7 @@ class Painter:
         """Add the stray reflection of each contact, a bright streak on the opposite side of the frame."""
         center = np.array(SIZE) / 2.0
         for press in pressed:
-            away = center - self._camera.to_raw(np.array([press.x, press.y]))
+            away = center - self._camera.to_raw(np.array([[press.x, press.y]]))[0]
             away /= max(float(np.hypot(*away)), 1.0)
             x, y = center + away * (320.0, 220.0)
             level = 90.0 * self._settings.stray * press.depth / press.shape.depth * FIXED_POINT

@@ -164,6 +164,8 @@ def _lookup(picture: Array, outside: float) -> Callable[[Array, Array], Array]:
     center_x, center_y = np.float32((picture.shape[1] - 1) / 2), np.float32((picture.shape[0] - 1) / 2)
 
     def value(x: Array, y: Array) -> Array:
+        if not x.size:  # `remap` takes no empty maps: a gel without markers
+            return np.empty(x.shape, np.float32)
         map_x = np.ascontiguousarray(x + center_x).reshape(len(x), -1)
         map_y = np.ascontiguousarray(y + center_y).reshape(len(y), -1)
         values = cv2.remap(
