@@ -170,9 +170,9 @@ def test_views_and_read_only_frames_are_fine_and_left_alone() -> None:
 @pytest.mark.parametrize(
     ("frame", "options", "words"),
     [
-        (np.zeros((4, 4, 3), np.float32), {}, "required an image"),
-        (np.zeros((0, 4, 3), np.uint8), {}, "required an image"),
-        (np.zeros((4, 4), np.uint8), {}, "required an image"),
+        (np.zeros((4, 4, 3), np.float32), {}, "required a non-empty"),
+        (np.zeros((0, 4, 3), np.uint8), {}, "required a non-empty"),
+        (np.zeros((4, 4), np.uint8), {}, "required a non-empty"),
         (np.zeros((4, 4, 3), np.uint8), {"false_alarms": 0}, "false_alarms in"),
         (np.zeros((4, 4, 3), np.uint8), {"false_alarms": float("nan")}, "false_alarms in"),
     ],

@@ -18,15 +18,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import Floats32, check_color_image
 from tactflow.vision.compiled import kernel
 
 TILES: Final = 24
 """Tiles along the longer side of a frame: a contact of 4 % of its width fills one."""
 LINES: Final = 6
-"""Lines of a tile that are read; more cost time."""
+"""Lines of a tile that are read; more cost time. A third of them is evenly spaced, so that no contact falls
+between them; the others are those with the strongest edges, which show best how far the gel has moved."""
 WINDOWS: Final = (1, 3, 7)
 """Widths of the windows of tiles, tiles: a faint contact shows in the mean over its own size."""
+LIGHT: Final = 3 * len(WINDOWS)
+PLANES: Final = LIGHT + 2
+"""Numbers of a tile: its light in three channels and windows, and a displacement along x and y."""
+NEAR: Final = 3
+"""Width of the windows in which a displacement is measured, tiles."""
 WARM_UP: Final = 4
 """Differences of frames from which the first noise is learned."""
 BLOCK: Final = 8
@@ -80,39 +86,35 @@ class RestTest:
     [False, True, True, True, False, False, False]
     """
 
-    def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-3) -> None:
+    def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-2) -> None:
         if not 0 < false_alarms <= 0.5:
             raise ValueError(f"required false_alarms in (0, 0.5], got {false_alarms}")
-        self._shape = _checked(frame).shape
-        step = max(1, round(max(self._shape) / (TILES * LINES)))
-        tile = min(step * LINES, *self._shape[:2])
+        check_color_image(frame)
+        self._shape = frame.shape
+        tile = min(max(LINES, round(max(self._shape) / TILES)), *self._shape[:2])
         rows, columns = self._shape[0] // tile, self._shape[1] // tile
-        self._used = slice(step // 2, rows * tile, step), slice(0, columns * tile)
-        gray = np.asarray(frame[..., 1], np.float32)
-        slopes = [cv2.Sobel(gray, cv2.CV_32F, *axis, scale=1 / 8)[self._used] for axis in ((1, 0), (0, 1))]
-        self._slopes: Floats32 = np.asarray(np.stack(slopes), np.float32)
+        gray = np.asarray(frame[: rows * tile, : columns * tile, 1], np.float32)
+        slopes = np.stack([cv2.Sobel(gray, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1))])
+        lines = _used_lines(np.square(slopes).sum(axis=(0, 2)).reshape(rows, tile))
+        self._used = lines, slice(columns * tile)
+        self._slopes: Floats32 = np.ascontiguousarray(slopes[:, lines])
         self._resting: NDArray[np.uint8] = np.ascontiguousarray(frame[self._used][..., 1])
-        self._lines = np.empty((*self._slopes.shape[1:], 3), np.uint8)
-        width = self._slopes.shape[2]
+        width = columns * tile
         self._heaps = np.empty(3 * width, np.uint16), np.empty((2, width), np.float32)
         self._sums = np.empty((rows, columns, 5), np.float32)
-        self._pixels = tile * len(self._lines) / rows
+        self._pixels = tile * len(lines) / rows
         energy = np.square(self._slopes).reshape(2, rows, -1, columns, tile).sum(axis=(2, 4))
-        energy = cv2.blur(energy.transpose(1, 2, 0), (3, 3)) + np.float32(ROUNDING * self._pixels)
-        self._per_energy = np.asarray(1 / energy, np.float32)
-        planes = 3 * len(WINDOWS) + 2
-        count = rows * columns * planes
-        self._z = -NormalDist().inv_cdf(false_alarms / (2 * count))
-        floor = ROUNDING / self._pixels / np.repeat(np.square(WINDOWS), 3)
-        self._level = np.repeat(LEVEL / np.array(WINDOWS, np.float32), 3)
-        self._floor = np.concatenate(
-            [np.broadcast_to(floor, (rows, columns, len(floor))), ROUNDING / energy / 9], axis=2
-        ).astype(np.float32)
+        energy = _near(energy.transpose(1, 2, 0)) + np.float32(ROUNDING * self._pixels)
+        self._px_per_edge = np.asarray(1 / np.sqrt(energy), np.float32)
+        self._z = -NormalDist().inv_cdf(false_alarms / (2 * PLANES * rows * columns))
+        self._level = np.repeat(LEVEL / np.array(WINDOWS, np.float32), 3)[:, None, None]
+        light = np.repeat(ROUNDING / (self._pixels * np.square(WINDOWS)), 3)
+        self._floor = np.append(light, [ROUNDING / NEAR**2] * 2).astype(np.float32)[:, None, None]
         self._rest = self._light(frame)
         self._frame: NDArray[np.uint8] | None = None
         self._last: Floats32 | None = None
         self._moved: Floats32 | None = None
-        self._squares: Floats32 = np.zeros((rows, columns, planes), np.float32)
+        self._squares: Floats32 = np.zeros((PLANES, rows, columns), np.float32)
         self._count = 0
         self._variance: Floats32 | None = None
         self._bound: Floats32 | None = None
@@ -128,7 +130,8 @@ class RestTest:
         touching : whether something touched the gel in the frame before. due : that the frame is worked on
         in full whatever it shows.
         """
-        if _checked(frame).shape != self._shape:
+        check_color_image(frame)
+        if frame.shape != self._shape:
             raise ValueError(f"required a frame of shape {self._shape}, got {frame.shape}")
         before, self._frame = self._frame, frame
         if touching:
@@ -154,18 +157,16 @@ class RestTest:
 
     def _decide(self, now: Floats32, *, changed: bool, suspect: bool) -> Look:
         """Note what is done with a frame."""
-        self._recent.append(np.abs(now[..., :-2]))
+        self._recent.append(np.abs(now[:LIGHT]))
         if changed:
-            self._moved = now[..., -2:]
+            self._moved = now[LIGHT:]
         self._worked = suspect
         return Look(changed, suspect)
 
     def _departs(self, now: Floats32) -> bool:
         """Whether the light of any window has departed from that of the untouched gel."""
         assert self._envelope is not None
-        assert self._bound is not None
-        excess = np.abs(now[..., :-2]) - self._envelope
-        if bool((excess > self._bound[..., :-2] + self._level).any()):
+        if bool((np.abs(now[:LIGHT]) > self._envelope + self._limit).any()):
             return True
         # What has crept back may not come again unseen.
         np.minimum(self._envelope, np.max(self._recent, axis=0), out=self._envelope)
@@ -175,23 +176,25 @@ class RestTest:
         """Whether an edge may have moved since the dots were last looked at."""
         if not self._sees_shifts or self._moved is None or self._bound is None:
             return True
-        return bool((np.abs(now[..., -2:] - self._moved) > self._bound[..., -2:]).any())
+        return bool((np.abs(now[LIGHT:] - self._moved) > self._bound[LIGHT:]).any())
 
     def _planes(self, frame: NDArray[np.uint8]) -> Floats32:
-        """(rows, columns, 11): against the untouched gel, the light of each channel in windows of each width,
-        grey levels, and the displacement in windows of 3 tiles, px."""
+        """(11, rows, columns): against the untouched gel, the light of each channel in windows of each width,
+        grey levels, and the displacement in windows of `NEAR`, in units of `_px_per_edge`, in which noise is
+        the same everywhere."""
         light = self._light(frame)
         ratio = ((light[::2, ::2] + 1) / (self._rest[::2, ::2] + 1)).reshape(-1, 3)
         change = light - self._rest * np.partition(ratio, len(ratio) // 2, axis=0)[len(ratio) // 2]
-        shift = cv2.blur(self._sums[..., 3:], (3, 3)) * self._per_energy
-        return np.dstack([*(cv2.blur(change, (width, width)) for width in WINDOWS), shift])
+        planes = np.empty_like(self._squares)
+        for first, width in zip(range(0, LIGHT, 3), WINDOWS, strict=True):
+            planes[first : first + 3] = cv2.blur(change, (width, width)).transpose(2, 0, 1)
+        planes[LIGHT:] = (_near(self._sums[..., 3:]) * self._px_per_edge).transpose(2, 0, 1)
+        return planes
 
     def _light(self, frame: NDArray[np.uint8]) -> Floats32:
         """(rows, columns, 3): mean light of each channel; the sums of all kinds are in `_sums` then."""
-        self._lines[...] = frame[self._used]
-        green = np.asarray(cv2.extractChannel(self._lines, 1), np.uint8)
-        flat = self._lines.reshape(len(green), -1)
-        sum_tiles(flat, green, self._resting, self._slopes, *self._heaps, self._sums)
+        lines = frame[self._used].reshape(len(self._resting), -1)
+        sum_tiles(lines, self._resting, self._slopes, *self._heaps, self._sums)
         return np.asarray(self._sums[..., :3] / np.float32(self._pixels), np.float32)
 
     def _learn(self, step: Floats32) -> None:
@@ -202,31 +205,43 @@ class RestTest:
             return
         seen = self._squares / np.float32(2 * self._count)
         # Neighbouring tiles are alike; one that is much louder than they are is louder.
-        near = [cv2.blur(np.ascontiguousarray(plane), (5, 5)) for plane in np.dsplit(seen, seen.shape[2])]
-        seen = np.maximum(np.maximum(np.dstack(near), seen / 2), self._floor)
+        near = np.stack([cv2.blur(plane, (5, 5)) for plane in seen])
+        seen = np.maximum(np.maximum(near, seen / 2), self._floor)
         older = self._variance
         self._variance = seen if older is None else np.minimum(older * np.float32(FORGET), seen)
         self._bound = np.sqrt(2 * self._variance) * np.float32(self._z)
-        self._sees_shifts = bool(np.median(self._bound[..., -2:]) <= SHIFT)
+        self._limit = self._bound[:LIGHT] + self._level
+        shifts = self._bound[LIGHT:].transpose(1, 2, 0) * self._px_per_edge
+        self._sees_shifts = bool(np.median(shifts) <= SHIFT)
         self._squares[...] = 0
         self._count = 0
 
 
-def _checked(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8 or 0 in frame.shape:
-        raise ValueError(
-            f"required an image (height, width, 3) of uint8, got {frame.dtype} of shape {frame.shape}"
-        )
-    return frame
+def _near(sums: Floats32) -> Floats32:
+    """Means over windows of `NEAR` tiles, (rows, columns, 2); what is outside of the frame adds nothing."""
+    return np.asarray(cv2.blur(sums, (NEAR, NEAR), borderType=cv2.BORDER_CONSTANT), np.float32)
+
+
+def _used_lines(energy: Floats32) -> NDArray[np.intp]:
+    """Numbers of the lines that are read, ascending: at most `LINES` of each row of tiles.
+
+    energy : (rows, lines of a tile), >= 0, of the edges in each line.
+    """
+    rows, lines = energy.shape
+    spread = LINES // 3
+    even = np.arange(lines) if lines <= LINES else (2 * np.arange(spread) + 1) * lines // (2 * spread)
+    others = energy.copy()
+    others[:, even] = -1
+    best = np.argsort(others, axis=1)[:, lines - min(LINES, lines) + len(even) :]
+    inside = np.sort(np.hstack([np.broadcast_to(even, (rows, len(even))), best]), axis=1)
+    return np.asarray((inside + lines * np.arange(rows)[:, None]).ravel())
 
 
 @kernel(
-    "void(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, :, ::1], uint16[::1], float32[:, ::1], "
-    "float32[:, :, ::1])"
+    "void(uint8[:, ::1], uint8[:, ::1], float32[:, :, ::1], uint16[::1], float32[:, ::1], float32[:, :, ::1])"
 )
 def sum_tiles(
     lines: NDArray[np.uint8],
-    green: NDArray[np.uint8],
     resting: NDArray[np.uint8],
     slopes: Floats32,
     light: NDArray[np.uint16],
@@ -235,20 +250,20 @@ def sum_tiles(
 ) -> None:
     """Sums over tiles of blue, green and red, and of the change of green times its slopes along x and y.
 
-    lines : (n * rows, m * columns * 3), n < 258. green : (n * rows, m * columns), its green; resting : that
-    of the untouched gel. slopes : (2, n * rows, m * columns), levels per px. light, shift : (m * columns
+    lines : (n * rows, m * columns * 3), n < 258. resting : (n * rows, m * columns), green of the untouched
+    gel. slopes : (2, n * rows, m * columns), levels per px. light, shift : (m * columns
     * 3,) and (2, m * columns), written over. sums : (rows, columns, 5), to be written.
     """
     rows, columns, _ = sums.shape
-    thick, wide = green.shape[0] // rows, green.shape[1] // columns
+    thick, wide = resting.shape[0] // rows, resting.shape[1] // columns
     for row in range(rows):
         light[:] = 0
         shift[:] = 0
         for y in range(row * thick, (row + 1) * thick):
             for x in range(light.size):
                 light[x] += lines[y, x]
-            for x in range(green.shape[1]):
-                more = np.float32(green[y, x]) - np.float32(resting[y, x])
+            for x in range(resting.shape[1]):
+                more = np.float32(lines[y, 3 * x + 1]) - np.float32(resting[y, x])
                 shift[0, x] += more * slopes[0, y, x]
                 shift[1, x] += more * slopes[1, y, x]
         for column in range(columns):
