@@ -31,7 +31,7 @@ class Probe(Stage):
         """How careful to be."""
 
         false_alarms: float = Field(
-            1e-2, gt=0, le=0.5, description="share of still frames that are worked on all the same"
+            1e-3, gt=0, le=0.5, description="share of still frames that are worked on all the same"
         )
         at_least_every: int = Field(
             30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"

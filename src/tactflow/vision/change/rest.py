@@ -1,6 +1,6 @@
 """Does anything touch the gel that did not, has anything moved? A cheap look at a raw frame.
 
-A few lines of the frame are summed over tiles: the light of each channel, and the least-squares displacement
+Some lines of the frame are summed over tiles: the light of each channel, and the least-squares displacement
 of the gel's edges (Lucas and Kanade, 1981). All are taken against the untouched gel, after the exposure, as
 single tiles and over windows of 3 and 7. What a sensor's compression, flicker and noise do to them is learned
 tile by tile from the differences between frames in a row (von Neumann, 1941): the calmest of all blocks of
@@ -23,9 +23,11 @@ from tactflow.vision.compiled import kernel
 
 TILES: Final = 24
 """Tiles along the longer side of a frame: a contact of 4 % of its width fills one."""
+READ: Final = 250_000
+"""Bytes of a frame that are read: all of a small one, a sixth of 800 x 600 px. More cost time."""
 LINES: Final = 6
-"""Lines of a tile that are read; more cost time. A third of them is evenly spaced, so that no contact falls
-between them; the others are those with the strongest edges, which show best how far the gel has moved."""
+"""Lines of a tile that are read at least. A third of all is evenly spaced, so that no contact falls between
+them; the others are those with the strongest edges, which show best how far the gel has moved."""
 WINDOWS: Final = (1, 3, 7)
 """Widths of the windows of tiles, tiles: a faint contact shows in the mean over its own size."""
 LIGHT: Final = 3 * len(WINDOWS)
@@ -48,6 +50,8 @@ SHIFT: Final = 0.05
 RECENT: Final = 5
 """Frames whose strongest change is what the gel shows at rest, so that a flicker of five frames is part of
 it: a sixth of a second."""
+GLANCES: Final = 0.01
+"""Share of still frames in which dots are looked at all the same: that costs less than a frame in full."""
 ROUNDING: Final = 1 / 12
 """Variance of rounding to whole grey levels, squared levels."""
 
@@ -86,27 +90,30 @@ class RestTest:
     [False, True, True, True, False, False, False]
     """
 
-    def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-2) -> None:
+    def __init__(self, frame: NDArray[np.uint8], *, false_alarms: float = 1e-3) -> None:
         if not 0 < false_alarms <= 0.5:
             raise ValueError(f"required false_alarms in (0, 0.5], got {false_alarms}")
         check_color_image(frame)
         self._shape = frame.shape
         tile = min(max(LINES, round(max(self._shape) / TILES)), *self._shape[:2])
         rows, columns = self._shape[0] // tile, self._shape[1] // tile
+        lines = min(max(LINES, READ // (3 * tile * rows * columns)), tile)
         gray = np.asarray(frame[: rows * tile, : columns * tile, 1], np.float32)
         slopes = np.stack([cv2.Sobel(gray, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1))])
-        lines = _used_lines(np.square(slopes).sum(axis=(0, 2)).reshape(rows, tile))
-        self._used = lines, slice(columns * tile)
-        self._slopes: Floats32 = np.ascontiguousarray(slopes[:, lines])
+        used = _used_lines(np.square(slopes).sum(axis=(0, 2)).reshape(rows, tile), lines)
+        self._used = used, slice(columns * tile)
+        self._slopes: Floats32 = np.ascontiguousarray(slopes[:, used])
         self._resting: NDArray[np.uint8] = np.ascontiguousarray(frame[self._used][..., 1])
         width = columns * tile
         self._heaps = np.empty(3 * width, np.uint16), np.empty((2, width), np.float32)
         self._sums = np.empty((rows, columns, 5), np.float32)
-        self._pixels = tile * len(lines) / rows
+        self._pixels = tile * lines
         energy = np.square(self._slopes).reshape(2, rows, -1, columns, tile).sum(axis=(2, 4))
         energy = _near(energy.transpose(1, 2, 0)) + np.float32(ROUNDING * self._pixels)
         self._px_per_edge = np.asarray(1 / np.sqrt(energy), np.float32)
-        self._z = -NormalDist().inv_cdf(false_alarms / (2 * PLANES * rows * columns))
+        shares = np.repeat([false_alarms / LIGHT, GLANCES / 2], [LIGHT, 2]) / (2 * rows * columns)
+        z = [-NormalDist().inv_cdf(share) for share in shares]
+        self._z = np.array(z, np.float32)[:, None, None]
         self._level = np.repeat(LEVEL / np.array(WINDOWS, np.float32), 3)[:, None, None]
         light = np.repeat(ROUNDING / (self._pixels * np.square(WINDOWS)), 3)
         self._floor = np.append(light, [ROUNDING / NEAR**2] * 2).astype(np.float32)[:, None, None]
@@ -209,7 +216,7 @@ class RestTest:
         seen = np.maximum(np.maximum(near, seen / 2), self._floor)
         older = self._variance
         self._variance = seen if older is None else np.minimum(older * np.float32(FORGET), seen)
-        self._bound = np.sqrt(2 * self._variance) * np.float32(self._z)
+        self._bound = np.sqrt(2 * self._variance) * self._z
         self._limit = self._bound[:LIGHT] + self._level
         shifts = self._bound[LIGHT:].transpose(1, 2, 0) * self._px_per_edge
         self._sees_shifts = bool(np.median(shifts) <= SHIFT)
@@ -222,18 +229,18 @@ def _near(sums: Floats32) -> Floats32:
     return np.asarray(cv2.blur(sums, (NEAR, NEAR), borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
-def _used_lines(energy: Floats32) -> NDArray[np.intp]:
-    """Numbers of the lines that are read, ascending: at most `LINES` of each row of tiles.
+def _used_lines(energy: Floats32, number: int) -> NDArray[np.intp]:
+    """The lines that are read, ascending: so many of each row of tiles.
 
     energy : (rows, lines of a tile), >= 0, of the edges in each line.
     """
     rows, lines = energy.shape
-    spread = LINES // 3
-    even = np.arange(lines) if lines <= LINES else (2 * np.arange(spread) + 1) * lines // (2 * spread)
+    spread = -(-number // 3)
+    even = (2 * np.arange(spread) + 1) * lines // (2 * spread)
     others = energy.copy()
     others[:, even] = -1
-    best = np.argsort(others, axis=1)[:, lines - min(LINES, lines) + len(even) :]
-    inside = np.sort(np.hstack([np.broadcast_to(even, (rows, len(even))), best]), axis=1)
+    best = np.argsort(others, axis=1)[:, lines - number + spread :]
+    inside = np.sort(np.hstack([np.broadcast_to(even, (rows, spread)), best]), axis=1)
     return np.asarray((inside + lines * np.arange(rows)[:, None]).ravel())
 
 
