@@ -93,7 +93,7 @@ def test_a_crowded_hub_is_named_in_place_of_each_slow_sensor(monkeypatch: pytest
     monkeypatch.setattr(rates, "time", Clock(1 / 15))
     sensors = [Sensor("left", "0", CameraRequest()), Sensor("right", "2", CameraRequest(format="YUYV"))]
     (said,) = measure_together(sensors, 30.0).advice
-    assert said.startswith("left and right share a 480 Mbit/s hub (usb1) and reserve 393 Mbit/s")
+    assert said.startswith("left and right share a 480 Mbit/s hub (usb1) and reserve 344 Mbit/s")
     assert said.endswith("move one to another root hub, or ask for MJPG or fewer pixels")
 
 

@@ -1,4 +1,9 @@
-"""What shares a USB root hub, in trees that are built as Linux's sysfs lays them out."""
+"""What shares a USB root hub, in trees as Linux's sysfs lays them out.
+
+Files and their formats are those of drivers/usb/core/sysfs.c. The descriptors are those of a Logitech C270
+(046d:0825, its units, formats and most of its microphone left out), as dumped in
+https://github.com/espressif/esp-usb, host/class/uvc/usb_host_uvc/host_test/main/parsing/descriptors.
+"""
 
 from __future__ import annotations
 
@@ -7,24 +12,31 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.sources.usb import Mode, UsbBus, read_alternates, usb_buses
+from tactflow.sources.usb import Mode, UsbBus, read_alternates, reservable, usb_buses
 
 YUYV = Mode(640, 480, 30, "YUYV")
 SMALL = Mode(320, 240, 30, "YUYV")
 MJPG = Mode(640, 480, 30, "MJPG")
-PACKETS = (0x0080, 0x0400, 0x0C00, 0x1400)
-"""wMaxPacketSize of the settings 1 to 4: 128 and 1024 bytes, twice and three times 1024."""
+DEVICE = bytes.fromhex("12010002ef020140 6d04250812000000 0201 0902a209040100 80fa 080b00020e030000")
+CONTROL = bytes.fromhex("09040000010e010000 07058703100008 0525031000")
+IDLE = bytes.fromhex("09040100000e020000 06240d010104")
+PACKETS = (0x00C0, 0x0180, 0x0200, 0x0280, 0x0320, 0x03B0, 0x0A80, 0x0B20, 0x0BE0, 0x1380, 0x13FC)
+"""wMaxPacketSize of the settings 1 to 11: up to three packets of 1020 bytes in a microframe."""
+MICROPHONE = bytes.fromhex("090403000001020000 0904030101010200 00 0905860544000400 00")
+BULK = bytes.fromhex("09040100010e020000 07058102000200")
+"""Streaming interface of a camera that reserves nothing: it has this setting alone."""
 
 
 def descriptors(*, bulk: bool = False, companion: bool = False) -> bytes:
-    """A camera with a control interface, and a streaming interface with an idle setting and four others."""
-    data = bytes([18, 1]) + bytes(16) + bytes([9, 4, 0, 0, 1, 14, 1, 0, 0, 7, 5, 0x83, 3, 16, 0, 6])
-    data += bytes([9, 4, 1, 0, 0, 14, 2, 0, 0, 5, 0x24, 1, 2, 3])
+    """Those of the camera; or as such a one has them that uses bulk transfers, or USB 3."""
+    if bulk:
+        return DEVICE + CONTROL + BULK
+    data = DEVICE + CONTROL + IDLE
     for number, size in enumerate(PACKETS, 1):
         data += bytes([9, 4, 1, number, 1, 14, 2, 0, 0])
-        data += struct.pack("<BBBBHB", 7, 5, 0x81, 2 if bulk else 5, size, 1)
+        data += struct.pack("<BBBBHB", 7, 5, 0x81, 5, 1024 if companion else size, 1)
         data += struct.pack("<BBBBH", 6, 0x30, 15, 0, 16 * 1024) if companion else b""
-    return data
+    return data + MICROPHONE
 
 
 def add_device(sys: Path, root: str, port: str, product: str, speed: str, interfaces: dict[str, str]) -> Path:
@@ -41,7 +53,8 @@ def add_device(sys: Path, root: str, port: str, product: str, speed: str, interf
         (interface / "bAlternateSetting").write_text(" 0\n")
         (links / interface.name).symlink_to(interface)
     (folder / "speed").write_text(f"{speed}\n")
-    (folder / "product").write_text(f"{product}\n")
+    if product:
+        (folder / "product").write_text(f"{product}\n")
     if not (links / root).exists():
         (hub / "speed").write_text("5000\n" if speed == "5000" else "480\n")
         (links / root).symlink_to(hub)
@@ -51,12 +64,13 @@ def add_device(sys: Path, root: str, port: str, product: str, speed: str, interf
 def add_camera(
     sys: Path, number: int, root: str, port: str, speed: str = "480", *, bulk: bool = False
 ) -> Path:
-    folder = add_device(sys, root, port, f"Gel {number}", speed, {"1.0": "0e01", "1.1": "0e02"})
+    folder = add_device(sys, root, port, "", speed, {"1.0": "0e01", "1.1": "0e02"})
     (folder / "descriptors").write_bytes(descriptors(bulk=bulk, companion=speed == "5000"))
     for device in (2 * number, 2 * number + 1):
         link = sys / f"class/video4linux/video{device}"
         link.mkdir(parents=True)
         (link / "device").symlink_to(folder / f"{port}:1.0")
+        (link / "name").write_text(f"Gel {number}\n")
     return folder
 
 
@@ -75,9 +89,9 @@ def test_two_small_cameras_fit(tmp_path: Path) -> None:
     add_camera(tmp_path, 1, "usb1", "1-2.3")
     (bus,) = buses(tmp_path)
     assert [camera.name for camera in bus.cameras] == ["Gel 0", "Gel 1"]
-    assert bus.budget == 384
-    # 320 x 240 x 2 bytes x 30 = 37 Mbit/s, which 1024 bytes 8000 times a second carry.
-    assert [camera.reserves(SMALL) for camera in bus.cameras] == [65.536] * 2
+    assert bus.budget == pytest.approx(329, abs=0.5)
+    # 320 x 240 x 2 bytes x 30 = 37 Mbit/s, which 640 bytes 8000 times a second carry.
+    assert [camera.reserves(SMALL) for camera in bus.cameras] == [pytest.approx(40.96)] * 2
     assert advice(tmp_path, SMALL) == []
 
 
@@ -85,15 +99,22 @@ def test_two_cameras_that_may_reserve_all_do_not_fit_until_they_stream_with_less
     folders = [add_camera(tmp_path, number, "usb1", f"1-{number + 1}") for number in range(2)]
     (said,) = advice(tmp_path, MJPG)
     assert said == (
-        "left and right share a 480 Mbit/s hub (usb1) and reserve 393 Mbit/s at most, of 384: move one to "
+        "left and right share a 480 Mbit/s hub (usb1) and reserve 392 Mbit/s at most, of 329: move one to "
         "another root hub, or ask for fewer pixels"
     )
     assert "or ask for MJPG or fewer pixels" in advice(tmp_path, YUYV)[0]
     for folder in folders:
-        (folder / f"{folder.name}:1.1" / "bAlternateSetting").write_text(" 3\n")
+        (folder / f"{folder.name}:1.1" / "bAlternateSetting").write_text(" 9\n")
     (bus,) = buses(tmp_path)
-    assert [camera.reserved for camera in bus.cameras] == [131.072] * 2
+    assert [camera.reserved for camera in bus.cameras] == [pytest.approx(126.976)] * 2
     assert advice(tmp_path, MJPG) == []
+
+
+def test_what_the_kernel_refused_does_not_fit() -> None:
+    # Two video grabbers with packets of 2688 and 2892 bytes: not within 80 % of the bus, but within 90 %.
+    # Linux, commit cc62a7eb6396e8be95b9a30053ed09191818b99b.
+    rates = [8e-6 * 8000 * size for size in (2688, 2892)]
+    assert reservable(480.0) < sum(rates) < 9 / 8 * reservable(480.0)
 
 
 def test_more_raw_pictures_than_a_port_carries_are_told(tmp_path: Path) -> None:
@@ -120,7 +141,7 @@ def test_cameras_of_usb_3_fit_on_a_hub_of_their_own(tmp_path: Path) -> None:
     for number in range(3):
         add_camera(tmp_path, number, "usb2", f"2-{number + 1}", "5000")
     (bus,) = buses(tmp_path)
-    assert bus.budget == 4500
+    assert bus.budget == pytest.approx(3600)
     # The companion's 16 KiB, 8000 times a second.
     assert {round(camera.reserves() or 0) for camera in bus.cameras} == {1049}
     assert advice(tmp_path, Mode(1280, 960, 30, "YUYV")) == []
@@ -128,7 +149,7 @@ def test_cameras_of_usb_3_fit_on_a_hub_of_their_own(tmp_path: Path) -> None:
 
 def test_where_sysfs_does_not_tell_it_is_said(tmp_path: Path) -> None:
     folder = add_camera(tmp_path, 0, "usb1", "1-1")
-    (folder / "descriptors").write_bytes(descriptors()[:40])
+    (folder / "descriptors").write_bytes(descriptors()[:60])
     assert advice(tmp_path) == ["left: what the USB reserves is not known; compare the frame rates"]
     (folder / "descriptors").unlink()
     assert "not known" in advice(tmp_path)[0]
@@ -136,9 +157,10 @@ def test_where_sysfs_does_not_tell_it_is_said(tmp_path: Path) -> None:
     assert usb_buses(["/dev/video6", "/dev/video9"], tmp_path) == []
 
 
-@pytest.mark.parametrize("cut", range(0, 120, 7))
+@pytest.mark.parametrize("cut", range(0, 250, 13))
 def test_damaged_descriptors_end_the_list(cut: int) -> None:
     whole = list(read_alternates(descriptors(), 480.0))
-    assert [alternate.reserves for alternate in whole] == [8.192, 65.536, 131.072, 196.608]
-    assert list(read_alternates(descriptors()[:cut], 480.0)) in [whole[:count] for count in range(5)]
+    numbers = [round(alternate.reserves, 1) for alternate in whole]
+    assert numbers == [12.3, 24.6, 32.8, 41.0, 51.2, 60.4, 81.9, 102.4, 127.0, 172.0, 195.8]
+    assert list(read_alternates(descriptors()[:cut], 480.0)) in [whole[:count] for count in range(12)]
     assert list(read_alternates(b"\0" * cut, 480.0)) == []

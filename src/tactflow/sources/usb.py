@@ -7,7 +7,9 @@ camera for which too little is left ("No space left on device").
 References
 ----------
 Universal Serial Bus Specification 2.0, sections 5.6.3 and 5.6.4 (isochronous transfers), 9.6 (descriptors);
-Universal Serial Bus 3.2 Specification, section 9.6.7 (endpoint companions).
+Universal Serial Bus 3.2 Specification, section 9.6.7 (endpoint companions). Files: Linux,
+Documentation/ABI/stable/sysfs-bus-usb and drivers/usb/core/sysfs.c. Limits: `*_BW_LIMIT` and `*_BW_RESERVED`
+in its drivers/usb/host/xhci.h.
 """
 
 from __future__ import annotations
@@ -15,23 +17,29 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
 INTERFACE, ENDPOINT, COMPANION = 4, 5, 0x30
 """Types of descriptors."""
-VIDEO, STREAMING, STORAGE, HUB = 14, 2, 8, 9
+VIDEO, STREAMING, STORAGE = 14, 2, 8
 """Classes of interfaces, and the subclass that carries pictures."""
 ISOCHRONOUS, BULK = 1, 2
 """Types of endpoints: with a reservation, and with what is left."""
-HIGH_SPEED, SUPER_SPEED = 480.0, 5000.0
-"""Speeds of USB 2 and USB 3, Mbit/s."""
-SHARE: Final = 0.8
-"""Part of a bus at 480 Mbit/s that reservations may take; 0.9 of slower and faster ones."""
-SHARE_OTHERS: Final = 0.9
-"""See `SHARE`."""
+HIGH_SPEED: Final = 480.0
+"""Speed of USB 2, Mbit/s."""
+CODING: Final = {12.0: 6 / 7, HIGH_SPEED: 6 / 7, 5000.0: 8 / 10}
+"""Speed, Mbit/s -> the part of its bits that is data: one is stuffed after six, or eight become ten."""
+FASTER: Final = 128 / 132
+"""The same of faster buses."""
 RAW_BYTES: Final = 2
 """Bytes of a pixel in the raw format of USB cameras, YUYV."""
+
+
+def reservable(speed: float) -> float:
+    """What all reservations of a bus may take of its speed, both in Mbit/s: 80 % of USB 2, 90 % of others."""
+    return speed * CODING.get(speed, FASTER) * (0.8 if speed == HIGH_SPEED else 0.9)
 
 
 class Alternate(NamedTuple):
@@ -120,9 +128,7 @@ class UsbBus:
     @property
     def budget(self) -> float | None:
         """What all reservations together may take, Mbit/s."""
-        if self.speed is None:
-            return None
-        return self.speed * (SHARE if self.speed == HIGH_SPEED else SHARE_OTHERS)
+        return None if self.speed is None else reservable(self.speed)
 
     def advice(
         self, modes: Mapping[str, Mode] | None = None, names: Mapping[str, str] | None = None
@@ -142,7 +148,7 @@ class UsbBus:
         total = sum(mbit or 0.0 for mbit in wanted)
         for camera, name in zip(self.cameras, called, strict=True):
             mode = (modes or {}).get(camera.device)
-            if mode and mode.raw and mode.mbit > SHARE * camera.speed:
+            if mode and mode.raw and mode.mbit > reservable(camera.speed):
                 yield (
                     f"{name} asks for {mode.mbit:.0f} Mbit/s of raw pictures on a port of "
                     f"{camera.speed:.0f}: ask for MJPG, fewer pixels or fewer frames"
@@ -187,12 +193,13 @@ def usb_buses(devices: Sequence[str], sys: Path = Path("/sys")) -> list[UsbBus]:
 
 def _camera(device: str, sys: Path) -> UsbCamera | None:
     real = os.path.realpath(device)
-    interface = (sys / "class/video4linux" / Path(real).name / "device").resolve()
+    node = sys / "class/video4linux" / Path(real).name
+    interface = (node / "device").resolve()
     folder = interface.parent
     root = next((part for part in folder.parts if part.startswith("usb") and part[3:].isdecimal()), None)
     if root is None or not (folder / "speed").exists():
         return None
-    name = _text(folder / "product") or Path(real).name
+    name = _text(folder / "product") or _text(node / "name") or node.name
     current = 0
     for streaming_interface in folder.glob(f"{folder.name}:*"):
         kind = (
@@ -220,43 +227,28 @@ def read_alternates(descriptors: bytes, speed: float) -> Iterator[Alternate]:
     [Alternate(number=2, reserves=196.608, bulk=False)]
     """
     number: int | None = None
-    place = 0
-    found: Alternate | None = None
-    while place + 2 <= len(descriptors) and descriptors[place] >= 2:
-        length, kind = descriptors[place], descriptors[place + 1]
-        body = descriptors[place : place + length]
-        if len(body) < length:
-            break
-        if kind == INTERFACE and length >= 9:
-            number = body[3] if (body[5], body[6]) == (VIDEO, STREAMING) else None
-        elif kind == ENDPOINT and length >= 7 and number is not None:
-            if found is not None:
-                yield found
-            found = _alternate(number, body, speed)
-        elif kind == COMPANION and length >= 6 and found is not None and not found.bulk:
-            # At USB 3 the companion says how many bytes an interval has.
-            rate = found.reserves / max(_bytes_of(descriptors, place), 1)
-            found = found._replace(reserves=rate * int.from_bytes(body[4:6], "little"))
-        place += length
-    if found is not None:
-        yield found
+    blocks = [*_descriptors(descriptors), bytes(2)]
+    for block, next_block in pairwise(blocks):
+        if block[1] == INTERFACE and len(block) >= 9:
+            number = block[3] if (block[5], block[6]) == (VIDEO, STREAMING) else None
+        elif block[1] == ENDPOINT and len(block) >= 7 and number is not None:
+            kind, size = block[3] & 3, int.from_bytes(block[4:6], "little")
+            fast = speed >= HIGH_SPEED
+            count = (size & 0x7FF) * (1 + (size >> 11 & 3) if fast else 1)
+            if next_block[1] == COMPANION and len(next_block) >= 6:
+                # At USB 3 the companion says how many bytes an interval has.
+                count = int.from_bytes(next_block[4:6], "little")
+            intervals = (8000 if fast else 1000) / 2 ** (max(block[6], 1) - 1)
+            if kind in (ISOCHRONOUS, BULK):
+                mbit = 8e-6 * count * intervals
+                yield Alternate(number, 0.0 if kind == BULK else mbit, kind == BULK)
 
 
-def _bytes_of(descriptors: bytes, companion: int) -> int:
-    """Bytes of an interval by the endpoint in front of its companion."""
-    size = int.from_bytes(descriptors[companion - 3 : companion - 1], "little")
-    return (size & 0x7FF) * (1 + (size >> 11 & 3))
-
-
-def _alternate(number: int, endpoint: bytes, speed: float) -> Alternate | None:
-    kind = endpoint[3] & 3
-    if kind not in (ISOCHRONOUS, BULK):
-        return None
-    size = int.from_bytes(endpoint[4:6], "little")
-    packets = 1 + (size >> 11 & 3) if speed >= HIGH_SPEED else 1
-    intervals = (8000 if speed >= HIGH_SPEED else 1000) / 2 ** (max(endpoint[6], 1) - 1)
-    mbit = (size & 0x7FF) * packets * intervals * 8 / 1e6
-    return Alternate(number, 0.0 if kind == BULK else mbit, kind == BULK)
+def _descriptors(data: bytes) -> Iterator[bytes]:
+    """The whole descriptors, each of which begins with its length."""
+    while len(data) >= 2 and 2 <= data[0] <= len(data):
+        yield data[: data[0]]
+        data = data[data[0] :]
 
 
 def _discs(sys: Path, root: str) -> Iterator[str]:
