@@ -27,7 +27,8 @@ def run_with_lerobot(program: str, *arguments: str) -> str:
         [str(PYTHON), "-W", "ignore", "-c", program, *arguments],
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
+        # Importing PyTorch alone takes a minute on a busy machine.
+        timeout=3 * PATIENCE,
         env=os.environ | {"HF_HUB_OFFLINE": "1"},
         check=False,
     )
