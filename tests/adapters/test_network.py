@@ -31,11 +31,18 @@ EXAMPLES = REPOSITORY / "examples" / "networks"
 GREY = np.full((6, 8, 3), 100, np.uint8)
 
 
-def save(path: Path, nodes: list[Any], shapes: dict[str, Any], out: dict[str, Any], **weights: Any) -> Path:
-    """Write a network. shapes, out : name -> axes. weights : name -> array."""
+def save(
+    path: Path,
+    nodes: list[Any],
+    shapes: dict[str, Any],
+    out: dict[str, Any],
+    dtype: int = TensorProto.FLOAT,
+    **weights: Any,
+) -> Path:
+    """Write a network. shapes, out : name -> axes. dtype : of the inputs. weights : name -> array."""
     infos = [
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, axes) for name, axes in side.items()]
-        for side in (shapes, out)
+        [helper.make_tensor_value_info(name, kind, axes) for name, axes in side.items()]
+        for side, kind in ((shapes, dtype), (out, TensorProto.FLOAT))
     ]
     constants = [numpy_helper.from_array(np.asarray(value), name) for name, value in weights.items()]
     graph = helper.make_graph(nodes, "network", *infos, constants)
@@ -203,6 +210,26 @@ def test_what_is_no_network_is_refused_with_what_to_do(tmp_path: Path) -> None:
         tactflow.stage("network", file=str(file), inputs={"picture": {}}, outputs={"y": {}})
     with pytest.raises(StageError, match=r"there is no provider TPU here; there are .*CPUExecutionProvider"):
         tactflow.stage("network", file=str(file), inputs={"x": {}}, outputs={"y": {}}, provider="TPU")
+
+
+@pytest.mark.parametrize("rest", [None, np.zeros((3, 4, 3), np.uint8)])
+def test_an_untouched_gel_that_is_missing_or_of_another_size_is_refused(tmp_path: Path, rest: Any) -> None:
+    stage = network(echo(tmp_path / "n.onnx", 1, 3, 6, 8), {"background": "subtract"})
+    with pytest.raises(StageError, match=r"required an untouched gel of \(6, 8, 3\), got"):
+        stage.process(GREY, rest)
+
+
+def test_bytes_are_not_scaled_to_zero_and_one(tmp_path: Path) -> None:
+    file = save(
+        tmp_path / "n.onnx",
+        [helper.make_node("Cast", ["x"], ["y"], to=TensorProto.FLOAT)],
+        {"x": [1, 3, 6, 8]},
+        {"y": [1, 3, 6, 8]},
+        dtype=TensorProto.UINT8,
+    )
+    with pytest.raises(StageError, match=r"takes bytes, but scale brings them to 0\.\.1: give scale: 1"):
+        network(file, {})
+    assert (seen(file, {"scale": 1.0}, GREY) == 100).all()
 
 
 def test_weights_in_another_file_are_not_read(tmp_path: Path) -> None:

@@ -219,7 +219,8 @@ class Network(Stage):
             raise StageError(f"there is no provider {p.provider} here; there are {', '.join(providers)}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = p.threads, 1
-        options.log_severity_level = 3
+        # What goes wrong is raised, too.
+        options.log_severity_level = 4
         try:
             # As bytes, so that the file cannot name others for its weights.
             content = self._file.read_bytes()
@@ -228,6 +229,10 @@ class Network(Stage):
             raise StageError(f"cannot read the network {self._file}: {error.strerror}") from None
         except Exception as error:
             raise StageError(f"{self._file} cannot be used as an ONNX file: {error}") from error
+        if session.get_providers()[0] != p.provider:
+            raise StageError(
+                f"the provider {p.provider} cannot be used here, for lack of a driver or library"
+            )
         self._check(session)
         self._session = session
 
@@ -330,6 +335,8 @@ class _Feed:
             raise StageError(f"{where}: required one of {', '.join(DTYPES)}, got {dtype}")
         self._where, self._sides, self._dtype = where, _sides(shape), DTYPES[dtype]
         p = self.params
+        if self._dtype is np.uint8 and "scale" not in p.model_fields_set:
+            raise StageError(f"{where} takes bytes, but scale brings them to 0..1: give scale: 1, or another")
         axes = p.shape(None, None, None)
         if p.size is None and p.layout != "pixels" and len(self._sides) - len(axes) in (0, 1):
             height, width = self._sides[-2:] if p.layout == "chw" else self._sides[-3:-1]
@@ -353,9 +360,12 @@ class _Feed:
         p, array = self.params, _array(value)
         if array.shape != self._shape:
             self._prepare(array)
-        if p.background != "none" and background is not self._background:
-            assert background is not None
-            self._background, self._rest = background, self._resized(background)
+        if p.background != "none":
+            if background is None or background.shape != array.shape:
+                shape = None if background is None else background.shape
+                raise StageError(f"{self._where}: required an untouched gel of {array.shape}, got {shape}")
+            if background is not self._background:
+                self._background, self._rest = background, self._resized(background)
         oldest = self._past[0] if len(self._past) == self._past.maxlen and self._owned else None
         self._past.append(self._resized(array, oldest))
         places = [max(0, len(self._past) - 1 - back * p.stride) for back in range(p.frames)]
@@ -553,8 +563,9 @@ def _array(value: Any) -> NDArray[Any]:
         value = np.hstack([value.origin, value.displacement])[:, None]
     elif isinstance(value, DisplacementField):
         value = value.displacement
-    if not isinstance(value, np.ndarray) or value.ndim not in (2, 3):
-        raise StageError(f"required an array (H, W) or (H, W, C), got {describe_type(type(value))}")
+    if not isinstance(value, np.ndarray) or value.ndim not in (2, 3) or not value.size:
+        got = value.shape if isinstance(value, np.ndarray) else describe_type(type(value))
+        raise StageError(f"required an array (H, W) or (H, W, C), got {got}")
     if value.dtype == np.uint8:
         return value
     return np.ascontiguousarray(value, np.float32)
