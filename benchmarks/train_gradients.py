@@ -29,7 +29,6 @@ from tactflow.calibration.photometric import INNER, fit_photometry
 from tactflow.calibration.presses import Press, Session
 from tactflow.calibration.scale import centre
 from tactflow.vision.depth.surface import Rest, Surface
-from tactflow.vision.depth.surroundings import surroundings
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale
 
@@ -170,17 +169,12 @@ def compare(args: argparse.Namespace, rest: Image, ball: float) -> None:
         "network", file=str(args.compare), inputs={"pixels": pixels}, outputs={"gradients": {}}
     )
 
-    def ours(press: Press) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        around = surroundings(press.mask, at_rest.window)
-        slopes = np.zeros((*press.mask.shape, 2), np.float32)
-        half = np.moveaxis(surface._slopes(press.image, at_rest, around)[0], 0, -1)
-        size = (2 * around.window.width, 2 * around.window.height)
-        slopes[around.window.whole] = cv2.resize(np.ascontiguousarray(half), size)
-        return -slopes, surface.depth(press.image, at_rest, press.mask).heights
-
-    def network(press: Press) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def network(press: Press) -> NDArray[np.float32]:
         (gradients,) = stage.process(press.image, rest)
-        return gradients, surface.depth(press.image, at_rest, press.mask, gradients).heights
+        return surface.depth(press.image, at_rest, press.mask, gradients).heights
+
+    def ours(press: Press) -> NDArray[np.float32]:
+        return surface.depth(press.image, at_rest, press.mask).heights
 
     print("| method | normals, deg, mean (median, 95 %) | radius of the sphere, error, % | ms a frame |")
     print("| --- | --- | --- | --- |")
@@ -188,10 +182,11 @@ def compare(args: argparse.Namespace, rest: Image, ball: float) -> None:
         angles, radii, times = [], [], []
         for press in [others[0], *others]:
             began = time.thread_time()
-            slopes, heights = method(press)
+            heights = method(press)
             times.append(1e3 * (time.thread_time() - began))
             inside, true = slopes_of_ball(press, ball, INNER)
-            angles.append(angle(slopes[inside], true))
+            down, right = np.gradient(heights, args.scale)
+            angles.append(angle(np.stack([right[inside], down[inside]], axis=1), true))
             radii.append(sphere(heights, inside, args.scale))
         found, errors = np.concatenate(angles[1:]), 100 * np.abs(np.array(radii[1:]) / args.radius - 1)
         q50, q95 = np.percentile(found, (50, 95))
