@@ -82,7 +82,7 @@ def test_the_embedding_can_be_made_again_from_its_files(exported: tuple[Path, li
 
 def test_an_embedding_of_few_markers_is_filled_with_zeros() -> None:
     vectors = np.random.default_rng(0).normal(size=(20, 4))
-    transform, _ = fit_embedding([vectors], 4)
+    transform, _ = fit_embedding(vectors)
     assert transform.shape == (4, 15)
     assert not transform[:, 4:].any()
 

@@ -10,7 +10,7 @@ the height of the picture (`common/tactile_marker_utils.py`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -106,17 +106,11 @@ class ReplayBuffer:
         """
         ends = np.array(self._ends, np.int64)
         self._meta.create_array("episode_ends", data=ends, chunks=ends.shape, compressors=None)
-        transform, mean = fit_embedding(self._offsets(), 2 * len(self._order.lost().offset))
-        for offsets in self._offsets():
-            self._append(f"{self._sensor}_marker_offset_emb", (offsets - mean) @ transform)
+        # Small beside the pictures, which the loaders keep in memory, too.
+        offsets = self._data[f"{self._sensor}_marker_offset"][:].reshape(ends[-1], -1)
+        transform, mean = fit_embedding(offsets)
+        self._append(f"{self._sensor}_marker_offset_emb", (offsets - mean) @ transform)
         return transform, mean
-
-    def _offsets(self) -> Iterator[NDArray[np.float32]]:
-        """The displacements of some frames at a time, (frames, 2 N)."""
-        array = self._data[f"{self._sensor}_marker_offset"]
-        for begin in range(0, array.shape[0], BATCH):
-            offsets: NDArray[np.float32] = array[begin : begin + BATCH]
-            yield offsets.reshape(len(offsets), -1)
 
     def _row(self, result: Result) -> dict[str, NDArray[Any]]:
         """The arrays of one frame."""
@@ -163,33 +157,21 @@ class ReplayBuffer:
         array.append(values)
 
 
-def fit_embedding(
-    batches: Iterable[NDArray[np.floating[Any]]], length: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Fit a principal component analysis to vectors that come in batches.
-
-    Parameters
-    ----------
-    batches : (frames, length) each. length : of a vector.
+def fit_embedding(vectors: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Fit a principal component analysis to vectors, (frames, length).
 
     Returns
     -------
     transform (length, 15) float32, orthonormal columns in the order of their variance, the largest number of
     each positive; columns that do not exist are 0. mean (length,) float32.
 
-    >>> line = np.outer(np.arange(5.0), [3.0, 4.0])
-    >>> transform, mean = fit_embedding([line[:2], line[2:]], 2)
+    >>> transform, mean = fit_embedding(np.outer(np.arange(5.0), [3.0, 4.0]))
     >>> transform[:, 0].round(3), mean
     (array([0.6, 0.8], dtype=float32), array([6., 8.], dtype=float32))
     """
-    count, total, products = 0, np.zeros(length), np.zeros((length, length))
-    for batch in batches:
-        vectors = batch.astype(np.float64)
-        count, total, products = count + len(vectors), total + vectors.sum(0), products + vectors.T @ vectors
-    mean = total / count
-    _, vectors = np.linalg.eigh(products / count - np.outer(mean, mean))
-    columns = vectors[:, ::-1][:, :COMPONENTS]
+    covariance = np.atleast_2d(np.cov(vectors, rowvar=False, bias=True))
+    columns = np.linalg.eigh(covariance)[1][:, ::-1][:, :COMPONENTS]
     largest = np.take_along_axis(columns, np.abs(columns).argmax(0)[None], 0)
-    transform = np.zeros((length, COMPONENTS), np.float32)
+    transform = np.zeros((vectors.shape[1], COMPONENTS), np.float32)
     transform[:, : columns.shape[1]] = columns * np.sign(largest)
-    return transform, mean.astype(np.float32)
+    return transform, vectors.mean(0, dtype=np.float64).astype(np.float32)
