@@ -49,6 +49,8 @@ def cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cameras under any number; `gone` cannot be opened."""
 
     def opened(spec: str, *, camera: CameraRequest) -> FrameReader:
+        if spec == "broken":
+            raise RuntimeError("a mistake of ours")
         if spec == "gone":
             raise SourceError("gone: cannot be opened; no such camera")
         return Camera(spec, camera)
@@ -95,6 +97,12 @@ def test_a_crowded_hub_is_named_in_place_of_each_slow_sensor(monkeypatch: pytest
     (said,) = measure_together(sensors, 30.0).advice
     assert said.startswith("left and right share a 480 Mbit/s hub (usb1) and reserve 344 Mbit/s")
     assert said.endswith("move one to another root hub, or ask for MJPG or fewer pixels")
+
+
+def test_a_mistake_in_a_reader_ends_the_measurement() -> None:
+    sensors = [Sensor("left", "broken", CameraRequest()), Sensor("right", "2", CameraRequest())]
+    with pytest.raises(RuntimeError, match="a mistake of ours"):
+        measure_together(sensors, 30.0)
 
 
 def test_the_command_prints_every_sensor_of_a_file_and_fails_for_one_that_is_gone(

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -82,16 +82,21 @@ def measure_together(sensors: Sequence[Sensor], seconds: float) -> Together:
     seconds : from when all are open, or until all have ended.
     """
     rates = [Rate(sensor.name, sensor.request.fps) for sensor in sensors]
-    ready, stop = threading.Barrier(len(sensors) + 1), threading.Event()
+    ready, go, stop = threading.Semaphore(0), threading.Event(), threading.Event()
     with ThreadPoolExecutor(len(sensors)) as pool:
         pairs = zip(sensors, rates, strict=True)
-        readers = [pool.submit(_count, sensor, rate, ready, stop) for sensor, rate in pairs]
+        readers = [pool.submit(_count, sensor, rate, ready, go, stop) for sensor, rate in pairs]
         try:
-            ready.wait()
+            for _ in sensors:
+                ready.acquire()
+            go.set()
             wait(readers, seconds)
             buses = usb_buses([_device(sensor.source) for sensor in sensors])
         finally:
             stop.set()
+            go.set()
+    for reader in readers:
+        reader.result()
     return Together(rates, buses, _advice(sensors, rates, buses))
 
 
@@ -100,30 +105,27 @@ def _device(source: str) -> str:
     return os.path.realpath(f"/dev/video{source}" if source.isdecimal() else source)
 
 
-def _count(sensor: Sensor, rate: Rate, ready: threading.Barrier, stop: threading.Event) -> None:
+def _count(
+    sensor: Sensor, rate: Rate, ready: threading.Semaphore, go: threading.Event, stop: threading.Event
+) -> None:
     """Read frames until told to stop, and note how many came a second."""
+    times: list[float] = []
     try:
-        reader = open_source(sensor.source, camera=sensor.request)
+        with ExitStack() as stack:
+            try:
+                reader = stack.enter_context(closing(open_source(sensor.source, camera=sensor.request)))
+                rate.promised, rate.description, rate.live = reader.fps, reader.description, reader.live
+                # The first frame takes as long as the camera needs to start; all wait for it.
+                reader.read()
+            finally:
+                ready.release()
+            go.wait()
+            rate.size = reader.size
+            while not stop.is_set() and reader.read() is not None:
+                times.append(time.monotonic())
     except SourceError as error:
         rate.problem = str(error)
-        ready.wait()
-        return
-    with closing(reader):
-        rate.promised, rate.description, rate.live = reader.fps, reader.description, reader.live
-        times: list[float] = []
-        try:
-            # The first frame takes as long as the camera needs to start; all wait for it.
-            reader.read()
-        except SourceError as error:
-            rate.problem = str(error)
-        ready.wait()
-        try:
-            while not (rate.problem or stop.is_set()) and reader.read() is not None:
-                times.append(time.monotonic())
-        except SourceError as error:
-            rate.problem = str(error)
-        rate.size = reader.size
-        rate.got = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
+    rate.got = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
 
 
 def _advice(sensors: Sequence[Sensor], rates: Sequence[Rate], buses: Sequence[UsbBus]) -> list[str]:
