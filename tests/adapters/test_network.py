@@ -255,7 +255,7 @@ def test_settings_that_contradict_each_other_are_mistakes(tmp_path: Path) -> Non
         with pytest.raises(ConfigError, match=words):
             network(file, settings)
     with pytest.raises(StageError, match="mean has 2 numbers for 3 channels"):
-        network(file, {"mean": (0.1, 0.2)}).process(GREY)
+        network(file, {"mean": (0.1, 0.2)})
 
 
 def pooled(path: Path, channels: int, count: int, shape: tuple[Any, ...] = (224, 224)) -> Path:

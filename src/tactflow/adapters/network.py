@@ -343,6 +343,8 @@ class _Feed:
             self._size = None if height is None or width is None else (width, height)
         width, height = self._size or (None, None)
         self._compare(p.shape(p.channels, height, width))
+        if p.channels is not None:
+            self._coefficients(p.channels - 2 * p.coordinates)
 
     def _compare(self, shape: tuple[Side, ...]) -> None:
         if not _agree(self._sides, shape):
