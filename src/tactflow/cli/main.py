@@ -19,6 +19,7 @@ from tactflow.system.spelling import closest, did_you_mean
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "run": ("run", "run a pipeline"),
     "check": ("pipelines", "validate a pipeline file without running it; prints every mistake at once"),
+    "start": ("start", "set up a sensor, step by step: from the camera to a pipeline file and live results"),
     "explain": ("explain", "why each stage runs, is skipped or is left out, and what it cost"),
     "graph": ("explain", "print a pipeline as a Mermaid flowchart"),
     "pipelines": ("pipelines", "list the pipelines that come with tactflow, one for each kind of sensor"),

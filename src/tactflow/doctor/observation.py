@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
@@ -49,6 +49,11 @@ class Observation:
     stopped: str = ""
     delays: list[float] = field(default_factory=list[float])
     pairs: list[Pair] = field(default_factory=list[Pair])
+
+    def check(self) -> None:
+        """Raise SourceError if there are no frames."""
+        if not self.frames:
+            raise SourceError(f"{self.source}: {self.stopped or 'it contains no frames'}")
 
     @property
     def gaps(self) -> NDArray[np.float64] | str:
@@ -128,26 +133,33 @@ def observe(source: str, seconds: float, report: Callable[[int], None] = lambda 
     (5, 60.0, 5)
     """
     with closing(open_source(source)) as reader:
-        observation = Observation(source, reader.description, reader.live, reader.fps)
-        try:
-            _read(reader, seconds, observation, report)
-        except SourceError as error:
-            observation.stopped = str(error)
-        except KeyboardInterrupt:
-            pass
-    if not observation.frames:
-        raise SourceError(f"{source}: {observation.stopped or 'it contains no frames'}")
-    if isinstance(reader, ImageFiles | ArrayFile):
-        # The reader invents the rate of these.
-        observation.nominal = observation.times = None
+        observation = Observation(source, reader.description, reader.live)
+        with suppress(KeyboardInterrupt):
+            watch(reader, seconds, observation, lambda _: report(observation.frames))
+    observation.check()
     return observation
 
 
+def watch(
+    reader: FrameReader, seconds: float, observation: Observation, show: Callable[[Arrival], object]
+) -> None:
+    """Add the frames of an open source to an observation, for some seconds of its own time, or to its end.
+
+    show : called with each frame; the observation ends when it returns False.
+    """
+    try:
+        _read(reader, seconds, observation, show)
+    except SourceError as error:
+        observation.stopped = str(error)
+
+
 def _read(
-    reader: FrameReader, seconds: float, observation: Observation, report: Callable[[int], None]
+    reader: FrameReader, seconds: float, observation: Observation, show: Callable[[Arrival], object]
 ) -> None:
     times: list[float] = []
-    observation.times = times
+    # The reader invents the rate of separate pictures.
+    if not isinstance(reader, ImageFiles | ArrayFile):
+        observation.nominal, observation.times = reader.fps, times
     last: Image | None = None
     last_seq: int | None = None
     stride = 1
@@ -171,7 +183,8 @@ def _read(
         times.append(t)
         last, last_seq = image, seq
         observation.frames += 1
-        report(observation.frames)
+        if show(frame) is False:
+            return
     if reader.live and times:
         observation.stopped = f"it ended after {times[-1] - times[0]:.1f} s"
 

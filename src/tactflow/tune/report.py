@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -88,21 +88,35 @@ def pipeline_text(tuned: Tuned, file: Path, out: Path) -> str:
         The pipeline names files relative to itself, and `out` is in another folder.
     """
     assert tuned.chosen is not None
+    title = f"Chosen by tactflow tune for {tuned.recording.source}, from {file.name}: {tuned.chosen.name}."
+    settings = tuned.chosen.settings
+    changes = [f"{key}: {'removed' if value is None else value}" for key, value in settings.items()]
+    return changed_pipeline(file, settings, [title, *changes, "", *lines(tuned)], out)
+
+
+def changed_pipeline(file: Path, settings: Mapping[str, Any], comments: Sequence[str], out: Path) -> str:
+    """A pipeline with other settings as YAML, below comments.
+
+    settings : as `stages.preprocess.downsample` -> value; None removes an entry. out : path of the file to
+    write.
+
+    Raises
+    ------
+    ConfigError
+        The pipeline names files relative to itself, and `out` is in another folder.
+    """
     document: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
     if "./" in yaml.safe_dump(document) and out.absolute().parent != file.absolute().parent:
         raise ConfigError(
             f"--out: {file} names files relative to itself; required a path in the same folder, such as "
             f"{file.parent / out.name}"
         )
-    header = [f"Chosen by tactflow tune for {tuned.recording.source}, from {file.name}: {tuned.chosen.name}."]
-    for key, value in tuned.chosen.settings.items():
+    for key, value in settings.items():
         _set(document, key, value)
-        header.append(f"{key}: {'removed' if value is None else value}")
-    header += ["", *lines(tuned)]
     body = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None)
     # The name of a recording may contain line breaks; all lines must stay comments.
-    comments = "\n".join(f"# {line}".rstrip() for part in header for line in part.splitlines() or [""])
-    return f"{comments}\n\n{body}"
+    header = "\n".join(f"# {line}".rstrip() for part in comments for line in part.splitlines() or [""])
+    return f"{header}\n\n{body}"
 
 
 def _set(document: dict[str, Any], key: str, value: Any) -> None:

@@ -22,7 +22,6 @@ from websockets.asyncio.server import ServerConnection
 
 from tactflow.engine.control import Control
 from tactflow.network.commands import Commands, RefusedError
-from tactflow.view.guided import Session
 
 log = logging.getLogger("tactflow")
 
@@ -96,7 +95,7 @@ class Hub:
     sensor : name of the sensor.
     neighbours : returns sensor name -> port of the other sensors' pages.
     again : publishes the last frame again; called in a worker thread.
-    session : the guided session that the run is part of, if any.
+    answers : further command -> what it calls with its value, of a guided session.
     """
 
     def __init__(
@@ -105,7 +104,7 @@ class Hub:
         sensor: str,
         neighbours: Callable[[], Mapping[str, int]] = dict,
         again: Callable[[], None] = lambda: None,
-        session: Session | None = None,
+        answers: Mapping[str, Callable[[Any], Any]] | None = None,
     ) -> None:
         self.control = control
         self._commands = Commands(control)
@@ -131,8 +130,8 @@ class Hub:
             "record": lambda value: self._commands.record(value is True),
             "stop": lambda _: self._commands.stop(),
         }
-        if session is not None:
-            self._by_name["undo"] = lambda _: session.undo()
+        self._answers = answers or {}
+        self._by_name |= self._answers
 
     # -- from other threads -------------------------------------------------------------------------------
 
@@ -333,7 +332,9 @@ class Hub:
 
     def _refusal(self, name: str) -> str | None:
         """Why a command is unavailable, or None."""
-        return "the run has ended" if self._end is not None else self._commands.refusal(name)
+        if self._end is not None:
+            return "the run has ended"
+        return None if name in self._answers else self._commands.refusal(name)
 
 
 def _text(**fields: Any) -> str:

@@ -32,6 +32,7 @@ let rise = 3;
 let wanted = localStorage.getItem("tactflow-unit") ?? "mm";
 let current = null;
 let run = null;
+let asked = null;  // number of the question that is shown
 let link = "connecting";  // connecting, open, lost, token
 let nextAttempt = 0;
 let lastFrame = 0;
@@ -61,7 +62,7 @@ const news = {
     // A new run at the same address: discard the state of the previous one.
     if (run !== null && run !== message.run) {
       sensors.clear();
-      current = null;
+      current = asked = null;
     }
     run = message.run;
     message.sensors.forEach(sensor);
@@ -125,6 +126,7 @@ function drawAspect({ last }) {
 
 function drawValues(s) {
   const message = s?.last;
+  put(document.body.dataset, "asks", String(Boolean(message?.guide?.choices)));
   drawOffers(message?.offers ?? []);
   for (const name of ["area", "angle", "flow", "depth", "force", "slip"]) {
     const [value, rest] = message ? words[name](message, unit()) : ["–", ""];
@@ -150,6 +152,29 @@ function drawValues(s) {
 }
 
 function drawGuide(guide) {
+  if (guide.choices) drawQuestion(guide);
+  else drawPresses(guide);
+}
+
+// A question of `tactflow start`. An edge of the picture is chosen at the picture.
+function drawQuestion({ number, now, notes, choices }) {
+  if (asked === number) return;
+  asked = number;
+  set("guide-title", "Set up");
+  set("guide-now", now);
+  set("guide-last", notes);
+  const buttons = choices.map(({ value, label, at }) => {
+    const button = document.createElement("button");
+    Object.assign(button, { type: "button", textContent: label });
+    if (at) button.dataset.at = at;
+    button.addEventListener("click", () => command("answer", [number, value]));
+    return button;
+  });
+  $("edges").replaceChildren(...buttons.filter((button) => button.dataset.at));
+  $("choices").replaceChildren(...buttons.filter((button) => !button.dataset.at));
+}
+
+function drawPresses(guide) {
   const [count, share, last, good] = words.guide(guide);
   set("guide-count", count);
   set("guide-now", guide.now);
@@ -295,7 +320,7 @@ function refresh() {
     connecting: ["Connecting", "Connecting to the run."],
     token: ["Token required", "Open the address that tactflow printed, or enter the token here."],
     disconnected: ["Disconnected", `The run does not answer. ${wait ? `Next attempt in ${wait} s.` : "Trying again …"}`],
-    ended: s?.last?.guide ? ["All presses are recorded", "The terminal shows the result of the calibration."] : ["The run has ended", `${ENDS[state?.end] ?? state?.end ?? ""} This page reconnects when a new run starts at this address.`],
+    ended: s?.last?.guide?.choices ? ["Set up", "The live results appear here when the pipeline runs."] : s?.last?.guide ? ["All presses are recorded", "The terminal shows the result of the calibration."] : ["The run has ended", `${ENDS[state?.end] ?? state?.end ?? ""} This page reconnects when a new run starts at this address.`],
     waiting: ["Waiting for frames", "The run has started, but its source has not delivered a frame yet."],
     paused: ["Paused", "No frame has been shown yet."],
     stalled: ["", ""],

@@ -59,7 +59,7 @@ export class Picture {
     this.at = ([x, y]) => [(x + 0.5) * sx, (y + 0.5) * sy];
     this.unit = ratio * Math.max(1, Math.min(width, height) / ratio / 480);
     c.lineJoin = c.lineCap = "round";
-    if (guide) this.drawGuide(guide);
+    if (guide?.next) this.drawGuide(guide);
     if (layers.field && field?.origin) this.drawField(field);
     if (layers.arrows && markers) this.drawMarkers(markers);
     if (message.contact) {

@@ -1,0 +1,264 @@
+"""`tactflow start`: set up a sensor, from the camera to a pipeline file and live results."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from tactflow.cli.cameras import NO_CAMERA
+from tactflow.cli.doctor import describe_finding
+from tactflow.cli.options import add_overwrite, refuse_output, writing
+from tactflow.cli.terminal import notes, printable, say, typed
+from tactflow.config.shipped import described_pipelines, find_pipeline
+from tactflow.engine.errors import ConfigError, SourceError, StageError
+from tactflow.sources import FrameReader, open_source
+from tactflow.sources.cameras import list_cameras
+from tactflow.system.files import completed
+from tactflow.system.redaction import shown_address
+from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
+
+if TYPE_CHECKING:
+    from tactflow.doctor import Observation
+    from tactflow.ports import Image
+    from tactflow.tune.propose import Attempt, Seen
+    from tactflow.view.questions import Questions
+
+SETTLE_SECONDS: Final = 3.0
+"""With --yes, time for exposure and white balance before the gel is looked at, s: `settle` of capture."""
+REST_SECONDS: Final = 2.0
+"""How long the untouched gel is looked at, s."""
+PRESS_SECONDS: Final = 10.0
+"""With --yes, how long to wait for presses, s."""
+RECORDED_SECONDS: Final = 30.0
+"""How much of a recording is looked at, s."""
+EDGES: Final = {"0": "top", "270": "right", "180": "bottom", "90": "left"}
+"""Value of `rotate`, degrees clockwise -> edge of the picture that it brings to the top."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `start`."""
+    parser.add_argument(
+        "source", nargs="?", metavar="SRC", help="as in 'tactflow run'; default: a camera that is plugged in"
+    )
+    parser.add_argument("--yes", action="store_true", help="take every proposal, ask nothing; for scripts")
+    parser.add_argument(
+        "--out", type=Path, default=Path("pipeline.yaml"), metavar="FILE", help="default: pipeline.yaml"
+    )
+    add_overwrite(parser)
+    parser.add_argument("--no-run", action="store_true", help="write the file, but do not run it")
+    parser.set_defaults(dev=Path("/dev"), port=8780)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask, propose, write, run; returns the exit code.
+
+    Raises
+    ------
+    ConfigError
+        The file is there already, there are several cameras and --yes, or nobody can answer.
+    SourceError
+        There is no camera, or the source delivers nothing.
+    StageError
+        With --yes: no pipeline finds the presses, or the gel was touched while it was looked at untouched.
+    """
+    refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
+    # Imported here: the server and the stages take their time.
+    from tactflow.view.questions import Questions
+
+    questions = Questions(None if args.yes else args.port, say)
+    try:
+        with ending_handled(interrupt), notes("ERROR"), closing(questions):
+            if questions.url is not None:
+                say(f"answer here, or on the page: {questions.url}")
+            source, reader = _open(args, questions)
+            with closing(reader):
+                _set_up(args, source, reader, questions)
+    except KeyboardInterrupt:
+        say("stopped; nothing was written")
+        return INTERRUPTED
+    say(f"{args.out} is written. From now on: {typed('tactflow', 'run', str(args.out))}")
+    if args.no_run:
+        return 0
+    from tactflow.cli.main import make_parser
+
+    words = [
+        "run",
+        str(args.out),
+        *([] if questions.url is None else ["--set", f"sinks.view.port={questions.port}"]),
+    ]
+    live = make_parser("run").parse_args(words)
+    return int(live.run(live))
+
+
+def _open(args: argparse.Namespace, questions: Questions) -> tuple[str, FrameReader]:
+    """The source that was named, or the camera that is the sensor."""
+    sources = [args.source] if args.source is not None else _cameras(args.dev)
+    if args.yes and len(sources) > 1:
+        raise ConfigError(f"{len(sources)} cameras are plugged in; name the sensor: {', '.join(sources)}")
+    problems: list[str] = []
+    while len(problems) < len(sources):
+        problems = []
+        for source in sources:
+            try:
+                reader = open_source(source)
+                reader.peek()
+            except SourceError as error:
+                problems.append(str(error))
+                continue
+            choices = {"yes": "Yes, this is the sensor", "no": "No, show the next camera"}
+            if len(sources) == 1 or questions.ask(f"Is this the sensor? {source}", choices, reader) == "yes":
+                return source, reader
+            reader.close()
+    raise SourceError("\n".join(problems))
+
+
+def _cameras(dev: Path) -> list[str]:
+    """Sources of the cameras that deliver pictures; outside Linux they have numbers, and no list."""
+    if not sys.platform.startswith("linux"):
+        return ["0", "1", "2"]
+    cameras = list_cameras(dev)
+    found = [camera.source for camera in cameras if camera.abilities is None or camera.abilities.pictures]
+    if not found:
+        raise SourceError(f"{NO_CAMERA}\n  to try it without one: tactflow start sim:press")
+    return found
+
+
+def _set_up(args: argparse.Namespace, source: str, reader: FrameReader, questions: Questions) -> None:
+    """Ask and propose until a pipeline is accepted, and write it. Raises KeyboardInterrupt if none is."""
+    from tactflow.doctor import examine
+    from tactflow.tune.propose import distinct_pipelines, propose
+
+    kinds = {name for names in distinct_pipelines() for name in names} - {"default", "markerless"}
+    named = {name: what for name, what in described_pipelines().items() if name in kinds}
+    kind = questions.ask(
+        "Which sensor is this?", {"unknown": "Another one, or unknown"} | named, _live(reader)
+    )
+    answer = "again"
+    while answer == "again":
+        observation, seen, rotate = (_look if reader.live else _read)(source, reader, questions)
+        questions.begin("Trying pipelines on these pictures ...")
+        dots = observation.dots
+        attempts = propose(seen, None if dots is None else dots.pitch, int(rotate), kind, say)
+        faults = [finding for finding in examine(observation) if finding.verdict in ("warning", "fault")]
+        remarks = [line for finding in faults for line in describe_finding(finding)]
+        answer = _decide(args, attempts[0], seen, remarks, reader, questions)
+    if answer == "quit":
+        raise KeyboardInterrupt
+    _write(args.out, source, attempts, remarks)
+
+
+def _live(reader: FrameReader) -> FrameReader | None:
+    return reader if reader.live else None
+
+
+def _look(source: str, reader: FrameReader, questions: Questions) -> tuple[Observation, Seen, str]:
+    """Look at a live sensor: at rest, then pressed. Returns also the value of `rotate`."""
+    from tactflow.doctor.observation import Observation, watch
+    from tactflow.tune.propose import divide, frames_of
+    from tactflow.tune.recording import CHANGE
+
+    if questions.unattended:
+        watch(reader, SETTLE_SECONDS, Observation(source, "", True), lambda _: None)
+    again = "Leave the gel untouched."
+    while again:
+        questions.ask(again, {"untouched": "Nothing touches the gel"}, reader)
+        rest = Observation(source, reader.description, live=True)
+        questions.begin(f"Looking at the untouched gel for {REST_SECONDS:.0f} s ...")
+        watch(reader, REST_SECONDS, rest, lambda arrival: questions.show(arrival.image))
+        rest.check()
+        untouched = frames_of(rest)
+        change, again = divide(untouched, len(untouched)).restless, ""
+        if change >= CHANGE:
+            again = (
+                f"The picture changed by {100 * change:.0f} %, although nothing should touch the gel. Keep "
+                "away from it, and from its light, for a moment."
+            )
+            if questions.unattended:
+                raise StageError(again)
+    rotate = questions.ask(
+        "Press the end of the gel that points away from the cable. At which edge of the picture is it?",
+        {value: f"{edge} edge" for value, edge in EDGES.items()},
+        reader,
+        sides=True,
+    )
+    pressed = Observation(source, reader.description, live=True)
+    questions.begin("Press the gel in several places, and lift in between.", {"done": "Done"})
+
+    def goes_on(image: Image) -> bool:
+        questions.show(image)
+        return questions.unattended or questions.poll() is None
+
+    seconds = PRESS_SECONDS if questions.unattended else math.inf
+    watch(reader, seconds, pressed, lambda arrival: goes_on(arrival.image))
+    pressed.check()
+    both = replace(pressed, pairs=[*rest.pairs, *pressed.pairs])
+    return both, divide([*untouched, *frames_of(pressed)], len(untouched)), rotate
+
+
+def _read(source: str, reader: FrameReader, questions: Questions) -> tuple[Observation, Seen, str]:
+    """The same from a recording."""
+    from tactflow.doctor.observation import Observation, watch
+    from tactflow.tune.propose import divide, frames_of
+
+    observation = Observation(source, reader.description, live=False)
+    watch(reader, RECORDED_SECONDS, observation, lambda _: None)
+    observation.check()
+    seen = divide(frames_of(observation))
+    if seen.reference:
+        say(f"frame {seen.reference} of those that were kept is taken for the untouched gel")
+    questions.show(seen.frames[seen.strongest])
+    rotate = questions.ask(
+        "Which edge of the picture is the end of the gel that points away from the cable?",
+        {value: f"{edge} edge" for value, edge in EDGES.items()},
+        sides=True,
+    )
+    return observation, seen, rotate
+
+
+def _decide(
+    args: argparse.Namespace,
+    best: Attempt,
+    seen: Seen,
+    remarks: Sequence[str],
+    reader: FrameReader,
+    questions: Questions,
+) -> str:
+    """Show the proposal; returns write, again or quit. Raises StageError with --yes if there is none."""
+    from tactflow.tune.propose import FEWEST_FOUND
+
+    choices = {"write": f"Write {args.out}" + ("" if args.no_run else " and go on live")}
+    if reader.live:
+        choices["again"] = "Look again"
+    choices["quit"] = "Quit"
+    text = f"Proposed: {best}"
+    if not seen.pressed:
+        text = f"No press was seen, so that contacts are untested. {text}"
+    elif best.failure or best.found < FEWEST_FOUND:
+        del choices["write"]
+        text = f"No pipeline finds the presses of this gel. The best is {best}"
+    if best.picture is not None:
+        questions.show(best.picture)
+    if args.yes:
+        if "write" not in choices:
+            raise StageError("\n".join([text, *remarks]))
+        say("\n".join([*remarks, text]))
+    return questions.ask(text, choices, notes=remarks)
+
+
+def _write(out: Path, source: str, attempts: Sequence[Attempt], remarks: Sequence[str]) -> None:
+    """Write the first pipeline, with what was measured as comments."""
+    from tactflow.tune.report import changed_pipeline
+
+    file = find_pipeline(attempts[0].pipeline)
+    title = f"Made by tactflow start for {shown_address(source)}, from {file.name}. Tried on its pictures:"
+    comments = [printable(line) for line in (title, *(f"  {attempt}" for attempt in attempts), *remarks)]
+    settings = {"stages.capture.source": source, **attempts[0].settings}
+    text = changed_pipeline(file, settings, comments, out)
+    with writing(out), completed(out) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")

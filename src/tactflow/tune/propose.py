@@ -1,0 +1,249 @@
+"""Propose a pipeline for a sensor of which nothing is known, from frames at rest and frames with presses.
+
+No truth is needed: the shipped pipelines process the same frames, and are compared by what they report at
+rest, where every contact is false, and while the gel is pressed, where every frame without one is a miss.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import takewhile
+from textwrap import shorten
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline, packaged_pipelines
+from tactflow.doctor.checks import STEADY
+from tactflow.doctor.observation import Observation
+from tactflow.engine.errors import StageError
+from tactflow.message.result import Result
+from tactflow.streaming import stream
+from tactflow.tune.recording import CHANGE, change_between
+from tactflow.tune.space import DOWNSAMPLE, MIN_PITCH, MIN_SIDE
+from tactflow.vision.change import Settling
+from tactflow.vision.types import MarkerStatus
+
+Image = NDArray[np.uint8]
+
+LARGE: Final = 500
+"""px: pictures with a longer side are shrunk; the shipped pipelines are measured on 160 to 480 px."""
+PRESSED: Final = 0.5
+"""Change of light, relative to the largest, from which a frame counts as pressed. Those between are left out,
+because whether they show a contact is a matter of definition."""
+FEWEST_FOUND: Final = 0.5
+"""Share of presses below which a pipeline does not find the contacts of a gel: no better than a coin."""
+GEOMETRY: Final = frozenset({"capture", "preprocess", "visualize"})
+"""Stages that do not distinguish candidates: where frames come from, how they are turned and drawn."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Frames of a sensor, and what is known of them.
+
+    frames : (H, W, 3) uint8 each. reference : index of the frame of the untouched gel. rest, pressed :
+    indices of frames. changes : largest relative change of light of each frame from the reference.
+    """
+
+    frames: list[Image]
+    reference: int
+    rest: list[int]
+    pressed: list[int]
+    changes: list[float]
+
+    @property
+    def strongest(self) -> int:
+        """Index of the frame that differs most from the reference."""
+        return int(np.argmax(self.changes))
+
+    @property
+    def restless(self) -> float:
+        """Largest relative change of light at rest."""
+        return max(self.changes[index] for index in self.rest)
+
+
+@dataclass
+class Attempt:
+    """What a pipeline reports on the frames.
+
+    pipeline : its name. settings : values that differ from its file. found : share of pressed frames with a
+    contact. false : share of frames at rest with a contact. deviation : standard error of their difference.
+    dots : median number of dots at rest. steady : 95th percentile of their displacement at rest, px.
+    picture : result of the strongest press, with its image. failure : error message if it does not run.
+    """
+
+    pipeline: str
+    settings: dict[str, Any]
+    found: float = math.nan
+    false: float = math.nan
+    deviation: float = math.nan
+    dots: int = 0
+    steady: float = math.inf
+    picture: Result | None = field(default=None, repr=False)
+    failure: str = ""
+
+    @property
+    def score(self) -> float:
+        """Found minus false: W. J. Youden, "Index for rating diagnostic tests", Cancer 3, 1950."""
+        return -math.inf if self.failure else (0.0 if math.isnan(self.found) else self.found) - self.false
+
+    @property
+    def has_dots(self) -> bool:
+        """Whether it tracks dots that keep still on the untouched gel."""
+        return self.dots > 0 and self.steady < STEADY
+
+    def __str__(self) -> str:
+        if self.failure:
+            return f"{self.pipeline}: {self.failure}"
+        found = (
+            "no press seen" if math.isnan(self.found) else f"finds {100 * self.found:.0f} % of the presses"
+        )
+        dots = f"{self.dots} dots, steady to {self.steady:.2f} px" if self.dots else "no dots"
+        return f"{self.pipeline}: {found}, {100 * self.false:.0f} % false contacts at rest, {dots}"
+
+
+def frames_of(observation: Observation) -> list[Image]:
+    """The kept frames of an observation, in order."""
+    images = {pair.number: pair.image for pair in observation.pairs}
+    images |= {pair.number + 1: pair.after for pair in observation.pairs if pair.after is not None}
+    return [images[number] for number in sorted(images)]
+
+
+def divide(frames: Sequence[Image], at_rest: int | None = None) -> Seen:
+    """Tell frames of the untouched gel from those with a press, by the change of light alone.
+
+    at_rest : number of first frames known to show the untouched gel; None: as many as look like the
+        reference.
+    """
+    settling = Settling()
+    for index, image in enumerate(frames[:at_rest]):
+        settling.add(image, index / 30)
+        if settling.touched or settling.unrelated or settling.steady:
+            break
+    reference = settling.best()
+    changes = [change_between(frames[reference], image) for image in frames]
+    same = takewhile(lambda index: changes[index] < CHANGE, range(reference, len(frames)))
+    rest = list(same) if at_rest is None else list(range(reference, at_rest))
+    limit = max(CHANGE, PRESSED * max(changes))
+    pressed = [index for index in range(rest[-1] + 1, len(frames)) if changes[index] >= limit]
+    return Seen(list(frames), reference, rest, pressed, changes)
+
+
+def distinct_pipelines() -> list[list[str]]:
+    """Shipped pipelines by what they compute, as lists of names; those of built-in stages only.
+
+    Pipelines that differ in geometry alone are in one list. Those that rectify the picture of a certain
+    camera are left out. The first list is that of `default`.
+
+    >>> [names[0] for names in distinct_pipelines()]
+    ['default', 'markerless', 'tactip']
+    """
+    alike: dict[str, list[str]] = {}
+    for name in sorted(
+        packaged_pipelines(), key=lambda name: (name != "default", name != "markerless", name)
+    ):
+        nodes = load_pipeline(find_pipeline(name)).nodes
+        if getattr(nodes["preprocess"].params, "homography", None) is None and all(
+            node.component.name == id_ for id_, node in nodes.items() if node.component.kind != "sink"
+        ):
+            computed = {id_: repr(node.params) for id_, node in nodes.items() if id_ not in GEOMETRY}
+            stages = {id_: text for id_, text in computed.items() if nodes[id_].component.kind == "stage"}
+            alike.setdefault(repr(sorted(stages.items())), []).append(name)
+    return list(alike.values())
+
+
+def shrinking(size: tuple[int, int], pitch: float | None) -> int:
+    """Factor of `downsample` for frames of a size (width, height), px. pitch : of the dots, px.
+
+    >>> shrinking((320, 240), None), shrinking((1280, 720), 60.0), shrinking((1280, 720), 13.0)
+    (1, 4, 2)
+    """
+    factor = 1
+    while (
+        max(size) / factor > LARGE
+        and min(size) / (2 * factor) >= MIN_SIDE
+        and (pitch is None or pitch / (2 * factor) >= MIN_PITCH)
+    ):
+        factor *= 2
+    return factor
+
+
+def propose(
+    seen: Seen,
+    pitch: float | None,
+    rotate: int = 0,
+    kind: str | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> list[Attempt]:
+    """Try the shipped pipelines, best first.
+
+    Of pipelines whose scores are within a standard error of the best, one that also tracks steady dots is
+    preferred, then the one for the sensor that the user named, then the first.
+
+    pitch : of the dots, px, None without dots. rotate : degrees clockwise. kind : shipped pipeline for the
+    sensor as named by the user, None if unknown. report : called with the result of each.
+    """
+    height, width = seen.frames[0].shape[:2]
+    settings = {"stages.preprocess.rotate": rotate, DOWNSAMPLE: shrinking((width, height), pitch)}
+    attempts = []
+    for names in distinct_pipelines():
+        attempts.append(_attempt(kind if kind in names else names[0], settings, seen))
+        report(str(attempts[-1]))
+    best = max(attempts, key=lambda attempt: attempt.score)
+
+    def rank(attempt: Attempt) -> tuple[bool, float, bool, bool]:
+        near = attempt.score >= best.score - best.deviation
+        with_dots = pitch is not None and attempt.has_dots
+        return not near, 0.0 if near else -attempt.score, not with_dots, attempt.pipeline != kind
+
+    return sorted(attempts, key=rank)
+
+
+def _attempt(name: str, settings: dict[str, Any], seen: Seen) -> Attempt:
+    attempt = Attempt(name, settings)
+    frames = [seen.frames[seen.reference], *seen.frames]
+    # The reference is chosen already.
+    running = stream(name, source=frames, settings={**settings, "stages.capture.settle": 0}, images=True)
+    touching, dots, moved = [], [], []
+    try:
+        with closing(running) as results:
+            for index, result in enumerate(results, -1):
+                if index < 0:
+                    continue
+                touching.append(result.contact is not None)
+                if index == seen.strongest:
+                    attempt.picture = result
+                if index in seen.rest and result.markers is not None:
+                    tracked = result.markers.status == MarkerStatus.TRACKED
+                    dots.append(int(tracked.sum()))
+                    moved.append(np.hypot(*(result.markers.position - result.markers.origin)[tracked].T))
+    except StageError as error:
+        attempt.failure = shorten(str(error), 70, placeholder=" ...")
+        return attempt
+    contact = np.array(touching)
+    attempt.false = float(contact[seen.rest].mean())
+    variance = _variance(contact[seen.rest])
+    if seen.pressed:
+        attempt.found = float(contact[seen.pressed].mean())
+        variance += _variance(contact[seen.pressed])
+    attempt.deviation = math.sqrt(variance)
+    if dots and any(map(len, moved)):
+        attempt.dots = int(np.median(dots))
+        attempt.steady = float(np.percentile(np.concatenate(moved), 95))
+    return attempt
+
+
+def _variance(outcomes: NDArray[np.bool_]) -> float:
+    """Variance of a share of outcomes (N,), also of 0 and 1.
+
+    A. Agresti and B. A. Coull, "Approximate is better than exact for interval estimation of binomial
+    proportions", The American Statistician 52, 1998.
+    """
+    count = len(outcomes) + 4
+    share = (int(outcomes.sum()) + 2) / count
+    return share * (1 - share) / count

@@ -1,0 +1,225 @@
+"""`tactflow start` with simulated cameras: questions answered on the page, in the terminal, or not at all."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import yaml
+
+from tactflow import open_scene
+from tests.chromium import PATIENCE
+from tests.clock import until
+
+SENSORS = {
+    "press": "default",
+    "unmarked": "markerless",
+    "bright_dots": "default",
+    "halo": "markerless",
+    "painted": "default",
+    "mixed": "default",
+}
+"""Simulated sensor -> the pipeline that a person would choose for it."""
+
+
+class Camera:
+    """A network camera that shows a simulated gel: at rest, and pressed while `pressed` is set."""
+
+    def __init__(self, scene: str) -> None:
+        gel = open_scene(f"{scene}?frames=120")
+        images = [cv2.resize(gel.frame(index), (400, 300)) for index in range(0, 60, 2)]
+        self._jpegs = [cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1] for image in images]
+        self.count = 0
+        self.pressed, self._stopped = threading.Event(), threading.Event()
+        camera = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                index = 0
+                while not camera._stopped.wait(0.03):
+                    index = index + 1 if camera.pressed.is_set() else 0
+                    camera.count = index
+                    jpeg = camera._jpegs[index % len(camera._jpegs)].tobytes()
+                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                    self.wfile.write(head.encode() + jpeg + b"\r\n")
+
+            def log_message(self, format: str, *args: object) -> None:
+                pass
+
+        class Quiet(ThreadingHTTPServer):
+            def handle_error(self, request: object, client_address: object) -> None:
+                """A reader that hangs up is expected."""
+
+        self._server = Quiet(("127.0.0.1", 0), Handler)
+        self.address = f"http://127.0.0.1:{self._server.server_port}/stream"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
+        self._thread.start()
+
+    def press(self) -> None:
+        """Press the gel twice, while somebody watches."""
+        self.pressed.set()
+        wanted = self.count + 2 * len(self._jpegs)
+        until(lambda: self.count > wanted)
+
+    def close(self) -> None:
+        self._stopped.set()
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+
+class Start:
+    """`tactflow start` in a process of its own, in an empty folder."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tactflow", "start", *words],
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.errors: list[str] = []
+        self._told = threading.Condition()
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            with self._told:
+                self.errors.append(line)
+                self._told.notify_all()
+
+    def said(self, pattern: str) -> str:
+        """Wait for a line that has a pattern; returns its first group, or all of it."""
+
+        def found() -> re.Match[str] | None:
+            return next((match for line in self.errors if (match := re.search(pattern, line))), None)
+
+        with self._told:
+            match = self._told.wait_for(found, PATIENCE / 1000)
+        assert match, "".join(self.errors)
+        return match[match.re.groups]
+
+    def type(self, text: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(text + "\n")
+        self.process.stdin.flush()
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        for stream in (self.process.stdin, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+
+@pytest.fixture
+def camera() -> Iterator[Callable[[str], Camera]]:
+    """Makes simulated cameras."""
+    with ExitStack() as stack:
+        yield lambda scene: stack.enter_context(closing(Camera(scene)))
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Start]]:
+    """Runs `tactflow start`."""
+    with ExitStack() as stack:
+        yield lambda *words: stack.enter_context(closing(Start(tmp_path, *words)))
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Opens the page; a script error fails the test."""
+    errors: list[str] = []
+    contexts: list[Any] = []
+
+    def open_page(url: str, **options: Any) -> Any:
+        contexts.append(browser.new_context(**({"viewport": {"width": 1400, "height": 900}} | options)))
+        opened = contexts[-1].new_page()
+        opened.set_default_timeout(PATIENCE)
+        opened.on("pageerror", lambda error: errors.append(str(error)))
+        opened.goto(url)
+        return opened
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert errors == []
+
+
+def asked(page: Any, text: str) -> None:
+    """Wait until the page asks."""
+    page.wait_for_function(
+        "text => document.getElementById('guide-now').textContent.includes(text)", arg=text
+    )
+
+
+def choose(page: Any, label: str) -> None:
+    page.get_by_role("button", name=label, exact=True).click()
+
+
+SHOTS = os.environ.get("TACTFLOW_SCREENSHOTS")
+
+
+def shoot(page: Any, name: str) -> None:
+    """Keep a picture of the page where TACTFLOW_SCREENSHOTS names a folder."""
+    if SHOTS:
+        page.screenshot(path=f"{SHOTS}/start-{name}.png")
+
+
+@pytest.mark.parametrize("scene", SENSORS)
+def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
+    scene: str,
+    camera: Callable[[str], Camera],
+    start: Callable[..., Start],
+    page: Callable[..., Any],
+    tmp_path: Path,
+) -> None:
+    gel = camera(scene)
+    running = start(gel.address)
+    shown = page(running.said(r"on the page: (http\S+)"))
+    asked(shown, "Which sensor")
+    shoot(shown, f"{scene}-1-sensor")
+    choose(shown, "Another one, or unknown")
+    asked(shown, "untouched")
+    choose(shown, "Nothing touches the gel")
+    asked(shown, "which edge")
+    shoot(shown, f"{scene}-2-edge")
+    choose(shown, "left edge")
+    asked(shown, "several places")
+    gel.press()
+    shoot(shown, f"{scene}-3-press")
+    choose(shown, "Done")
+    asked(shown, "Proposed")
+    shoot(shown, f"{scene}-4-proposal")
+    written = tmp_path / "pipeline.yaml"
+    assert not written.exists()
+    choose(shown, "Write pipeline.yaml and go on live")
+    shown.wait_for_function("() => document.body.dataset.asks === 'false'")
+    shown.wait_for_function("() => document.getElementById('value-area').textContent !== '–'")
+    shoot(shown, f"{scene}-5-live")
+    running.process.send_signal(signal.SIGINT)
+    assert running.process.wait(PATIENCE / 1000) == 0, "".join(running.errors)
+    pipeline = yaml.safe_load(written.read_text())
+    assert pipeline["stages"]["capture"]["source"] == gel.address
+    assert pipeline["stages"]["preprocess"]["rotate"] == 90
+    assert ("tracker" in pipeline["stages"]) == (SENSORS[scene] == "default")

@@ -1,0 +1,123 @@
+"""`tactflow start` without questions, and what it refuses."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import tactflow
+from tactflow.cli import start
+from tactflow.cli.main import main, make_parser
+from tactflow.engine.errors import SourceError
+from tests.clock import PATIENCE
+
+DATA = Path(os.environ.get("TACTFLOW_RECORDINGS", "recordings"))
+"""Folder of real recordings; they do not come with the package."""
+
+
+def propose(source: str, out: Path, *words: str) -> int:
+    return main(["start", source, "--yes", "--no-run", "--out", str(out), *words])
+
+
+@pytest.mark.parametrize(
+    ("source", "base", "dots"),
+    [("sim:press?frames=120", "default", True), ("sim:halo?frames=120", "markerless", False)],
+)
+def test_a_script_takes_the_proposals_and_the_file_finds_the_contacts(
+    source: str, base: str, dots: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "made.yaml"
+    assert propose(source, out) == 0
+    assert "is written" in capsys.readouterr().err
+    text = out.read_text()
+    assert f"from {base}.yaml" in text.splitlines()[0]
+    assert ("tracker" in yaml.safe_load(text)["stages"]) == dots
+    assert tactflow.check(out) == []
+    results = list(tactflow.stream(out))
+    assert not results[0].contact
+    assert sum(result.contact is not None for result in results) > 20
+
+
+def test_a_file_is_never_replaced_without_being_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "pipeline.yaml"
+    out.write_text("mine")
+    assert propose("sim:press?frames=60", out) == 2
+    assert "already there; give --overwrite" in capsys.readouterr().err
+    assert out.read_text() == "mine"
+    assert propose("sim:press?frames=60", out, "--overwrite") == 0
+    assert out.read_text() != "mine"
+
+
+def test_without_a_press_the_proposal_says_that_contacts_are_untested(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert propose("sim:idle?frames=40", tmp_path / "made.yaml") == 0
+    assert "No press was seen" in capsys.readouterr().err
+
+
+def test_a_gel_whose_presses_no_pipeline_finds_is_not_set_up(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = np.full((24, 96, 128, 3), 90, np.uint8)
+    frames += np.random.default_rng(0).integers(0, 4, frames.shape, np.uint8)
+    frames[8:, 30:60, 40:80] = 97  # a change too faint for a contact, and too large for rest
+    np.save(tmp_path / "faint.npy", frames)
+    assert propose(str(tmp_path / "faint.npy"), tmp_path / "made.yaml") == 3
+    assert "No pipeline finds the presses" in capsys.readouterr().err
+    assert not (tmp_path / "made.yaml").exists()
+
+
+def test_a_source_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert propose(str(tmp_path / "none.mp4"), tmp_path / "made.yaml") == 4
+    assert "none.mp4" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="cameras have no list outside Linux")
+def test_without_a_camera_it_is_said_what_to_do(tmp_path: Path) -> None:
+    args = make_parser("start").parse_args(["start", "--out", str(tmp_path / "made.yaml")])
+    args.yes, args.dev = True, tmp_path
+    with pytest.raises(SourceError, match="no camera is plugged in") as caught:
+        start.run(args)
+    assert "tactflow start sim:press" in str(caught.value)
+    (tmp_path / "video0").write_text("not a device")
+    with pytest.raises(SourceError, match="video0"):
+        start.run(args)
+    (tmp_path / "video1").write_text("not a device")
+    with pytest.raises(tactflow.ConfigError, match="2 cameras are plugged in; name the sensor"):
+        start.run(args)
+
+
+def test_ctrl_c_before_the_end_leaves_no_file(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactflow", "start", "sim:press?frames=60"],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("Which sensor"):
+            process.send_signal(signal.SIGINT)
+    assert process.wait(PATIENCE) == 130
+    assert list(tmp_path.iterdir()) == []
+    process.stdin.close()
+    process.stderr.close()
+
+
+@pytest.mark.parametrize(("recording", "dots"), [("gels/digit_fots", False), ("gels/gelslim_ball", True)])
+def test_real_sensors(recording: str, dots: bool, tmp_path: Path) -> None:
+    if not (DATA / recording).exists():
+        pytest.skip(f"{DATA / recording} is not here")
+    out = tmp_path / "made.yaml"
+    assert propose(str(DATA / recording), out) == 0
+    assert ("tracker" in yaml.safe_load(out.read_text())["stages"]) == dots
