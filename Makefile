@@ -9,7 +9,7 @@
 # make packages     the wheel and the sdist in dist/, checked as a package index does
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
 # make lerobot-env  LeRobot in an environment of its own (650 MB), for the tests of its camera
-# make lerobot-datasets  the same with PyTorch (up to 6 GB), for the tests of its datasets
+# make lerobot-datasets  the same with PyTorch (up to 8 GB), for the tests of its datasets
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
 VENV := .venv

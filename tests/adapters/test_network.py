@@ -157,6 +157,13 @@ def test_markers_depth_and_ports_of_others_are_inputs_too(tmp_path: Path) -> Non
     depth = Depth(heights, 1.0, None, 1.0, None)
     np.testing.assert_allclose(seen(file, {"port": "depth", "scale": 2.0}, depth)[0], 2 * heights)
     np.testing.assert_allclose(seen(file, {"port": "warmth", "scale": 1.0}, heights)[0], heights)
+    six, means = np.arange(288, dtype=np.float32).reshape(6, 8, 6), tuple(map(float, range(6)))
+    given = seen(
+        echo(tmp_path / "s.onnx", 1, 6, 6, 8),
+        {"port": "six", "scale": 1.0, "colour": "rgb", "mean": means},
+        six,
+    )
+    np.testing.assert_allclose(given, np.moveaxis(six - means, -1, 0))
     with pytest.raises(StageError, match="required an array"):
         network(file, {"port": "warmth"}).process("warm")
 

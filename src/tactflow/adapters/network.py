@@ -393,7 +393,10 @@ class _Feed:
         shape = p.shape(channels + 2 * p.coordinates, height, width)
         self._compare(shape)
         affine = self._coefficients(channels)
-        self._affines = [affine[:, first : first + count].copy() for first in range(0, channels, count)]
+        groups = [affine[:, first : first + count] for first in range(0, channels, count)]
+        # In the order of the picture, which is blue, green, red.
+        self._is_reversed = p.colour == "rgb" and count == 3
+        self._affines = [(group[:, ::-1] if self._is_reversed else group).copy() for group in groups]
         self._rest = self._nothing = np.zeros(resized.shape, resized.dtype)
         batch = (1,) if len(self._sides) > len(shape) else ()
         self._tensor = np.empty((*batch, *(side or 0 for side in shape)), np.float32)
@@ -406,7 +409,7 @@ class _Feed:
             planes[:, -1] = np.arange(height, dtype=np.float32)[:, None] / height
 
     def _coefficients(self, count: int) -> Floats:
-        """(4, count) of the channels of pictures: factor, offset, least and greatest value."""
+        """(4, count) of the network's channels: factor, offset, least and greatest value."""
         p = self.params
         for name, numbers in (("mean", p.mean), ("std", p.std)):
             if len(numbers) not in (1, count):
@@ -415,10 +418,7 @@ class _Feed:
         bounds = (0.0, 1.0) if half else (-np.inf, np.inf)
         mean, std = np.resize(p.mean, count), np.resize(p.std, count)
         factor = np.full(count, p.scale) / std
-        affine = np.array([factor, *((value - mean) / std for value in (0.5 * half, *bounds))], np.float32)
-        if p.colour == "rgb" and count % 3 == 0:
-            affine = affine.reshape(4, -1, 3)[:, :, ::-1].reshape(4, count)
-        return affine
+        return np.array([factor, *((value - mean) / std for value in (0.5 * half, *bounds))], np.float32)
 
     def _resized(self, array: NDArray[Any], into: NDArray[Any] | None = None) -> NDArray[Any]:
         """A picture in the network's size, grey if asked for. into : memory that may be used."""
@@ -440,7 +440,7 @@ class _Feed:
         """Fill the part of the tensor that belongs to one frame."""
         p = self.params
         if p.layout == "pixels" and part.shape[2] == 5 and p.coordinates and picture.dtype == np.uint8:
-            _pixels(*_lines(picture, self._rest), p.colour == "rgb", self._affines[0], part)
+            _pixels(*_lines(picture, self._rest), self._is_reversed, self._affines[0], part)
             return
         planes = part if p.layout == "chw" else self._planes[0]
         rest = self._nothing if p.background == "concat" else self._rest
@@ -453,12 +453,12 @@ class _Feed:
 
     def _convert(self, picture: NDArray[Any], rest: NDArray[Any], affine: Floats, planes: Floats) -> None:
         """Fill planes (C, h, w) with (picture - rest) * factor + offset, within its limits."""
-        rgb = self.params.colour == "rgb" and len(planes) == 3
         if picture.dtype == np.uint8 and len(planes) == 3:
-            _planes(*_lines(picture, rest), rgb, affine, planes)
+            _planes(*_lines(picture, rest), self._is_reversed, affine, planes)
             return
+        planes = planes[::-1] if self._is_reversed else planes
         channels = zip(cv2.split(picture), cv2.split(rest), affine.T, strict=True)
-        for plane, (channel, less, own) in zip(planes[::-1] if rgb else planes, channels, strict=True):
+        for plane, (channel, less, own) in zip(planes, channels, strict=True):
             factor, offset, least, greatest = map(float, own)
             cv2.addWeighted(channel, factor, less, -factor, offset, plane, cv2.CV_32F)
             if np.isfinite(least):
