@@ -25,6 +25,7 @@ pytest.importorskip("onnx", reason="the package onnx, which makes files, is not 
 pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
 
 import onnx
+import onnxruntime
 from onnx import TensorProto, helper, numpy_helper
 
 EXAMPLES = REPOSITORY / "examples" / "networks"
@@ -217,6 +218,18 @@ def test_what_is_no_network_is_refused_with_what_to_do(tmp_path: Path) -> None:
         tactflow.stage("network", file=str(file), inputs={"picture": {}}, outputs={"y": {}})
     with pytest.raises(StageError, match=r"there is no provider TPU here; there are .*CPUExecutionProvider"):
         tactflow.stage("network", file=str(file), inputs={"x": {}}, outputs={"y": {}}, provider="TPU")
+
+
+def test_a_provider_without_its_driver_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # onnxruntime goes on with the CPU, with a warning.
+    cuda = "CUDAExecutionProvider"
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [cuda])
+    file = echo(tmp_path / "n.onnx", 1, 3, 6, 8)
+    with (
+        pytest.warns(UserWarning, match=cuda),
+        pytest.raises(StageError, match=f"{cuda} cannot be used here"),
+    ):
+        tactflow.stage("network", file=str(file), inputs={"x": {}}, outputs={"y": {}}, provider=cuda)
 
 
 @pytest.mark.parametrize("rest", [None, np.zeros((3, 4, 3), np.uint8)])
