@@ -16,7 +16,7 @@ from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.sources import KINDS, Arrival, CameraRequest, FrameReader, StampedReader, Watch, open_source
-from tactflow.sources.files import load_image
+from tactflow.sources.files import ImageFiles, load_image
 from tactflow.sources.pace import paced
 from tactflow.sources.references import References
 
@@ -143,6 +143,7 @@ class Capture(Source):
             p.source, directory=self._directory, fps=p.fps, camera=request, watch=watch
         )
         self.live = source.live or p.realtime
+        self.pictures = isinstance(source, ImageFiles)
         self.total = None if source.total is None else max(source.total - p.skip, 0)
         self.description = source.description
 

@@ -14,6 +14,7 @@ import yaml
 
 import tactflow
 from tactflow.calibration.file import Calibration, ScaleEntry, raw_corners, small_picture
+from tactflow.calibration.stored import KINDS, kinds
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale
@@ -210,6 +211,71 @@ def test_a_recorded_calibration_of_other_frames_is_left_out_with_a_warning(
         results = list(tactflow.stream(plain, source=str(recording)))
     assert {result.scale for result in results} == {None}
     assert caplog.text.count("is not used") == 1
+
+
+def test_a_default_of_a_kind_gives_way_to_the_calibration_in_a_recording(
+    pipeline: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("mcap")
+    recording = tmp_path / "press.mcap"
+    tactflow.run(pipeline, settings={"sinks": {"record": {"path": str(recording)}}}, max_frames=3)
+    shipped = tmp_path / "shipped.yaml"
+    shipped.write_text(PIPELINE.replace("left.yaml", "mini"))
+    assert {r.scale for r in tactflow.stream(shipped, source=str(recording))} == {CALIBRATION.scale}
+    without = tactflow.stream(shipped, source=str(recording), settings={"calibration": None})
+    assert {r.scale for r in without} == {None}
+
+
+KIND = CALIBRATION.for_kind("test gel")
+
+
+def test_a_default_of_a_kind_is_for_frames_of_its_shape_in_any_size(tmp_path: Path) -> None:
+    KIND.save(tmp_path / "kind.yaml")
+    kind = Calibration.load(tmp_path / "kind.yaml")
+    half = Preprocessor((400, 300), rotate=90, downsample=2).mapping
+    assert kind.misfit(MAPPING) is kind.misfit(half) is None
+    scale = kind.scale_at((150, 200))
+    assert (scale.x, scale.y, scale.origin) == (0.1, 0.12, (74.5, 99.5))
+    # 5 % of another sensor of the kind, and what the scale has itself.
+    assert scale.stderr == pytest.approx((np.hypot(0.002, 0.1 * 0.05), np.hypot(0.004, 0.12 * 0.05)))
+    assert "have another shape" in str(kind.misfit(Preprocessor((800, 600), downsample=2).mapping))
+    assert "turned or mirrored" in str(
+        kind.misfit(Preprocessor((800, 600), rotate=270, downsample=2).mapping)
+    )
+
+
+def test_a_default_of_a_kind_says_once_that_it_is_one_and_is_left_out_for_another_gel(
+    pipeline: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    known = Calibration.load(pipeline.with_name("left.yaml"))
+    known.for_kind("test gel").save(pipeline.with_name("left.yaml"))
+    with caplog.at_level(logging.INFO, "tactflow"):
+        results = list(tactflow.stream(pipeline))
+    assert all(result.scale for result in results)
+    assert caplog.text.count("default calibration of a test gel: lengths +- 5 %") == 1
+    assert "tactflow calibrate --refine" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        results = list(tactflow.stream(pipeline, settings={"stages.preprocess.rotate": 270}))
+    assert {result.scale for result in results} == {None}
+    assert caplog.text.count("the calibration of a test gel is not used: the frames are turned") == 1
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        results = list(tactflow.stream(pipeline, source="sim:round_gel", max_frames=3))
+    assert {result.scale for result in results} == {None}
+    assert "the untouched gel differs from one by" in caplog.text
+
+
+@pytest.mark.parametrize("kind", kinds())
+def test_the_shipped_defaults_say_what_they_are_made_from_and_how_far_off_they_are(kind: str) -> None:
+    known = Calibration.load(KINDS / f"{kind}.yaml")
+    assert known.kind is not None
+    assert "MIT" in known.made_from
+    assert known.slopes is not None
+    assert known.information is not None
+    assert np.linalg.eigvalsh(known.information).min() > -1e-3
+    assert known.photometric is not None
+    assert 0.05 < known.photometric.depth_stderr < 0.2
+    assert known.scale.stderr[0] == pytest.approx(0.05 * known.scale.x)
 
 
 def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path) -> None:

@@ -216,3 +216,94 @@ def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
     assert "Leave the gel untouched." in capsys.readouterr().err
     scales = [yaml.safe_load(Path(name).read_text())["scale"] for name in ("film.yaml", "camera.yaml")]
     assert scales[0]["mm_per_pixel"] == pytest.approx(scales[1]["mm_per_pixel"], rel=5e-3)
+
+
+REFINED = """
+sensor: left
+calibration: kind.yaml
+stages:
+  capture: {source: "0"}
+  preprocess: {rotate: 90, downsample: 2}
+  marker_mask:
+  inpaint:
+  difference:
+  tracker:
+  untouched:
+  scale:
+  hull: {when: touching}
+  depth: {when: touching}
+sinks:
+  jsonl: {path: out.jsonl}
+"""
+
+
+def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_pictures_of_one_press(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ball = ["--ball-radius", "2.375"]
+    pitch = f"{open_scene('ball').layout.pitch * RAW_MM:.5f}"
+    made = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--kind", "test gel", "--out", "kind.yaml"]
+    assert calibrate(*made, *ball) == 0
+    kind = yaml.safe_load(Path("kind.yaml").read_text())
+    assert kind["kind"] == "test gel"
+    assert kind["photometric"]["depth_stderr"] > 0.094
+    capsys.readouterr()
+
+    Path("left.yaml").write_text(REFINED)
+    scene = open_scene("ball?frames=200&seed=4")
+    Path("pictures").mkdir()
+    # Two depths at one place, without a picture of the untouched gel between them.
+    depths = [max((press.depth for press in scene.presses(index)), default=0.0) for index in range(40)]
+    deepest = int(np.argmax(depths))
+    going_down = [np.searchsorted(depths[: deepest + 1], part * depths[deepest]) for part in (0.4, 1)]
+    for number, index in enumerate((0, *going_down)):
+        cv2.imwrite(f"pictures/{number}.png", scene.frame(int(index)))
+    refine = ["left.yaml", "--from", "pictures", "--refine"]
+    assert calibrate(*refine) == 2
+    assert "required --ball-radius MM" in capsys.readouterr().err
+    assert calibrate(*refine, *ball) == 0
+    told = capsys.readouterr().err
+    assert "2 presses; learning" in told
+    assert "press 1 of 9" in told
+    assert "not its diameter" not in told
+    found = yaml.safe_load(Path("calibration/left.yaml").read_text())
+    assert found.get("kind") is None
+    assert found["scale"] == kind["scale"]
+    assert found["photometric"]["presses"] == 2
+    assert found["photometric"]["depth_stderr"] < 0.8 * kind["photometric"]["depth_stderr"]
+
+    assert calibrate(*refine, "--ball-radius", "4.75", "--overwrite") == 0
+    assert "is 4.75 mm the radius of the ball, and not its diameter" in capsys.readouterr().err
+    Path("left.yaml").write_text(REFINED.replace("rotate: 90", "rotate: 270"))
+    assert calibrate(*refine, *ball, "--overwrite") == 2
+    assert "does not fit: the frames are turned" in capsys.readouterr().err
+    Path("left.yaml").write_text(REFINED.replace("calibration: kind.yaml", ""))
+    assert calibrate(*refine, *ball, "--overwrite") == 2
+    assert "required a pipeline with a calibration" in capsys.readouterr().err
+
+
+def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert calibrate("--from", "sim:idle?frames=3", "--pitch", "1.724", "--out", "gel.yaml") == 0
+    Path("forces").mkdir()
+    for name, scene in (
+        ("good", "ball?frames=100&shear=0.6"),
+        ("idle", "idle?frames=12"),
+        ("bad", "ball?frames=12"),
+    ):
+        files = ["--out", f"forces/{name}.avi", "--truth", f"forces/{name}.csv"]
+        assert main(["sim", scene, *files, "--quiet"]) == 0
+    Path("forces/bad.csv").write_text("t,force\n0,1\n")
+    capsys.readouterr()
+    assert calibrate("force", "gel.yaml", "--from", "forces") == 0
+    told = capsys.readouterr().err
+    assert "forces/idle.avi is left out: " in told
+    assert "forces/bad.avi is left out: " in told
+    assert "forces/good.avi: 100 frames" in told
+    assert list(yaml.safe_load(Path("gel.yaml").read_text())["force"]["recordings"]) == ["forces/good.avi"]
+    Path("forces/good.csv").unlink()
+    assert calibrate("force", "gel.yaml", "--from", "forces", "--overwrite") == 2
+    assert "none of the 2 recordings can be used" in capsys.readouterr().err

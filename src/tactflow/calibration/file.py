@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from datetime import UTC, datetime
 from functools import cached_property
@@ -25,7 +26,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import ending_held_back
-from tactflow.vision.depth.slopes import SlopeModel
+from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
 from tactflow.vision.force import ForceModel, LinearForce
 from tactflow.vision.geometry import PixelMapping
@@ -39,6 +40,22 @@ what rounding in a pipeline file does is less."""
 UNLIKE: Final = 0.1
 """Difference of the untouched gel, relative to its brightness and after its light was scaled channel by
 channel, above which the gel counts as different. Chosen by hand: presses of one session differ by 0.01."""
+
+UNLIKE_KIND: Final = 0.22
+"""The same for sensors of one kind. Minis of three labs differ by 0.06 to 0.07, with dots by up to 0.21, and
+seven other kinds of gel from them by 0.24 to 1.1."""
+ASPECT: Final = 0.02
+"""Relative difference of width over height up to which frames have the same shape. Chosen by hand."""
+ALIGNED: Final = 0.9
+"""Cosine of the angle between the axes of two frames above which they are turned alike."""
+KIND_SCALE: Final = 0.05
+"""Relative standard error of the scale on another sensor of the kind: the authors of FOTS measured 19.6 and
+21.1 pixels per mm on two DIGITs."""
+KIND_ERRORS: Final = {"normal_error": 2.5, "sphere_rms": 0.005, "depth_stderr": 0.094, "volume_stderr": 0.11}
+"""What another sensor of the kind adds to the errors, as two other Minis do to those of one:
+benchmarks/default_calibrations.py."""
+TERMS: Final = PLACE_TERMS * COLOUR_TERMS
+"""Coefficients of one part of the normal."""
 
 Pair = Annotated[tuple[float, float], BeforeValidator(tuple)]
 Size = Annotated[tuple[int, int], BeforeValidator(tuple)]
@@ -69,7 +86,8 @@ class PhotometricEntry(_Entry):
 
     ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. radius_error : median
     of the fitted radius over the true one, less 1. sphere_rms : of the heights from the fitted ball, mm.
-    depth_stderr, volume_stderr : of balls, relative to the value. steepest : see `SurfaceErrors`.
+    depth_stderr, volume_stderr : of balls, relative to the value. steepest : see `SurfaceErrors`. explained :
+    share of the slopes of a ball that the fit explains, see `Misfit`; None in files of earlier versions.
     """
 
     ball_radius: float = Field(gt=0)
@@ -81,6 +99,7 @@ class PhotometricEntry(_Entry):
     depth_stderr: float
     volume_stderr: float
     steepest: float | None = None
+    explained: float | None = None
 
     def errors(self) -> SurfaceErrors:
         """The basis of the standard errors of heights."""
@@ -139,13 +158,18 @@ class Calibration(_Entry):
     corners : (4, 2), where the corner pixels of the processed frame lie in the raw one, px.
     scale_entry : millimetres per pixel. photometric, slopes : which slope has which colour, and how well;
     None where that is not known. force : how the force follows from a contact; None where that is not known.
+    kind : the kind of sensor that it is the default of, for frames of the same shape and any size; None where
+    it is of one sensor.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
+    information : (114, 114) float64, `Photometry.information`, with which it can be refined for another
+    sensor; None without slopes, and in files of earlier versions.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True, populate_by_name=True)
 
     format: Literal["tactflow.calibration/1"] = "tactflow.calibration/1"
     sensor: str
+    kind: str | None = None
     made: str = Field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     made_from: str
     tactflow: str = __version__
@@ -157,12 +181,35 @@ class Calibration(_Entry):
     force: ForceEntry | None = None
     look: NDArray[np.float32] = Field(exclude=True, repr=False)
     slopes: SlopeModel | None = Field(None, exclude=True, repr=False)
+    information: NDArray[np.float64] | None = Field(None, exclude=True, repr=False)
 
     @cached_property
     def scale(self) -> Scale:
         """Millimetres per pixel."""
         entry = self.scale_entry
         return Scale(*entry.mm_per_pixel, entry.stderr, entry.origin)
+
+    def scale_at(self, size: tuple[int, int]) -> Scale:
+        """Millimetres per pixel of processed frames (width, height), px, that `misfit` accepts."""
+        if size == self.size:
+            return self.scale
+        across, down = self.size[0] / size[0], self.size[1] / size[1]
+        (x, y), (x_error, y_error) = self.scale_entry.mm_per_pixel, self.scale_entry.stderr
+        center = (size[0] - 1) / 2, (size[1] - 1) / 2
+        return Scale(x * across, y * down, (x_error * across, y_error * down), center)
+
+    def for_kind(self, kind: str) -> Calibration:
+        """The same as the default of a kind of sensor, with the errors that it has on others of the kind."""
+        entry, photometric = self.scale_entry, self.photometric
+        if photometric is not None:
+            own = photometric.model_dump()
+            wider = {name: math.hypot(own[name], more) for name, more in KIND_ERRORS.items()}
+            photometric = photometric.model_copy(update=wider)
+        pairs = zip(entry.mm_per_pixel, entry.stderr, strict=True)
+        stderr = tuple(math.hypot(error, KIND_SCALE * value) for value, error in pairs)
+        scale_entry = entry.model_copy(update={"stderr": stderr})
+        update = {"kind": kind, "scale_entry": scale_entry, "photometric": photometric}
+        return self.model_copy(update=update)
 
     def save(self, path: Path) -> None:
         """Write the YAML file, and beside it the arrays in a `.npz` of the same name.
@@ -175,6 +222,9 @@ class Calibration(_Entry):
         arrays: dict[str, Any] = {"look": self.look}
         if self.slopes is not None:
             arrays["slopes"] = self.slopes.coefficients
+        if self.information is not None:
+            # It is symmetric.
+            arrays["information"] = self.information[np.tril_indices(TERMS)].astype(np.float32)
         try:
             # Both are complete before either replaces an earlier calibration, and then both do.
             with (
@@ -201,7 +251,9 @@ class Calibration(_Entry):
             if arrays["look"].shape != (LOOK[1], LOOK[0], 3) or not np.isfinite(arrays["look"]).all():
                 raise ValueError("its .npz is of another file")
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
-            loaded = cls(**document, look=arrays["look"].astype(np.float32), slopes=slopes)
+            information = _symmetric(arrays["information"]) if "information" in arrays else None
+            look = arrays["look"].astype(np.float32)
+            loaded = cls(**document, look=look, slopes=slopes, information=information)
             if (slopes is None) != (loaded.photometric is None):
                 raise ValueError("its .npz is of another file")
             return loaded
@@ -217,6 +269,8 @@ class Calibration(_Entry):
 
     def misfit(self, mapping: PixelMapping) -> str | None:
         """Why it cannot be used for frames of this geometry; None if it can."""
+        if self.kind is not None:
+            return self._misfit_of_kind(mapping)
         origin = f"the calibration was made {self.made} from {self.made_from}"
         if mapping.raw_size != self.raw_size:
             return f"{origin}, with frames of {_by(self.raw_size)}; these have {_by(mapping.raw_size)}"
@@ -225,6 +279,15 @@ class Calibration(_Entry):
         moved = float(np.linalg.norm(np.subtract(raw_corners(mapping), self.corners), axis=1).max())
         if moved > MOVED:
             return f"{origin}, with another preprocess: a corner lies {moved:.1f} raw px elsewhere"
+        return None
+
+    def _misfit_of_kind(self, mapping: PixelMapping) -> str | None:
+        wide, expected = mapping.size[0] / mapping.size[1], self.size[0] / self.size[1]
+        if abs(wide / expected - 1) > ASPECT:
+            return f"frames of {_by(mapping.size)} px have another shape than its {_by(self.size)} px"
+        here, there = (_axes(corners) for corners in (raw_corners(mapping), self.corners))
+        if (np.sum(here * there, axis=1) < ALIGNED).any():
+            return "the frames are turned or mirrored otherwise; it is for frames as the sensor gives them"
         return None
 
     def unlikeness(self, untouched: NDArray[np.uint8]) -> float:
@@ -256,6 +319,22 @@ def raw_corners(mapping: PixelMapping) -> list[tuple[float, float]]:
     right, low = width - 1, height - 1
     corners = np.asarray(mapping.to_raw([[0, 0], [right, 0], [0, low], [right, low]]), np.float64)
     return [(float(x), float(y)) for x, y in corners]
+
+
+def _axes(corners: list[tuple[float, float]]) -> NDArray[np.float64]:
+    """(2, 2): unit vectors along x and y of a frame, from its corners."""
+    first, right, below, _ = np.asarray(corners, np.float64)
+    axes = np.stack([right - first, below - first])
+    return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+def _symmetric(lower: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(114, 114) from its lower triangle. Raises ValueError on another length, NaN or infinity."""
+    if lower.shape != (TERMS * (TERMS + 1) // 2,) or not np.isfinite(lower).all():
+        raise ValueError("its .npz is of another file")
+    whole = np.zeros((TERMS, TERMS))
+    whole[np.tril_indices(TERMS)] = lower
+    return np.tril(whole, -1).T + whole
 
 
 def _arrays(data: bytes) -> dict[str, NDArray[Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,7 +24,9 @@ SAME: Final = 0.03
 """RMS difference of the untouched gel, relative to its brightness, up to which presses belong to one session.
 Chosen by hand, between what presses of one session differ by (0.01) and what a calibration bears (0.1)."""
 MOVED_ON: Final = 0.5
-"""How far a contact lies from the one before, in its own radii, to be another press. Chosen by hand."""
+"""How far a contact lies from the press so far, in its radii, to be another press. Chosen by hand."""
+MOVED_ALONE: Final = 0.1
+"""The same for pictures that were taken one by one, also of the change of its radius. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -65,7 +67,10 @@ class PressFinder:
     """Finds the presses in results, which are added one after the other.
 
     A press lasts as long as something touches at about one place; of each, the frame with the largest contact
-    is kept. Pictures of separate presses one after the other will do.
+    is kept.
+
+    pictures : the frames were taken one by one, so that every one whose contact has moved or changed its size
+    is a press of its own, even at about the place of the one before.
 
     Attributes
     ----------
@@ -74,7 +79,8 @@ class PressFinder:
     new reference showed another look of the gel.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pictures: bool = False) -> None:
+        self.pictures = pictures
         self.presses: list[Press] = []
         self.frames = 0
         self.lasts = False
@@ -129,7 +135,12 @@ class PressFinder:
         """A press of its own, or another moment of the last one."""
         if self.lasts:
             last = self.presses[-1]
-            if np.hypot(*np.subtract(press.center, last.center)) < MOVED_ON * last.radius:
+            moved = float(np.hypot(*np.subtract(press.center, last.center))) / last.radius
+            if self.pictures:
+                same = max(moved, abs(press.radius / last.radius - 1)) < MOVED_ALONE
+            else:
+                same = moved < MOVED_ON
+            if same:
                 if press.radius > last.radius:
                     self.presses[-1] = press
                 return
@@ -157,17 +168,6 @@ class PressFinder:
     def session(self) -> Session:
         """What was found. Raises ConfigError if there were no frames."""
         return Session(self.untouched, self.mapping, self.presses, self._dots, self.frames)
-
-
-def find_presses(results: Iterable[Result]) -> Session:
-    """The presses in results with their pictures, as `tactflow.stream(..., images=True)` gives them.
-
-    Raises ConfigError if there are no results.
-    """
-    finder = PressFinder()
-    for result in results:
-        finder.add(result)
-    return finder.session()
 
 
 def difference(untouched: Picture, before: Picture) -> float:

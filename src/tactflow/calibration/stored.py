@@ -1,4 +1,5 @@
-"""Where a calibration is stored: in files of its own, or in the recording that was made with it."""
+"""Where a calibration is stored: in files of its own, in the recording that was made with it, or in the
+package, if it is of a kind of sensor."""
 
 from __future__ import annotations
 
@@ -14,6 +15,14 @@ MAX_ARRAYS: Final = 1 << 20
 """Size limit of the arrays, packed and unpacked, bytes; ours have some thousands."""
 MAX_TEXT: Final = 1 << 17
 """Size limit of the YAML file, bytes; ours have some thousands. PyYAML takes 4 s for so many."""
+
+KINDS: Final = Path(__file__).parent / "kinds"
+"""Folder of the calibrations of kinds of sensors that come with the package."""
+
+
+def kinds() -> list[str]:
+    """Names of the kinds of sensors that the package has a calibration for."""
+    return sorted(path.stem for path in KINDS.glob("*.yaml"))
 
 
 def stored_text(path: Path) -> bytes:
@@ -32,11 +41,12 @@ def stored_arrays(path: Path) -> bytes:
 def with_recorded_calibration(pipeline: Pipeline) -> Pipeline:
     """The pipeline with the calibration that its recording was made with.
 
-    One that names a calibration itself, or null, stays as it is.
+    One that names a calibration itself, or null, stays as it is; the default of a kind of sensor gives way.
     """
     source = getattr(pipeline.source.params, "source", None)
     name = source.partition("?")[0] if isinstance(source, str) else ""
-    if pipeline.calibration or "calibration" in pipeline.settings or not name.endswith(".mcap"):
+    chosen = pipeline.calibration is not None and pipeline.calibration.parent != KINDS
+    if chosen or pipeline.settings.get("calibration", "") is None or not name.endswith(".mcap"):
         return pipeline
     from tactflow.recording import missing_packages
     from tactflow.recording.records import NotARecordingError

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -24,16 +25,19 @@ from tactflow.calibration.file import (
     raw_corners,
     small_picture,
 )
+from tactflow.calibration.judgement import doubt
 from tactflow.calibration.keeping import KeptPresses
-from tactflow.calibration.photometric import fit_photometry, try_photometry
+from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
+from tactflow.calibration.refine import apparent_radius, refine_photometry
+from tactflow.calibration.samples import press_errors, summary
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
 from tactflow.cli.guide import Guide
 from tactflow.cli.options import add_overwrite, add_sensor, number, positive, refuse_output
 from tactflow.cli.terminal import notes, say, show, typed
 from tactflow.engine.collect import with_collector
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.run import Runner
 from tactflow.message.result import Result
@@ -47,6 +51,10 @@ WORSE: Final = 1.5
 LOOSE: Final = 0.02
 """Relative error of a scale by pitch above which a better method is advised: grids of the simulator have less
 than 0.01, the rings of a TacTip 0.1 to 0.15."""
+ENOUGH: Final = 30
+"""Presses after which a live session ends by itself."""
+ENOUGH_TO_REFINE: Final = 9
+"""The same with --refine: the errors on two Minis are then those of a calibration of their own."""
 # Gels and balls have 1 to 100.
 _millimetres = number(float, 1e-3, 1e4, "millimetres from 0.001 to 10000")
 
@@ -91,7 +99,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what the whole processed picture shows, mm, where the gel has no dots of known pitch",
     )
     option("--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only")
-    option("--presses", type=positive, default=30, metavar="N", help="of a live source: enough presses (30)")
+    option(
+        "--refine",
+        action="store_true",
+        help="start from the pipeline's calibration, such as the default of a kind of sensor, and adapt it "
+        "to this sensor by one press of the ball or more; its scale stays unless --pitch, --area or --target "
+        "is given",
+    )
+    option(
+        "--kind",
+        metavar="NAME",
+        help="make the default for all sensors of a kind, such as 'GelSight Mini', with the errors that it "
+        "has on others",
+    )
+    option(
+        "--presses",
+        type=positive,
+        metavar="N",
+        help=f"of a live source: enough presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE})",
+    )
     option("--view", action="store_true", help="show the live page, which says where to press next")
     _add_target_and_force(parser)
 
@@ -134,6 +160,7 @@ def run(args: argparse.Namespace) -> int:
     TactflowError
         If options are wrong, or the recording gives no calibration.
     """
+    args.presses = args.presses or (ENOUGH_TO_REFINE if args.refine else ENOUGH)
     verb, *words = args.what if args.what[:1] in (["check"], ["force"], ["lens"]) else ["make", *args.what]
     with notes():
         if verb == "lens":
@@ -149,8 +176,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make(args: argparse.Namespace, pipeline: str | None) -> int:
-    if (args.pitch is None) == (args.area is None):
+    ways = [args.pitch, args.area].count(None)
+    if ways == 0 or (ways == 2 and not args.refine):
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
+    base = _base(args, pipeline)
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
     refuse_output("--out", out, overwrite=args.overwrite, suffixes=(".yaml",))
@@ -165,7 +194,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     else:
         session = _find_presses(loaded, guide, kept, page)
     try:
-        calibration = _learned(args, loaded, session)
+        calibration = _learned(args, loaded, session, base)
     except ConfigError as error:
         if not kept.presses:
             raise
@@ -185,9 +214,36 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     return 0
 
 
-def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Calibration:
-    """The calibration that a session gives. Raises ConfigError if it gives none."""
-    scale, found_by = _scale(args, loaded, session)
+def _base(args: argparse.Namespace, pipeline: str | None) -> Calibration | None:
+    """The calibration of the pipeline, which --refine starts from; None without one, or without a ball."""
+    if args.ball_radius is None:
+        if args.refine:
+            raise ConfigError("calibrate --refine: required --ball-radius MM, of the ball that is pressed")
+        return None
+    # Without --refine it only helps to judge; the pipeline may name a file that is yet to be made.
+    with nullcontext() if args.refine else suppress(ConfigError):
+        path = load(pipeline, source=args.source, sensor=args.sensor).calibration
+        if path is not None:
+            return Calibration.load(path)
+    if args.refine:
+        raise ConfigError(
+            "calibrate --refine: required a pipeline with a calibration, such as mini, mini_plain or digit"
+        )
+    return None
+
+
+def _learned(
+    args: argparse.Namespace, loaded: Pipeline, session: Session, base: Calibration | None
+) -> Calibration:
+    """The calibration that a session gives. base : of the pipeline, or None.
+
+    Raises ConfigError if it gives none.
+    """
+    if base is not None and (misfit := base.misfit(session.mapping)) is not None:
+        if args.refine:
+            raise ConfigError(f"calibrate --refine: the calibration of the pipeline does not fit: {misfit}")
+        base = None
+    scale, found_by = _scale(args, loaded, session, base if args.refine else None)
     say(
         f"scale: {scale.x:.5f} +- {scale.stderr[0]:.5f} mm per px in x, "
         f"{scale.y:.5f} +- {scale.stderr[1]:.5f} in y"
@@ -202,12 +258,21 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
     fitted = None
     if args.ball_radius is not None:
         say(f"{len(session.presses)} presses; learning from them ...")
-        fitted = fit_photometry(session, scale, args.ball_radius)
+        apparent = None
+        if base is not None and base.slopes is not None:
+            apparent = apparent_radius(session, scale, args.ball_radius, base)
+        if args.refine:
+            assert base is not None
+            fitted = refine_photometry(session, scale, args.ball_radius, base)
+        else:
+            fitted = fit_photometry(session, scale, args.ball_radius)
+        if (question := doubt(session, scale, args.ball_radius, apparent)) is not None:
+            say(question)
         for press, kept, misfit in zip(session.presses, fitted.kept, fitted.misfit, strict=True):
             if not kept:
                 say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
         say(_photometric_words(fitted.found.model_dump()))
-    return Calibration(
+    made = Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
         raw_size=session.mapping.raw_size,
@@ -217,7 +282,9 @@ def _learned(args: argparse.Namespace, loaded: Pipeline, session: Session) -> Ca
         photometric=None if fitted is None else fitted.found,
         look=small_picture(session.untouched),
         slopes=None if fitted is None else fitted.model,
+        information=None if fitted is None else fitted.information,
     )
+    return made if args.kind is None else made.for_kind(args.kind)
 
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
@@ -252,7 +319,7 @@ def _check_presses(calibration: Calibration, then: PhotometricEntry, session: Se
             [f"no presses today: to check the depth, show the untouched gel, then a ball of radius {radius}"]
         )
         return True
-    now = try_photometry(session, calibration.slopes, calibration.scale, then.ball_radius)
+    now = summary(press_errors(session, calibration.slopes, calibration.scale, then.ball_radius))
     limit = WORSE * then.normal_error
     show([f"presses today, {count}: {_photometric_words(now)}"])
     show([f"when it was made: {_photometric_words(then.model_dump())}"])
@@ -284,12 +351,21 @@ def _add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> in
             "calibrate force: required --source, a recording with a CSV of the same name beside it"
         )
     pairs = {args.source: args.csv} if args.csv else recordings_with_csv(args.source)
-    references = {source: _read(file, args.offset) for source, file in pairs.items()}
-    watched = {}
-    for source in references:
-        watched[source] = _watch(_load(args, pipeline, source=source), path)
-        touched = watched[source].touched
-        say(f"{source}: {len(touched)} frames, {touched.sum()} of them with contact")
+    watched, references = {}, {}
+    for source, file in pairs.items():
+        try:
+            reference = _read(file, args.offset)
+            seen = _watch(_load(args, pipeline, source=source), path)
+            force.align(source, seen, reference, seen.change_at_rest)
+        except TactflowError as problem:
+            if len(pairs) == 1:
+                raise
+            say(f"{source} is left out: {problem}")
+            continue
+        watched[source], references[source] = seen, reference
+        say(f"{source}: {len(seen.touched)} frames, {seen.touched.sum()} of them with contact")
+    if not watched:
+        raise ConfigError(f"calibrate force: none of the {len(pairs)} recordings can be used")
     fit = force.fit_force(watched, references)
     for words in _force_words(fit, references):
         say(words)
@@ -365,10 +441,14 @@ def _print_lens(args: argparse.Namespace, words: Sequence[str]) -> int:
     return 0
 
 
-def _scale(args: argparse.Namespace, loaded: Pipeline, session: Session) -> tuple[Scale, str]:
-    """Millimetres per pixel, and how they were found."""
+def _scale(
+    args: argparse.Namespace, loaded: Pipeline, session: Session, base: Calibration | None
+) -> tuple[Scale, str]:
+    """Millimetres per pixel, and how they were found. base : to take it from where no option tells it."""
     width, height = session.mapping.size
     try:
+        if base is not None and args.pitch is None and args.area is None:
+            return base.scale_at((width, height)), base.scale_entry.found_by
         if args.target is not None:
             return _target_scale(args, loaded), f"target of {args.grid}, pitch of {args.pitch:g} mm"
         if args.pitch is not None:
@@ -469,6 +549,7 @@ def _find_presses(
     def take(result: Result, runner: Runner) -> None:
         nonlocal enough
         live = runner.source is not None and runner.source.live
+        finder.pictures = runner.source is not None and runner.source.pictures
         if live and kept is not None and not finder.frames:
             finder.presses[:] = kept.presses
         finder.add(result)

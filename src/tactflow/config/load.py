@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
+from tactflow.calibration.stored import KINDS, kinds
 from tactflow.config import sensors, wiring
 from tactflow.config.document import Document, described, dotted, read_document
 from tactflow.config.files_used import file_id, files_named, files_written
@@ -211,7 +212,10 @@ def _check_files(
 
 
 def _calibration(document: Document, directory: Path) -> Path | None:
-    """The calibration file that the pipeline names; a missing file is a mistake."""
+    """The calibration file that the pipeline names, or the default of a kind of sensor.
+
+    A missing file is a mistake.
+    """
     name = document.get("calibration")
     if not isinstance(name, str):
         return None
@@ -219,8 +223,11 @@ def _calibration(document: Document, directory: Path) -> Path | None:
     for path in paths:
         if path.is_file():
             return path
+    if name in kinds():
+        return KINDS / f"{name}.yaml"
     looked = " or ".join(dict.fromkeys(str(path.absolute()) for path in paths))
-    document.report(("calibration",), f"there is no file {looked}; `tactflow calibrate` makes one")
+    advice = f"`tactflow calibrate` makes one, and tactflow has those of {', '.join(kinds())}"
+    document.report(("calibration",), f"there is no file {looked}; {advice}")
     return None
 
 

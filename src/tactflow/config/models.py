@@ -150,8 +150,8 @@ class PipelineFile(Part):
     calibration: str | None = Field(
         None,
         min_length=1,
-        description="the sensor's calibration file, from the folder of this file or the current one; "
-        "null: results in pixels only",
+        description="the sensor's calibration file, from the folder of this file or the current one, or the "
+        "default of a kind of sensor, mini or digit; null: results in pixels only",
     )
     skipping: bool = Field(True, description="false runs every stage in every frame")
     opencv_threads: int | None = Field(

@@ -317,7 +317,7 @@ class Source(Part):
     >>> [frame.seq for frame in Black(Black.Params()).frames()]
     [0, 1, 2]
 
-    `live` and `total` are known once it is open.
+    `live`, `total` and `pictures` are known once it is open.
     """
 
     live: bool = False
@@ -325,6 +325,9 @@ class Source(Part):
 
     total: int | None = None
     """How many frames there will be, where that is known."""
+
+    pictures: bool = False
+    """Whether frames are pictures in files of their own, which may show moments far apart."""
 
     @property
     def missed(self) -> int:

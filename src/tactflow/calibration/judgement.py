@@ -1,0 +1,105 @@
+"""Whether presses can give a calibration, and whether what they gave is one."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from tactflow.calibration.file import PhotometricEntry
+from tactflow.calibration.presses import Session, usual_radius
+from tactflow.engine.errors import ConfigError
+from tactflow.vision.arrays import Floats
+from tactflow.vision.types import Scale
+
+FEWEST_PRESSES: Final = 8
+"""Presses that a fit needs at least; 20 or more are advised. Chosen by hand."""
+SPREAD: Final = 0.15
+"""Part of the picture's width and height that the presses must span at least. Chosen by hand."""
+TOO_LARGE: Final = 1.25
+"""Radius of a contact over that of the ball that no ball can make; what outlines add to it is less."""
+LEAST_EXPLAINED: Final = 0.7
+"""Median share of the slopes of presses that a fit to others must explain. Two faces of an edge can explain
+0.36 of the slopes of a ball, as (E|x|)^2 / E(x^2 + y^2) on a disc. Balls on five gels have 0.94 to 0.99,
+edges of a cube 0.53 by a fit of their own and 0.26 by that of a ball."""
+LARGEST_ERROR: Final = 0.35
+"""Relative error of depth above which a fit is refused. By hand: balls on five gels have 0.04 to 0.14."""
+SHALLOW: Final = 0.4
+"""Radius of the contacts over that of the ball, in the median, below which it is asked whether the diameter
+was given. Balls on five gels have 0.42 to 1.1, and half of it where the diameter is given."""
+OTHER_RADIUS: Final = 2**0.5
+"""Factor between the radius of a ball as given and as another sensor of the kind sees it, from which on it is
+asked: half way to a diameter. Balls on two Minis and a DIGIT have 0.9 to 1.3, one by one."""
+
+
+def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) -> None:
+    """Raise ConfigError if the presses cannot give a calibration, with what was found and what to do.
+
+    radii : (n,) float64, mm, of the ball of each press. fewest : presses, from `FEWEST_PRESSES` on all over
+    the gel.
+    """
+    presses = session.presses
+    if not (np.isfinite(radii) & (radii > 0)).all():
+        raise ConfigError(f"calibrate: required a ball radius > 0 mm, got {radii.min():g}")
+    if not presses:
+        raise ConfigError(
+            f"calibrate: nothing touched the gel in {session.frames} frames; the first frame must show it "
+            "untouched, the others presses of the ball"
+        )
+    if len(presses) < fewest:
+        raise ConfigError(
+            f"calibrate: required {fewest} presses of the ball or more (20 are better), found "
+            f"{len(presses)} in {session.frames} frames; lift the ball between two presses"
+        )
+    span = np.ptp([press.center for press in presses], axis=0) / session.mapping.size
+    if span.min() < SPREAD and fewest >= FEWEST_PRESSES:
+        # Rounded down, so as not to read as enough.
+        wide, high = np.floor(1000 * span) / 10
+        raise ConfigError(
+            f"calibrate: the presses span {wide:g} % of the picture's width and "
+            f"{high:g} % of its height, required {100 * SPREAD:.0f} %; press all over the gel"
+        )
+    radius = usual_radius(presses) * (scale.x * scale.y) ** 0.5
+    ball_radius = float(np.median(radii))
+    if radius > TOO_LARGE * ball_radius:
+        raise ConfigError(
+            f"calibrate: the contacts have a radius of {radius:.2f} mm in the median, which a ball of radius "
+            f"{ball_radius:g} mm cannot make; give its radius, not its diameter, in mm, and look at the scale"
+        )
+
+
+def check_fit(found: PhotometricEntry) -> None:
+    """Raise ConfigError if presses have been fitted too badly to be a ball's, with what may be wrong."""
+    explained = found.explained
+    if explained is not None and explained < LEAST_EXPLAINED:
+        raise ConfigError(
+            f"calibrate: the colours explain {100 * explained:.0f} % of the slopes that a ball would "
+            f"have ({100 * LEAST_EXPLAINED:.0f} % required): what presses is no ball, nothing "
+            "touches the gel, or this gel does not answer to slopes with colour"
+        )
+    if found.depth_stderr > LARGEST_ERROR:
+        raise ConfigError(
+            f"calibrate: the error of the depth would be {100 * found.depth_stderr:.0f} % "
+            f"({100 * LARGEST_ERROR:.0f} % at most); press all over the gel, with nothing but the ball, and "
+            "see whether its outline is found (`--view`)"
+        )
+
+
+def doubt(session: Session, scale: Scale, ball_radius: float, apparent: float | None = None) -> str | None:
+    """A question about the radius of the ball; None where nothing raises it.
+
+    ball_radius : mm, as given. apparent : mm, `apparent_radius`, where there is a calibration of the kind.
+    """
+    ask = f"is {ball_radius:g} mm the radius of the ball, and not its diameter, or of another ball?"
+    if apparent is not None:
+        if max(apparent / ball_radius, ball_radius / apparent) < OTHER_RADIUS:
+            return None
+        return f"{ask} By the calibration of the pipeline, its radius is about {apparent:.2g} mm"
+    contact = usual_radius(session.presses) * (scale.x * scale.y) ** 0.5
+    if contact >= SHALLOW * ball_radius:
+        return None
+    deep = ball_radius - (ball_radius**2 - contact**2) ** 0.5
+    return (
+        f"{ask} Its contacts have a radius of {contact:.2f} mm in the median, so it was pressed {deep:.2f} "
+        "mm deep; if that is right, press deeper"
+    )

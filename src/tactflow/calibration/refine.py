@@ -1,0 +1,124 @@
+"""Slopes of a sensor from those of another one of its kind, and a few presses of a ball."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from tactflow.calibration.file import Calibration, PhotometricEntry
+from tactflow.calibration.judgement import check_fit, check_presses
+from tactflow.calibration.photometric import RIDGE, Photometry
+from tactflow.calibration.presses import Session
+from tactflow.calibration.samples import TURNS, Misfit, Sample, errors_on, flat, prepared, shaped, summary
+from tactflow.engine.errors import ConfigError
+from tactflow.vision.arrays import Floats
+from tactflow.vision.depth.slopes import SlopeModel
+from tactflow.vision.types import Scale
+
+MAP_WEIGHT: Final = 0.3
+"""Weight of the prior of how normals of two sensors differ, in presses: they differ by some 10 %, and a press
+shows that to 5 or 6 %, the squared ratio of which is 0.3."""
+BASE_WEIGHT: Final = 3.0
+"""The same of the prior of the coefficients. With 1 to 10, errors after 1, 3 and 9 presses of two Minis
+differ by a tenth at most."""
+
+
+def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: Calibration) -> Photometry:
+    """Adapt the slopes of another sensor of the same kind to this one, by one press of a ball or more.
+
+    Bayesian linear regression, in two steps. Other lamps make slopes look steeper, or turn them: so first all
+    normals are mapped by one 2 x 2 matrix, which one press determines. Then the coefficients are fitted, with
+    the mapped ones as the mean of their prior, and its precision in proportion to the Gram matrix of the
+    presses that the base was learned from: with more presses, more of the place and the colour is learned.
+
+    base : with slopes. The other parameters are those of `fit_photometry`.
+
+    Raises
+    ------
+    ConfigError : no presses, presses that are no ball's, or contacts larger than the ball.
+    """
+    if base.slopes is None or base.photometric is None or base.information is None:
+        raise ConfigError(
+            "calibrate --refine: required a calibration with depth, by this version of tactflow or a "
+            "later one"
+        )
+    radii = np.full(len(session.presses), ball_radius)
+    check_presses(session, scale, radii, fewest=1)
+    samples = prepared(session, scale, radii)
+    start = flat(base.slopes)
+    weights = _refined(samples, start, base.information)
+    centers = np.array([sample.center(sample.start, weights) for sample in samples])
+    misfit = np.array([s.misfit(c, weights).angle for s, c in zip(samples, centers, strict=True)])
+    before, count = base.photometric, len(samples)
+    errors = _left_out(session, samples, start, base.information, scale)
+
+    def with_base(name: str) -> float:
+        # What the base is known to be off by counts as one press more.
+        return float(np.sqrt((getattr(before, name) ** 2 + count * errors[name] ** 2) / (1 + count)))
+
+    found = PhotometricEntry(
+        ball_radius=ball_radius,
+        presses=count,
+        rejected=0,
+        steepest=max(before.steepest or 0.0, *(s.reach / s.ball_radius for s in samples)),
+        radius_error=errors["radius_error"],
+        explained=float(np.median([_by_base(sample, start).explained for sample in samples])),
+        **{name: with_base(name) for name in ("normal_error", "sphere_rms", "depth_stderr", "volume_stderr")},
+    )
+    check_fit(found)
+    pixels = centers / (scale.x, scale.y) + scale.origin
+    kept = np.ones(count, np.bool_)
+    return Photometry(SlopeModel(shaped(weights)), base.information, found, pixels, kept, misfit)
+
+
+def _refined(samples: Sequence[Sample], start: Floats, information: Floats) -> Floats:
+    """Coefficients (2, 114) of `refine_photometry`. start : (2, 114). information : of `Photometry`."""
+    known = information + RIDGE * np.diag(np.diag(information))
+    weights = start
+    for _ in range(TURNS):
+        seen, true = [], []
+        for sample in samples:
+            center = sample.center(sample.start, weights)
+            ball = sample.on_ball(center)
+            seen.append(sample.terms[ball].astype(np.float64))
+            true.append(sample.true_normals(center, ball))
+        terms, normals = np.concatenate(seen), np.concatenate(true)
+        found = terms @ start.T
+        step = np.linalg.solve(
+            found.T @ found + MAP_WEIGHT * start @ information @ start.T, found.T @ (normals - found)
+        )
+        mapped = start + step.T @ start
+        misfit = terms.T @ (normals - terms @ mapped.T)
+        weights = mapped + np.linalg.solve(terms.T @ terms + BASE_WEIGHT * known, misfit).T
+    return weights
+
+
+def apparent_radius(session: Session, scale: Scale, ball_radius: float, base: Calibration) -> float:
+    """Radius of the pressed ball by the slopes of another sensor of the kind, mm, median of the presses.
+
+    The presses alone cannot tell it: with twice the radius all slopes are half as steep. ball_radius : mm, as
+    it was given. base : with slopes.
+    """
+    assert base.slopes is not None
+    start, radii = flat(base.slopes), np.full(len(session.presses), ball_radius)
+    gains = [_by_base(sample, start).gain for sample in prepared(session, scale, radii)]
+    return ball_radius * float(np.median(gains))
+
+
+def _by_base(sample: Sample, start: Floats) -> Misfit:
+    """How well the base alone, (2, 114), fits a press."""
+    return sample.misfit(sample.center(sample.start, start), start)
+
+
+def _left_out(
+    session: Session, samples: Sequence[Sample], start: Floats, information: Floats, scale: Scale
+) -> dict[str, float]:
+    """Errors of each press by what is refined on the others; of a press alone by what is refined on it."""
+    errors = []
+    for number in range(len(samples)):
+        others = [*samples[:number], *samples[number + 1 :]] or samples
+        weights = _refined(others, start, information)
+        errors += errors_on(session, samples, [number], weights, scale)
+    return summary(errors)

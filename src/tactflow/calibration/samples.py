@@ -1,0 +1,261 @@
+"""Presses of a ball, prepared for a fit of the slopes, and how far a fit is off on each of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.calibration.presses import Press, Session
+from tactflow.vision.arrays import Floats
+from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
+from tactflow.vision.depth.surface import Rest, Surface, colour_change
+from tactflow.vision.depth.surroundings import Window, surroundings
+from tactflow.vision.types import Scale
+
+INNER: Final = 0.85
+"""Part of a contact's radius inside which the surface is the ball for sure, and part of the ball's radius up
+to which its colours tell slopes apart. Chosen on wedge_ball."""
+SMOOTHED: Final = 0.02
+"""Standard deviation of the Gaussian over which colours are averaged to be learned, in radii of the ball.
+Noise makes learned slopes too small: without it a box under `mixed` has errors of 8 % instead of 4. On
+wedge_ball 0.07 makes balls 1.5 % smaller than 0.03."""
+DARK: Final = 20.0
+"""Grey level below which a channel's light does not reach the surface, so that the slope shows in the two
+others alone. There colours are learned with their noise, which draws to the mean what it leaves open: with
+averages there, too, cables under `dark_channel` have errors of 5.6 % instead of 3.8."""
+TURNS: Final = 3
+"""How often fit and centres take turns; later ones move centres by less than 0.05 px on wedge_ball."""
+FEWEST_PIXELS: Final = 12
+"""Pixels at half resolution inside a contact that a sphere can be fitted to. Chosen by hand."""
+EDGE: Final = 0.1
+"""Half the width of the ring that counts as the rim of a contact, relative to its radius. Chosen by hand."""
+RIM: Final = 6
+"""Pixels at half resolution along the border of a press's window that roundness is not asked of. Chosen by
+hand."""
+
+
+class Misfit(NamedTuple):
+    """Normals by a fit against those of the ball that was pressed.
+
+    angle : mean between them, degrees; 180 where the press shows no ball. explained : share of the sum of
+    squares of their horizontal parts that the fit explains once it is scaled, 0 to 1. gain : the factor of
+    that scaling.
+    """
+
+    angle: float
+    explained: float
+    gain: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sample:
+    """A press, prepared: pixels (m) in its window at half resolution, in mm.
+
+    x, y : (m,), places, mm. terms : (m, 114) float32. hidden : (m,) bool. inner : (m,) bool, not too near the
+    border of the window. start : (x, y) of the outline, mm. reach : radius inside which it is the ball, mm.
+    ball_radius : mm.
+    """
+
+    x: Floats
+    y: Floats
+    terms: NDArray[np.float32]
+    hidden: NDArray[np.bool_]
+    inner: NDArray[np.bool_]
+    start: Floats
+    reach: float
+    window: Window
+    ball_radius: float
+
+    def on_ball(self, center: Floats) -> NDArray[np.bool_]:
+        """(m,): visible pixels where the surface is a ball with this centre."""
+        near = np.hypot(self.x - center[0], self.y - center[1]) < self.reach
+        return np.asarray(near & ~self.hidden)
+
+    def normals(self, weights: Floats, chosen: NDArray[np.bool_]) -> Floats:
+        """(k, 2): horizontal part of the normals at some pixels, by the fit."""
+        return np.asarray(self.terms[chosen] @ weights.T.astype(np.float32), np.float64)
+
+    def center(self, start: Floats, weights: Floats) -> Floats:
+        """(2,), mm: the median of where pixels of the press say that the middle of the ball is."""
+        center = start
+        for _ in range(TURNS):
+            ball = self.on_ball(center)
+            if not ball.any():
+                return center
+            places = np.stack([self.x[ball], self.y[ball]], axis=1)
+            center = np.median(places - self.ball_radius * self.normals(weights, ball), axis=0)
+        return center
+
+    def true_normals(self, center: Floats, ball: NDArray[np.bool_]) -> Floats:
+        """(k, 2): horizontal part of the normals of the ball at some pixels."""
+        places = np.stack([self.x[ball], self.y[ball]], axis=1)
+        return np.asarray((places - center) / self.ball_radius)
+
+    def information(self, center: Floats) -> Floats:
+        """(114, 114): Gram matrix of the terms over the pixels where the surface is the ball."""
+        terms = self.terms[self.on_ball(center)].astype(np.float64)
+        return np.asarray(terms.T @ terms)
+
+    def misfit(self, center: Floats, weights: Floats) -> Misfit:
+        """How far the normals by the fit are from those of the ball."""
+        ball = self.on_ball(center)
+        found, true = self.normals(weights, ball), self.true_normals(center, ball)
+        product, square = float((found * true).sum()), float((found**2).sum())
+        if product <= 0:
+            return Misfit(180.0, 0.0, math.inf)
+        cosine = np.sum(upright(found) * upright(true), axis=1)
+        angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+        return Misfit(angle, product**2 / (square * float((true**2).sum())), product / square)
+
+
+def prepared(session: Session, scale: Scale, radii: Floats) -> list[Sample]:
+    """The presses of a session.
+
+    radii : (n,), mm, of the ball of each press.
+    """
+    width = SMOOTHED * float(np.median(radii))
+    across, down = width / scale.x, width / scale.y
+
+    def smoothed(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        # Not rounded to grey levels again: that would be as much noise as a camera's.
+        return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), across, sigmaY=down), np.float32)
+
+    rests = Rest(session.untouched), Rest(smoothed(session.untouched))
+    pairs = zip(session.presses, radii.tolist(), strict=True)
+    return [_prepare(press, smoothed(press.image), rests, scale, radius) for press, radius in pairs]
+
+
+def _prepare(
+    press: Press, smoothed: NDArray[np.float32], rests: tuple[Rest, Rest], scale: Scale, ball_radius: float
+) -> Sample:
+    """smoothed : the picture of the press. rests : the untouched gel, as it is and smoothed."""
+    rest = rests[0]
+    window = surroundings(press.mask, rest.window).window
+    light = rest.around(press.image, press.mask).light
+    change = colour_change(smoothed, rests[1], window, light)
+    size = (window.width, window.height)
+    dark = cv2.resize(smoothed[window.whole], size, interpolation=cv2.INTER_AREA).min(axis=2) < DARK
+    change[dark] = colour_change(press.image, rest, window, light)[dark]
+    place = place_terms((rest.window.right, rest.window.bottom))[(slice(None), *window.part)]
+    terms = place.reshape(PLACE_TERMS, 1, -1) * colour_terms(change)
+    rows, columns = np.mgrid[window.part]
+    hidden = press.hidden[window.whole]
+    inner = np.zeros(change.shape[:2], np.bool_)
+    inner[RIM:-RIM, RIM:-RIM] = True
+    return Sample(
+        # The centre of a pixel at half resolution lies between two of the processed frame.
+        x=((2.0 * columns + 0.5 - scale.origin[0]) * scale.x).ravel(),
+        y=((2.0 * rows + 0.5 - scale.origin[1]) * scale.y).ravel(),
+        terms=np.ascontiguousarray(terms.reshape(PLACE_TERMS * COLOUR_TERMS, -1).T),
+        hidden=(hidden[::2, ::2] | hidden[1::2, ::2] | hidden[::2, 1::2] | hidden[1::2, 1::2]).ravel(),
+        inner=inner.ravel(),
+        start=np.array(scale.point(press.center)),
+        reach=min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius),
+        window=window,
+        ball_radius=ball_radius,
+    )
+
+
+def press_errors(
+    session: Session, model: SlopeModel, scale: Scale, ball_radius: float | Sequence[float]
+) -> list[list[float]]:
+    """Errors of a model on each press of a ball.
+
+    session : what `PressFinder` found. ball_radius : mm, of all presses or of each.
+
+    Returns
+    -------
+    (n, 6): mean angle of the normals, degrees; relative error of the ball's radius; RMS distance of the
+    heights from it, mm; relative errors of its depth and its volume, from the middle to the rim of the
+    contact: the gel around it is not known; share of the normals that is explained, see `Misfit`. The
+    middle four are NaN where a contact is too small.
+    """
+    radii = np.broadcast_to(np.asarray(ball_radius, np.float64), len(session.presses))
+    samples = prepared(session, scale, radii)
+    return errors_on(session, samples, range(len(samples)), flat(model), scale)
+
+
+def errors_on(
+    session: Session, samples: Sequence[Sample], chosen: Iterable[int], weights: Floats, scale: Scale
+) -> list[list[float]]:
+    """The same for some presses, from the coefficients (2, 114). samples : of all presses of the session."""
+    rest, surface = Rest(session.untouched), Surface(SlopeModel(shaped(weights)), scale)
+    errors = []
+    for number in chosen:
+        press, sample = session.presses[number], samples[number]
+        heights = surface.heights(press.image, rest, press.mask)[sample.window.part]
+        errors.append(_errors(sample, weights, heights))
+    return errors
+
+
+def _errors(sample: Sample, weights: Floats, heights: NDArray[np.float32]) -> list[float]:
+    """A row of `press_errors`."""
+    ball_radius = sample.ball_radius
+    center = sample.center(sample.start, weights)
+    angle, explained, _ = sample.misfit(center, weights)
+    found = heights.ravel().astype(np.float64)
+    dx, dy = sample.x - center[0], sample.y - center[1]
+    distance = np.hypot(dx, dy)
+    ball = distance < sample.reach
+    edge = np.abs(distance - sample.reach) < EDGE * sample.reach
+    if np.count_nonzero(ball) < FEWEST_PIXELS or not edge.any():
+        return [angle, np.nan, np.nan, np.nan, np.nan, explained]
+    radius, rms = fit_sphere(np.stack([dx[ball], dy[ball], found[ball]], axis=1))
+    cap = np.sqrt(ball_radius**2 - distance[ball] ** 2)
+    rise = cap - cap.mean()
+    fall = np.sqrt(ball_radius**2 - distance[edge] ** 2).mean()
+    depth = float(rise @ found[ball] / (rise @ rise)) - 1
+    volume = float((found[ball].mean() - found[edge].mean()) / (cap.mean() - fall)) - 1
+    return [angle, radius / ball_radius - 1, rms, depth, volume, explained]
+
+
+def summary(errors: Sequence[Sequence[float]]) -> dict[str, float]:
+    """Numbers of `PhotometricEntry` from the errors of each press."""
+    angle, radius, rms, depth, volume, explained = np.transpose(errors)
+    return {
+        "normal_error": float(np.mean(angle)),
+        "radius_error": float(np.nanmedian(radius)),
+        "sphere_rms": float(np.nanmean(rms)),
+        "depth_stderr": float(np.sqrt(np.nanmean(depth**2))),
+        "volume_stderr": float(np.sqrt(np.nanmean(volume**2))),
+        "explained": float(np.median(explained)),
+    }
+
+
+def fit_sphere(points: Floats) -> tuple[float, float]:
+    """Radius of the sphere through points (n, 3), by linear least squares, and their RMS distance from it.
+
+    >>> angle = np.linspace(0, 6, 40)
+    >>> flat = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.linspace(0.1, 1.2, 40)[:, None]
+    >>> points = np.column_stack([flat, np.sqrt(4 - (flat**2).sum(axis=1))])
+    >>> [round(value, 6) for value in fit_sphere(points)]
+    [2.0, 0.0]
+    """
+    matrix = np.column_stack([points, np.ones(len(points))])
+    solved = np.linalg.lstsq(matrix, (points**2).sum(axis=1), rcond=None)[0]
+    center = solved[:3] / 2
+    radius = float(np.sqrt(max(solved[3] + center @ center, 0.0)))
+    distance = np.linalg.norm(points - center, axis=1) - radius
+    return radius, float(np.sqrt(np.mean(distance**2)))
+
+
+def upright(flat: Floats) -> Floats:
+    """(m, 3): unit normals from their horizontal parts (m, 2); longer ones than 1 lie flat."""
+    flat = flat / np.maximum(np.hypot(flat[:, 0], flat[:, 1]), 1)[:, None]
+    return np.concatenate([flat, np.sqrt(np.maximum(1 - (flat**2).sum(axis=1, keepdims=True), 0))], axis=1)
+
+
+def flat(model: SlopeModel) -> Floats:
+    """(2, 114): the coefficients of a model."""
+    return model.coefficients.transpose(2, 0, 1).reshape(2, -1).astype(np.float64)
+
+
+def shaped(weights: Floats) -> Floats:
+    """(6, 19, 2) coefficients, as `SlopeModel` takes them, from (2, 114)."""
+    return weights.reshape(2, PLACE_TERMS, COLOUR_TERMS).transpose(1, 2, 0)

@@ -1,0 +1,40 @@
+"""Which results are presses of their own."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from tactflow.calibration.presses import PressFinder
+from tactflow.engine.frame import Frame
+from tactflow.message.result import Result
+from tactflow.vision.types import Contact
+
+GEL = np.full((80, 120, 3), 100, np.uint8)
+
+
+def result(seq: int, x: int | None = None, radius: int = 12) -> Result:
+    """A frame with a round contact at (x, 40), or without."""
+    ports: dict[str, object] = {"image": GEL}
+    if x is not None:
+        mask = cv2.circle(np.zeros(GEL.shape[:2], np.uint8), (x, 40), radius, 255, -1)
+        ports |= {
+            "contact_mask": mask,
+            "contact": Contact(450.0, (float(x), 40.0), None, None, np.zeros((0, 2)), None),
+        }
+    return Result(Frame("main", seq, seq / 30, GEL, reference=x is None), ports)
+
+
+CONTACTS = [(50, 10), (50, 16), (54, 12), (54, 12), (90, 12)]
+
+
+@pytest.mark.parametrize(("pictures", "expected"), [(False, [2, 5]), (True, [1, 2, 3, 5])])
+def test_pictures_of_presses_at_one_place_are_presses_of_their_own_and_frames_of_a_film_are_one(
+    pictures: bool, expected: list[int]
+) -> None:
+    finder = PressFinder(pictures)
+    finder.add(result(0))
+    for seq, (x, radius) in enumerate(CONTACTS, 1):
+        finder.add(result(seq, x, radius))
+    assert [press.seq for press in finder.presses] == expected
