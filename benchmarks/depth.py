@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,9 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tactflow
-from tactflow.calibration.photometric import Photometry, fit_photometry, press_errors
+from tactflow.calibration.file import Calibration, PhotometricEntry
+from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press, Session
+from tactflow.calibration.refine import refine_photometry
+from tactflow.calibration.samples import press_errors
 from tactflow.calibration.scale import centre
+from tactflow.calibration.stored import KINDS
+from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Scale
 
@@ -37,7 +42,11 @@ MINI = 0.0634
 
 @dataclass(frozen=True, slots=True)
 class Balls:
-    """A set. radii : start of a file's name -> radius of the ball, mm. kind : set of another sensor."""
+    """A set.
+
+    radii : start of a file's name -> radius of the ball, mm. kind : the default calibration of its kind,
+    made from another sensor.
+    """
 
     folder: str
     untouched: str
@@ -49,12 +58,12 @@ class Balls:
 
 SETS = {
     "gelslam": Balls("mini_ball_gelslam", "background.png", "mini_plain", MINI, {"6": 3.155, "9": 4.75}),
-    "mini_ball": Balls("gels/mini_ball", "000.png", "mini", MINI, {"": 2.5}, "gelslam"),
-    "mini_ball_9mm": Balls("mini_ball_9mm", "background.png", "mini_plain", MINI, {"": 4.735}, "gelslam"),
+    "mini_ball": Balls("gels/mini_ball", "000.png", "mini", MINI, {"": 2.5}, "mini"),
+    "mini_ball_9mm": Balls("mini_ball_9mm", "background.png", "mini_plain", MINI, {"": 4.735}, "mini"),
     "digit_fots": Balls("gels/digit_fots", "000.png", "digit", 1 / 19.58, {"": 2.35}),
     "wedge_ball": Balls("wedge_ball", "reference.jpg", "wedge", 0.1, {"": 1.98}),
 }
-EDGE = Balls("gels/mini_box", "000.png", "mini_plain", MINI, {}, "gelslam")
+EDGE = Balls("gels/mini_box", "000.png", "mini_plain", MINI, {}, "mini")
 
 
 def read(balls: Balls, data: Path) -> tuple[Session, list[str]]:
@@ -65,7 +74,8 @@ def read(balls: Balls, data: Path) -> tuple[Session, list[str]]:
     with TemporaryDirectory() as links:
         for number, path in enumerate(pictures):
             (Path(links) / f"{number:04d}{path.suffix}").symlink_to(path.resolve())
-        results = tactflow.stream(balls.pipeline, source=links, images=True)
+        pictures_only = {"calibration": None}
+        results = tactflow.stream(balls.pipeline, source=links, settings=pictures_only, images=True)
         first, *others = [r for r in results if r.image is not None]
     untouched = first.get("unmarked", first.image)
     presses, names = [], []
@@ -97,10 +107,12 @@ def chosen(session: Session, radii: list[float], which: slice) -> tuple[Session,
     return replace(session, presses=session.presses[which]), radii[which]
 
 
-def judge(fitted: Photometry, session: Session, scale: Scale, radii: list[float]) -> str:
+def judge(
+    model: SlopeModel, found: PhotometricEntry, session: Session, scale: Scale, radii: list[float]
+) -> str:
     """The columns of a row."""
-    errors = np.array(press_errors(session, fitted.model, scale, radii))
-    surface, rest = Surface(fitted.model, scale, fitted.found.errors()), Rest(session.untouched)
+    errors = np.array(press_errors(session, model, scale, radii))
+    surface, rest = Surface(model, scale, found.errors()), Rest(session.untouched)
     rows = []
     for press, ball_radius, cap_error in zip(session.presses, radii, errors[:, 3], strict=True):
         depth = surface.depth(press.image, rest, press.mask)
@@ -136,11 +148,11 @@ def border(heights: NDArray[np.float32]) -> float:
     return max((float(line.max()) for inside, line in lines if inside), default=0.0)
 
 
-def edge_angle(fitted: Photometry, data: Path, session: Session, names: list[str]) -> float:
+def edge_angle(model: SlopeModel, data: Path, session: Session, names: list[str]) -> float:
     """Median angle between the faces of the cube, degrees; 90 is right."""
     labels = json.loads((data / EDGE.folder / "labels.json").read_text())
     scale = scale_of(EDGE, session)
-    surface, rest, angles = Surface(fitted.model, scale), Rest(session.untouched), []
+    surface, rest, angles = Surface(model, scale), Rest(session.untouched), []
     y, x = np.mgrid[: session.untouched.shape[0], : session.untouched.shape[1]]
     for press, name in zip(session.presses, names, strict=True):
         label = labels.get(Path(name).stem)
@@ -164,9 +176,36 @@ def calibrations(name: str, sessions: dict[str, tuple[Session, list[str]]]) -> I
     balls = SETS[name]
     session, names = sessions[name]
     scale, radii = scale_of(balls, session), radii_of(balls, names)
-    halves = [chosen(session, radii, slice(start, None, 2)) for start in (0, 1)]
-    own = fit_photometry(halves[0][0], scale, halves[0][1])
-    yield "own", judge(own, halves[1][0], scale, halves[1][1])
+    first, second = (chosen(session, radii, slice(start, None, 2)) for start in (0, 1))
+    own = fit_photometry(first[0], scale, first[1])
+    yield "own", judge(own.model, own.found, second[0], scale, second[1])
+    if balls.kind is None:
+        return
+    base = Calibration.load(KINDS / f"{balls.kind}.yaml")
+    assert base.slopes is not None
+    assert base.photometric is not None
+    yield "default", judge(base.slopes, base.photometric, second[0], scale, second[1])
+    for count in (1, 3, 9):
+        # The same presses of every run, from all over the gel.
+        few, ball = chosen(*first, slice(0, None, len(first[1]) // count))
+        few = replace(few, presses=few.presses[:count])
+        refined = refine_photometry(few, scale, ball[0], base)
+        yield f"{count} presses", judge(refined.model, refined.found, second[0], scale, second[1])
+
+
+def sessions_of(names: Iterable[str], data: Path, keep: Path | None) -> dict[str, tuple[Session, list[str]]]:
+    """The presses of sets. keep : folder with those of an earlier run, or where they are put."""
+    sessions = {}
+    for name in dict.fromkeys(names):
+        kept = keep / f"{name}.pickle" if keep else None
+        if kept and kept.exists():
+            sessions[name] = pickle.loads(kept.read_bytes())
+            continue
+        sessions[name] = read(EDGE if name == "edge" else SETS[name], data)
+        if kept:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_bytes(pickle.dumps(sessions[name]))
+    return sessions
 
 
 def main() -> None:
@@ -176,20 +215,16 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder with the presses of an earlier run")
     parser.add_argument("sets", nargs="*", default=[*SETS])
     args = parser.parse_args()
-    sessions = {}
-    for name in {*args.sets, *(SETS[s].kind for s in args.sets if SETS[s].kind), "edge"}:
-        kept = args.keep / f"{name}.pickle" if args.keep else None
-        if kept and kept.exists():
-            sessions[name] = pickle.loads(kept.read_bytes())
-            continue
-        sessions[name] = read(EDGE if name == "edge" else SETS[name], args.data)
-        if kept:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_bytes(pickle.dumps(sessions[name]))
+    sessions = sessions_of([*args.sets, "edge"], args.data, args.keep)
     print(f"{'set':14} {'calibration':12} normals    cap  /cap /sneddon   step  cover    presses")
     for name in args.sets:
         for label, columns in calibrations(name, sessions):
             print(f"{name:14} {label:12}{columns}", flush=True)
+    base = Calibration.load(KINDS / f"{EDGE.kind}.yaml")
+    assert base.slopes is not None
+    print(
+        f"edge of a cube, default: {edge_angle(base.slopes, args.data, *sessions['edge']):.0f} degrees of 90"
+    )
 
 
 if __name__ == "__main__":
