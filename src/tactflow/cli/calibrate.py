@@ -100,6 +100,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     option("--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only")
     option(
+        "--presses",
+        type=positive,
+        metavar="N",
+        help=f"of a live source: enough presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE})",
+    )
+    option("--view", action="store_true", help="show the live page, which says where to press next")
+    _add_kind(parser)
+    _add_target_and_force(parser)
+
+
+def _add_kind(parser: argparse.ArgumentParser) -> None:
+    """Declare the options about calibrations of a kind of sensor."""
+    option = parser.add_argument
+    option(
         "--refine",
         action="store_true",
         help="start from the pipeline's calibration, such as the default of a kind of sensor, and adapt it "
@@ -112,14 +126,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="make the default for all sensors of a kind, such as 'GelSight Mini', with the errors that it "
         "has on others",
     )
-    option(
-        "--presses",
-        type=positive,
-        metavar="N",
-        help=f"of a live source: enough presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE})",
-    )
-    option("--view", action="store_true", help="show the live page, which says where to press next")
-    _add_target_and_force(parser)
 
 
 def _add_target_and_force(parser: argparse.ArgumentParser) -> None:
