@@ -28,7 +28,7 @@ BULK = bytes.fromhex("09040100010e020000 07058102000200")
 
 
 def descriptors(*, bulk: bool = False, companion: bool = False) -> bytes:
-    """Those of the camera; or as such a one has them that uses bulk transfers, or USB 3."""
+    """Those of the camera; or, by the specifications, of one that uses bulk transfers, or USB 3."""
     if bulk:
         return DEVICE + CONTROL + BULK
     data = DEVICE + CONTROL + IDLE
