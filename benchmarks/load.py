@@ -2,9 +2,11 @@
 
     python benchmarks/load.py                       # 1 to 16 sensors, 1 to 128 subscribers; five minutes
     python benchmarks/load.py --sensors 1 --rate 60
+    python benchmarks/load.py --sensors 16 --touched 2 --rate 60 --subscribers
     python benchmarks/load.py --soak 1000000        # frames through all sinks as fast as possible; an hour
 
-Each sensor feeds 800 x 600 px pictures with intermittent contact to the default pipeline. Subscribers run on
+Each sensor feeds 800 x 600 px pictures with intermittent contact, or of an untouched gel, to the default
+pipeline. Subscribers run on
 the same machine. Tables are printed in Markdown.
 """
 
@@ -35,6 +37,7 @@ import tactflow
 ROOT = Path(__file__).resolve().parents[1]
 CYCLE = 60
 """Number of pictures in the repeated cycle: one press and release."""
+PICTURES, IDLE = "press.npy", "idle.npy"
 SETTLE, MEASURED = 4.0, 15.0
 """Seconds between the first results and the measurement, and duration of the measurement. Chosen by hand."""
 SAMPLE_SECONDS = 5.0
@@ -48,12 +51,13 @@ size."""
 
 def write_pipeline(folder: Path, size: tuple[int, int], source: Mapping[str, Any], **changes: Any) -> None:
     """Write the default pipeline with the endless source, its pictures, and changed keys."""
-    scene = tactflow.open_scene(f"press?frames={CYCLE}")
-    pictures = [cv2.resize(scene.frame(i), size, interpolation=cv2.INTER_AREA) for i in range(CYCLE)]
-    np.save(folder / "pictures.npy", np.stack(pictures))
+    for name in (PICTURES, IDLE):
+        scene = tactflow.open_scene(f"{name.removesuffix('.npy')}?frames={CYCLE}")
+        pictures = [cv2.resize(scene.frame(i), size, interpolation=cv2.INTER_AREA) for i in range(CYCLE)]
+        np.save(folder / name, np.stack(pictures))
     shutil.copy(Path(__file__).with_name("endless.py"), folder)
     document = yaml.safe_load((ROOT / "pipeline.yaml").read_text(encoding="utf-8"))
-    capture = {"use": "./endless.py:Endless", "pictures": str(folder / "pictures.npy"), **source}
+    capture = {"use": "./endless.py:Endless", "pictures": str(folder / PICTURES), **source}
     document["stages"]["capture"] = capture
     if "sensors" in changes:
         del document["sensor"]
@@ -81,12 +85,22 @@ def fail_if_ended(process: subprocess.Popen[bytes], folder: Path) -> None:
         raise SystemExit((folder / "messages.txt").read_text(encoding="utf-8"))
 
 
+def family(pid: int) -> list[int]:
+    """A process and its children."""
+    return [pid, *map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
+
+
+def processor_seconds(pid: int) -> float:
+    """CPU time of a process and its children so far, s."""
+    stats = [Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split() for one in family(pid)]
+    return sum(int(fields[11]) + int(fields[12]) for fields in stats) / os.sysconf("SC_CLK_TCK")
+
+
 def resources(pid: int) -> dict[str, float]:
     """Memory of a process and its children, MB, its open files and threads; empty if it has ended."""
     folder = Path(f"/proc/{pid}")
     with suppress(OSError, IndexError):
-        children = (folder / f"task/{pid}/children").read_text().split()
-        pages = [int(Path(f"/proc/{p}/statm").read_text().split()[1]) for p in [str(pid), *children]]
+        pages = [int(Path(f"/proc/{one}/statm").read_text().split()[1]) for one in family(pid)]
         megabytes = sum(pages) * os.sysconf("SC_PAGE_SIZE") / 2**20
         files, threads = (len(list((folder / name).iterdir())) for name in ("fd", "task"))
         return {"memory, MB": megabytes, "open files": files, "threads": threads}
@@ -132,12 +146,14 @@ class Subscribers:
                             self.seqs[message["sensor"]].append(message["seq"])
 
 
-def measure(sensors: int, subscribers: int, rate: float) -> list[str]:
-    """Measure one load; return the cells of its row."""
-    names = {"sensors": {f"s{n}": {} for n in range(sensors)}} if sensors > 1 else {"sensor": "s0"}
+def measure(sensors: int, subscribers: int, rate: float, touched: int) -> list[str]:
+    """Measure one load; return the cells of its row. touched : sensors with contacts, the first ones."""
     readers = Subscribers(subscribers)
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
+        idle = {"stages": {"capture": {"pictures": str(folder / IDLE)}}}
+        several = {f"s{n}": {} if n < touched else idle for n in range(sensors)}
+        names = {"sensors": several} if sensors > 1 else {"sensor": "s0"}
         sinks = {"zmq": {"endpoint": f"tcp://127.0.0.1:{PORT}"}}
         write_pipeline(folder, (800, 600), {"rate": rate}, sinks=sinks, **names)
         process = stack.enter_context(running(folder))
@@ -148,8 +164,13 @@ def measure(sensors: int, subscribers: int, rate: float) -> list[str]:
         time.sleep(SETTLE)
         readers.ages.clear()
         readers.seqs.clear()
-        before = resources(process.pid)["memory, MB"]
+        before, began, used = (
+            resources(process.pid)["memory, MB"],
+            time.perf_counter(),
+            processor_seconds(process.pid),
+        )
         time.sleep(MEASURED)
+        busy = (processor_seconds(process.pid) - used) / (time.perf_counter() - began)
         memory = resources(process.pid)["memory, MB"]
         ages = 1e3 * np.array(readers.ages)
         arrived = [len(seqs) / (seqs[-1] - seqs[0] + 1) for seqs in readers.seqs.values()]
@@ -160,6 +181,7 @@ def measure(sensors: int, subscribers: int, rate: float) -> list[str]:
         f"{ages[-max(1, len(ages) // 10) :].max():.0f}",
         f"{memory:.0f}",
         f"{memory - before:+.1f}",
+        f"{busy:.2f}",
     ]
 
 
@@ -201,7 +223,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure a running tactflow under load.")
     parser.add_argument("--sensors", type=int, nargs="+", default=[1, 2, 4, 8, 16])
     parser.add_argument(
-        "--subscribers", type=int, nargs="+", default=[16, 128], help="number, with one sensor"
+        "--touched", type=int, default=sys.maxsize, metavar="N", help="the other sensors see an untouched gel"
+    )
+    parser.add_argument(
+        "--subscribers", type=int, nargs="*", default=[16, 128], help="number, with one sensor"
     )
     parser.add_argument("--rate", type=float, default=30.0, help="frames per second of each sensor (30)")
     parser.add_argument(
@@ -218,10 +243,10 @@ def main() -> None:
             print_row([what, *(f"{v:.0f}" for v in (values[0], min(values), max(values), values[-1]))])
         return
     heads = ["sensors", "subscribers", "results", "age, ms: p50", "p99", "oldest at the end", "memory, MB"]
-    print_row([*heads, "growth, MB"])
-    print_row(["---"] * 8)
+    print_row([*heads, "growth, MB", "processors busy"])
+    print_row(["---"] * 9)
     for sensors, subscribers in [(n, 1) for n in args.sensors] + [(1, n) for n in args.subscribers]:
-        print_row(measure(sensors, subscribers, args.rate))
+        print_row(measure(sensors, subscribers, args.rate, args.touched))
 
 
 if __name__ == "__main__":
