@@ -138,6 +138,24 @@ def test_marks_as_bright_as_lamps_are_still_marks() -> None:
     assert away.max() < 0.5
 
 
+@pytest.mark.parametrize("pitch", [8, 24])
+@pytest.mark.parametrize("kind", ["threads", "uneven threads", "checks", "plain weave"])
+def test_the_crossings_of_a_cloth_are_refused_in_words(kind: str, pitch: int) -> None:
+    y, x = np.mgrid[:360, :480] / pitch
+    warp, weft = np.sin(2 * np.pi * x), np.sin(2 * np.pi * y)
+    over = (np.floor(x) + np.floor(y)) % 2 == 0
+    cloth = {
+        "threads": warp + weft,
+        "uneven threads": 1.5 * warp + 0.5 * weft,
+        "checks": np.sign(warp * weft),
+        "plain weave": np.where(over, np.abs(np.sin(np.pi * x)), np.abs(np.sin(np.pi * y))),
+    }[kind]
+    picture = 128 + 30 * cloth + np.random.default_rng(0).normal(0, 1.5, cloth.shape)
+    with pytest.raises(NoMarkersError, match="run into each other") as refused:
+        detect_markers(picture.astype(np.uint8))
+    assert refused.value.best is not None
+
+
 @pytest.mark.parametrize("kind", ["speckle", "waves", "scattered"])
 def test_a_random_texture_is_refused_in_words(kind: str) -> None:
     rng = np.random.default_rng(4)

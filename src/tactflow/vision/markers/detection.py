@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import family
 from tactflow.vision.markers.family import Family, Sign
-from tactflow.vision.markers.lattice import LONGEST_LINK, nearest, neighbour_graph, pitch_of
+from tactflow.vision.markers.lattice import LONGEST_LINK, corners, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
@@ -27,6 +27,13 @@ LEAST_SCORE: Final = 2.5
 """Score of the weakest family that is believed to be marks (see `family.families`). Real gels with marks
 score 4 and more; dust, reflections and noise on gels without at most 0.4, what compression leaves along edges
 up to 3, in 36 of 38 such pictures of wedge_grasp up to 2.4 (measured). Marks 3.5 px apart need as little."""
+
+MOST_BETWEEN: Final = 0.3
+"""Level half-way between two neighbouring marks, on the way from the gel's (0) to that of the marks (1), at
+most. The gel is looked at on the diagonal, three quarters of the way to the middle of a cell, where another
+lattice may have its marks. Of two waves that cross, as in a weave, it is sqrt(2) / (2 + sqrt(2)) = 0.41 and
+more. Real marks have at most 0.20, those that nearly touch on sts_torque160; most have less than 0.1
+(measured)."""
 
 MANY_SPOTS: Final = 30
 """Spots from which on a picture without a lattice is called a texture; fewer are dust. Chosen by hand."""
@@ -242,7 +249,7 @@ def _found_in(
         marks = family.united(gray, best, by_scale)
         if not len(marks.points):
             raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(best))
-        return _detection(gray, best, marks, found[1:])
+        return _with_gel_between(gray, _detection(gray, best, marks, found[1:]))
     return _detection(gray, best, best.spots, found[1:])
 
 
@@ -250,15 +257,15 @@ def _without_lamps(
     gray: NDArray[np.float32], best: Family, by_scale: Mapping[float, Spots]
 ) -> tuple[Family, Mapping[float, Spots]]:
     """The family, and the spots of its polarity, without those that saturate the camera if marks do not."""
-    if best.polarity == "dark" or np.percentile(_levels(gray, best.spots), MOST_MARKS) > NEARLY_WHITE:
+    if best.polarity == "dark" or np.percentile(_levels(gray, best.spots.points), MOST_MARKS) > NEARLY_WHITE:
         return best, by_scale
-    kept = {s: spots.at(_levels(gray, spots) < SATURATED) for s, spots in by_scale.items()}
-    return best._replace(spots=best.spots.at(_levels(gray, best.spots) < SATURATED)), kept
+    kept = {s: spots.at(_levels(gray, spots.points) < SATURATED) for s, spots in by_scale.items()}
+    return best._replace(spots=best.spots.at(_levels(gray, best.spots.points) < SATURATED)), kept
 
 
-def _levels(gray: NDArray[np.float32], spots: Spots) -> NDArray[np.float32]:
-    """(N,) grey level in the middle of each spot."""
-    column, row = np.clip(np.rint(spots.points).astype(np.int64), 0, np.array(gray.shape[::-1]) - 1).T
+def _levels(gray: NDArray[np.float32], points: Floats) -> NDArray[np.float32]:
+    """(N,) grey level at points (N, 2), px."""
+    column, row = np.clip(np.rint(points).astype(np.int64), 0, np.array(gray.shape[::-1]) - 1).T
     return np.asarray(gray[row, column], np.float32)
 
 
@@ -276,6 +283,28 @@ def _require_lattice(found: list[Family]) -> None:
             _candidate(best),
         )
     raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(found[0]))
+
+
+def _with_gel_between(gray: NDArray[np.float32], found: Detection) -> Detection:
+    """What was found. Raises NoMarkersError for spots between which there is no even gel, as in a weave."""
+    around = corners(found.centers, found.edges)
+    if len(around.points):
+        smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), max(0.3 * found.dot_radius, 0.5)), np.float32)
+        mark = found.centers[around.middle]
+        first, last = found.centers[around.first], found.centers[around.last]
+        diagonal = (mark + 1.5 * first + 1.5 * last) / 4
+        marks, gel, one, other = (
+            _levels(smooth if found.polarity == "dark" else -smooth, points)
+            for points in (mark, diagonal, (mark + first) / 2, (mark + last) / 2)
+        )
+        if np.median(gel - np.minimum(one, other)) > MOST_BETWEEN * np.median(gel - marks):
+            raise NoMarkersError(
+                f"{_NO_MARKERS} ({len(found.centers)} {found.polarity} spots of radius "
+                f"{found.dot_radius:.1f} px run into each other, like the threads of a cloth; if they are "
+                "marks, give their radius in pixels)",
+                found.chosen,
+            )
+    return found
 
 
 def _candidate(found: Family) -> Candidate:
