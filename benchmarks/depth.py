@@ -148,17 +148,26 @@ def border(heights: NDArray[np.float32]) -> float:
     return max((float(line.max()) for inside, line in lines if inside), default=0.0)
 
 
-def edge_angle(model: SlopeModel, data: Path, session: Session, names: list[str]) -> float:
-    """Median angle between the faces of the cube, degrees; 90 is right."""
+def judge_edge(base: Calibration, data: Path, session: Session, names: list[str]) -> str:
+    """Median angle between the faces of the cube, and how its depth and the stated error of that fit.
+
+    A right angle over a base of two parts is as high as the geometric mean of these.
+    """
+    assert base.slopes is not None
+    assert base.photometric is not None
     labels = json.loads((data / EDGE.folder / "labels.json").read_text())
     scale = scale_of(EDGE, session)
-    surface, rest, angles = Surface(model, scale), Rest(session.untouched), []
+    surface = Surface(base.slopes, scale, base.photometric.errors())
+    rest, angles, ratios, off = Rest(session.untouched), [], [], []
     y, x = np.mgrid[: session.untouched.shape[0], : session.untouched.shape[1]]
     for press, name in zip(session.presses, names, strict=True):
         label = labels.get(Path(name).stem)
         if label is None:
             continue
-        heights = surface.depth(press.image, rest, press.mask).heights
+        depth = surface.depth(press.image, rest, press.mask)
+        heights, true = depth.heights, scale.x * np.sqrt(label["width1"] * label["width2"])
+        ratios.append(depth.greatest / true)
+        off.append(abs(depth.greatest - true) / (depth.greatest_stderr or np.nan))
         slant = np.radians(label["line_angle"])
         dx, dy = x - label["line_center"][0], y - label["line_center"][1]
         across, along = dy * np.cos(slant) - dx * np.sin(slant), dx * np.cos(slant) + dy * np.sin(slant)
@@ -168,7 +177,11 @@ def edge_angle(model: SlopeModel, data: Path, session: Session, names: list[str]
             face &= side * across < 0.8 * width
             slopes.append(np.polyfit(across[face] * scale.y, heights[face], 1)[0])
         angles.append(180 - np.degrees(np.arctan(slopes[0]) - np.arctan(slopes[1])))
-    return float(np.median(angles))
+    one, two = (100 * np.mean(np.array(off) < k) for k in (1, 2))
+    return (
+        f"{np.median(angles):.0f} degrees of 90, depth over the true one {np.median(ratios):.2f}, within one "
+        f"and two stated errors {one:.0f} and {two:.0f} % of {len(off)}"
+    )
 
 
 def calibrations(name: str, sessions: dict[str, tuple[Session, list[str]]]) -> Iterator[tuple[str, str]]:
@@ -221,10 +234,7 @@ def main() -> None:
         for label, columns in calibrations(name, sessions):
             print(f"{name:14} {label:12}{columns}", flush=True)
     base = Calibration.load(KINDS / f"{EDGE.kind}.yaml")
-    assert base.slopes is not None
-    print(
-        f"edge of a cube, default: {edge_angle(base.slopes, args.data, *sessions['edge']):.0f} degrees of 90"
-    )
+    print(f"edge of a cube, default: {judge_edge(base, args.data, *sessions['edge'])}")
 
 
 if __name__ == "__main__":

@@ -9,9 +9,12 @@ from pydantic import Field
 
 from tactflow.drawing.results import Annotator
 from tactflow.engine.contract import Stage, StageParams
-from tactflow.ports import ContactMask, Image, Picture, Valid
+from tactflow.ports import ContactMask, Image, Normals, Picture, Valid
 from tactflow.vision.flow import DisplacementField
 from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
+
+_SHOWN = {"depth": ("depth", "scale"), "normals": ("normals",)}
+"""View -> the inputs that it alone shows."""
 
 
 class Visualize(Stage):
@@ -26,10 +29,10 @@ class Visualize(Stage):
         arrow_scale: float = Field(
             3.0, ge=0, le=1000, description="arrow length over displacement, 1; 1 ends it where the marker is"
         )
-        view: Literal["frame", "contact", "depth"] = Field(
+        view: Literal["frame", "contact", "depth", "normals"] = Field(
             "frame",
             description="contact: only the contact and the arrows inside it, the rest black. depth: the "
-            "height map instead of the picture; needs a calibration",
+            "height map instead of the picture; normals: those of the stage normals; need a calibration",
         )
         deepest: float = Field(1.0, gt=0, le=100, description="view depth: height of the lightest colour, mm")
         ellipse: bool = Field(False, description="whether the fitted ellipse is drawn")
@@ -40,14 +43,13 @@ class Visualize(Stage):
         )
 
         def needed_inputs(self) -> Mapping[str, str]:
-            """View depth shows heights."""
-            return {"depth": "view", "scale": "view"} if self.view == "depth" else {}
+            """Views of the surface show heights or normals."""
+            return dict.fromkeys(_SHOWN.get(self.view, ()), "view")
 
         def unused_inputs(self) -> set[str]:
             """Inputs that are not shown need not be computed."""
-            return ({"depth", "scale"} if self.view != "depth" else set()) | (
-                set() if self.field else {"field"}
-            )
+            shown = {*_SHOWN.get(self.view, ()), *(["field"] if self.field else [])}
+            return {"depth", "scale", "normals", "field"} - shown
 
     def __init__(self, params: Params) -> None:
         self._annotator = Annotator(
@@ -70,6 +72,7 @@ class Visualize(Stage):
         field: DisplacementField | None = None,
         depth: Depth | None = None,
         scale: Scale | None = None,
+        normals: Normals | None = None,
     ) -> Picture:
         """A new picture; what is absent is not drawn."""
         return self._annotator(
@@ -82,4 +85,5 @@ class Visualize(Stage):
             field=field,
             depth=depth,
             scale=scale,
+            normals=normals,
         )

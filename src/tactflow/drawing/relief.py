@@ -53,6 +53,16 @@ def relief(heights: NDArray[np.float32], scale: Scale, deepest: float) -> NDArra
     return picture
 
 
+def normals_picture(normals: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8, BGR: unit normals (H, W, 3) as a normal map, x as red, y upwards as green, z as blue.
+
+    >>> normals_picture(np.array([[[0, 0, 1], [1, 0, 0]]], np.float32)).tolist()
+    [[[255, 128, 128], [128, 128, 255]]]
+    """
+    upwards = normals[..., ::-1] * np.array([1, -1, 1], np.float32)
+    return np.asarray(np.rint(127.5 + 127.5 * upwards), np.uint8)
+
+
 def colour_bar(width: int, height: int) -> NDArray[np.uint8]:
     """(height, width, 3) uint8: the colours of `relief`, from 0 on the left to the deepest on the right.
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.drawing.lettering import Lettering
-from tactflow.drawing.relief import colour_bar, relief
+from tactflow.drawing.relief import colour_bar, normals_picture, relief
 from tactflow.vision.flow import DisplacementField, inside_mask
 from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
 
-View = Literal["frame", "contact", "depth"]
+View = Literal["frame", "contact", "depth", "normals"]
 Colour = tuple[int, int, int]
 
 YELLOW: Final[Colour] = (0, 255, 255)
@@ -147,12 +147,14 @@ class Annotator:
         field: DisplacementField | None = None,
         depth: Depth | None = None,
         scale: Scale | None = None,
+        normals: NDArray[np.float32] | None = None,
     ) -> NDArray[np.uint8]:
         """A new picture of the size of `image`, with whatever is given drawn on it.
 
         image : (H, W, 3) uint8 BGR. contact_mask : (H, W) uint8, needed by the "contact" view alone.
         valid : (H, W) uint8, 0 where no gel is, which is shown darker. depth, scale : for the "depth" view;
-        without the first the gel lies flat, without both there is no calibration.
+        without the first the gel lies flat, without both there is no calibration. normals : (H, W, 3)
+        float32, for the "normals" view; without them the gel lies flat.
         Returns (H, W, 3) uint8; the inputs stay as they are. Raises ValueError on another shape.
         """
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
@@ -163,6 +165,9 @@ class Annotator:
                 markers = self._inside(markers, contact_mask)
         elif self._view == "depth":
             picture = self._heights(image, depth, scale)
+        elif self._view == "normals":
+            flat = np.zeros(image.shape, np.float32) + np.array([0, 0, 1], np.float32)
+            picture = normals_picture(flat if normals is None else normals)
         else:
             picture = (image if valid is None else dimmed(image, valid)).copy()
         unit = max(1.0, min(image.shape[:2]) / _UNIT_SIDE)

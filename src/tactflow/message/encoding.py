@@ -9,6 +9,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus, Scale
 
@@ -43,6 +44,8 @@ def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
         "markers": None if markers is None else _markers(markers, detail),
         "skipped": {port: reason for port, reason in result.skipped.items() if port in _EXPLAINED},
     }
+    if contact is not None and result.normals is not None and result.contact_mask is not None:
+        message["contact"]["normal"] = _mean_normal(result.normals[result.contact_mask > 0])
     if scale is not None:
         message["scale"] = {"mm_per_px": (scale.x, scale.y), "origin": scale.origin}
     if result.slip is not None:
@@ -76,6 +79,13 @@ def _contact(contact: Contact, scale: Scale | None, depth: Depth | None, detail:
         if detail:
             message |= {"depth_mm_stderr": depth.greatest_stderr, "volume_mm3_stderr": depth.volume_stderr}
     return message
+
+
+def _mean_normal(normals: NDArray[np.float32]) -> list[float] | None:
+    """Unit vector along the sum of normals (n, 3); None where there are none."""
+    total = normals.sum(axis=0, dtype=np.float64)
+    length = float(np.linalg.norm(total))
+    return (total / length).tolist() if length else None
 
 
 def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:

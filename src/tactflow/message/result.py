@@ -16,7 +16,7 @@ import orjson
 from tactflow.engine.frame import NO_PICTURE, Frame, Tick
 from tactflow.message.decoding import decode_values
 from tactflow.message.encoding import SCHEMA, encode
-from tactflow.ports import ContactMask, Image
+from tactflow.ports import ContactMask, Image, Normals
 from tactflow.vision.types import Contact, Depth, Features, Flow, Force, Markers, Scale, Slip
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ class Result(Tick):
     contact_mask : (H, W) uint8, 255 in contact.
     scale, depth, force : millimetres per pixel, how far the gel is pushed in, and by which force; only with a
         calibration that knows it.
-    field, slip : displacement between the dots, and whether the contact slips; only where a stage of that
-        name stands in the pipeline.
+    field, slip, normals : displacement between the dots, whether the contact slips, and the normals of the
+        gel's surface; only where a stage of that name stands in the pipeline.
     features : of a stage `network` that gives some.
 
     >>> import tactflow
@@ -55,6 +55,7 @@ class Result(Tick):
     contact_mask: ContactMask | None
     scale: Scale | None
     depth: Depth | None
+    normals: Normals | None
     field: DisplacementField | None
     slip: Slip | None
     force: Force | None

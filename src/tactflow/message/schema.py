@@ -58,6 +58,11 @@ class _ContactModel(_Strict):
     area_mm2_stderr: _NotNegative | None = Field(
         None, description="what the scale's error does to area_mm2, mm^2 (calibrated, detail)"
     )
+    normal: tuple[_Finite, _Finite, _Finite] | None = Field(
+        None,
+        description="mean unit normal of the gel's surface in the contact, out of the gel: x right, y down "
+        "(calibrated, only with the stage normals)",
+    )
     depth_mm: _NotNegative | None = Field(
         None, description="how far the surface has been pushed in where it is deepest, mm (calibrated)"
     )

@@ -15,7 +15,7 @@ import numpy as np
 
 from tactflow.vision.arrays import Floats32
 from tactflow.vision.depth.slopes import Bytes, SlopeModel, coordinates
-from tactflow.vision.depth.surroundings import CELL, Resting, Surroundings, Window, resting, surroundings
+from tactflow.vision.depth.surroundings import CELL, Resting, Window, resting, surroundings
 from tactflow.vision.types import Depth, Scale
 
 DIM: Final = 20.0
@@ -120,14 +120,7 @@ class Surface:
         gradients : (H, W, 2), `tactflow.ports.Gradients`, in place of those by the model; then no errors are
         known.
         """
-        at_rest = rest.around(image, mask)
-        around = surroundings(mask, rest.window, at_rest.margin)
-        window = around.window
-        if gradients is None:
-            slope, steep = self._slopes(image, rest, around, at_rest.light)
-        else:
-            # The model's slopes fall where the gel is pushed in.
-            slope, steep = -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32), 0.0
+        slope, steep, window = self._slopes(image, rest, mask, gradients)
         low = self._integrated(slope, window, rest.window)
         heights = np.zeros(mask.shape, np.float32)
         size = (2 * window.width, 2 * window.height)
@@ -145,22 +138,43 @@ class Surface:
 
     def heights(self, image: Bytes, rest: Rest, mask: Bytes) -> Floats32:
         """(h, w) float32: how far the gel is pushed in, mm >= 0, at half resolution; see `depth`."""
-        at_rest = rest.around(image, mask)
-        around = surroundings(mask, rest.window, at_rest.margin)
-        slope, _ = self._slopes(image, rest, around, at_rest.light)
+        slope, _, window = self._slopes(image, rest, mask)
         whole = np.zeros((rest.window.height, rest.window.width), np.float32)
-        whole[around.window.part] = self._integrated(slope, around.window, rest.window)
+        whole[window.part] = self._integrated(slope, window, rest.window)
         return whole
 
+    def normals(self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None) -> Floats32:
+        """(H, W, 3) float32: unit normals of the gel's surface, out of the gel; see `depth`.
+
+        x right, y down, z towards the object: (0, 0, 1) where the gel is at rest. They point to the middle of
+        a ball that is pressed in.
+        """
+        slope, _, window = self._slopes(image, rest, mask, gradients)
+        normals = np.zeros((*mask.shape, 3), np.float32)
+        normals[..., 2] = 1
+        size = (2 * window.width, 2 * window.height)
+        part = normals[window.whole]
+        for axis in (0, 1):
+            part[..., axis] = -cv2.resize(slope[axis], size, interpolation=cv2.INTER_LINEAR)
+        part /= np.sqrt(np.sum(part * part, axis=2, keepdims=True))
+        return normals
+
     def _slopes(
-        self, image: Bytes, rest: Rest, around: Surroundings, light: Floats32
-    ) -> tuple[Floats32, float]:
-        """(2, h, w) float32, and the part of all slope that is steeper than the ball has shown, 0 to 1."""
-        change = colour_change(image, rest, around.window, light)
+        self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None
+    ) -> tuple[Floats32, float, Window]:
+        """(2, h, w) float32, the part of all slope that is steeper than the ball has shown, the window."""
+        at_rest = rest.around(image, mask)
+        around = surroundings(mask, rest.window, at_rest.margin)
+        window = around.window
+        if gradients is not None:
+            # The model's slopes fall where the gel is pushed in.
+            return -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32), 0.0, window
+        change = colour_change(image, rest, window, at_rest.light)
         assert self._model is not None, "without a model, gradients are given"
-        rows, columns = around.window.part
+        rows, columns = window.part
         slope = self._model.slopes(change, rest.x[columns], rest.y[rows], around.near)
-        return slope, 0.0 if self._errors is None else _steep_part(slope, self._errors.steepest)
+        steep = 0.0 if self._errors is None else _steep_part(slope, self._errors.steepest)
+        return slope, steep, window
 
     def _integrated(self, slope: Floats32, window: Window, whole: Window) -> Floats32:
         # Two processed pixels a step. Slopes rise towards the camera, where the gel is pushed to.

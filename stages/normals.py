@@ -1,0 +1,44 @@
+"""Stage `normals`: which way the gel's surface looks, pixel by pixel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tactflow.calibration.file import Calibration
+from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.frame import Absent
+from tactflow.ports import ContactMask, Gradients, Normals, Unmarked, Untouched
+from tactflow.vision.depth.surface import Rest, Surface
+from tactflow.vision.types import Scale
+
+
+class SurfaceNormals(Stage):
+    """Unit normals of the gel's surface, from its colour or from the gradients of a network, as in `depth`.
+
+    Nothing without a calibration, or with one that knows the scale alone and no network.
+    """
+
+    memory = "pure"
+
+    def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
+        """Prepare. calibration : the file."""
+        super().__init__(params)
+        self._slopes = None if calibration is None else Calibration.load(calibration).slopes
+        self._rest: tuple[Untouched, Rest] | None = None
+
+    def process(
+        self,
+        unmarked: Unmarked,
+        untouched: Untouched,
+        contact_mask: ContactMask,
+        scale: Scale,
+        gradients: Gradients | None = None,
+    ) -> Normals | Absent:
+        """The normals of the contact and its surroundings; (0, 0, 1) elsewhere."""
+        if self._slopes is None and gradients is None:
+            return Absent("no_calibration")
+        if not contact_mask.any():
+            return Absent("no_contact")
+        if self._rest is None or self._rest[0] is not untouched:
+            self._rest = untouched, Rest(untouched)
+        return Surface(self._slopes, scale).normals(unmarked, self._rest[1], contact_mask, gradients)
