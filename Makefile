@@ -10,6 +10,8 @@
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
 # make lerobot-env  LeRobot in an environment of its own (650 MB), for the tests of its camera
 # make lerobot-datasets  the same with PyTorch (up to 8 GB), for the tests of its datasets
+# make peers        packages to compare with, in environments of their own (3 GB; with CUDA 12)
+# make peers-page   measures them beside tactflow and writes docs/peers.md; DATA is a folder of recordings
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 
 VENV := .venv
@@ -18,12 +20,14 @@ TOOLS := $(VENV)-tools
 ROS := $(VENV)-ros
 LEROBOT := $(VENV)-lerobot
 DOCS := $(VENV)-docs
+PEERS := $(VENV)-peers
 PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak load fuzz audit lock lint types docs packages ros-env lerobot-env lerobot-datasets system-deps clean
+.PHONY: run test soak load fuzz audit lock lint types docs packages ros-env lerobot-env lerobot-datasets peers peers-page \
+	system-deps clean
 
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime
@@ -110,6 +114,31 @@ lerobot-datasets: $(LEROBOT)/.installed
 		"torch<2.11" "torchvision<0.26" "accelerate<2" "datasets<5" "huggingface-hub<0.36" "av<16" \
 		pandas pyarrow jsonlines einops
 
+PIN_gs_sdk := gs_sdk==2.0.0
+PIN_opentouch-interface := opentouch-interface==0.2.0 torch==2.13.0
+PIN_xensesdk := xensesdk==2.0.1
+OTHER_PEERS := $(patsubst %,$(PEERS)-others/%/.installed,gs_sdk opentouch-interface xensesdk)
+
+peers: $(PEERS)/.installed $(OTHER_PEERS)
+
+DATA := ../shared/data
+peers-page: peers
+	$(PEERS)/bin/python -W ignore -m benchmarks.peers --data $(DATA) --page docs/peers.md
+
+# For CPUs alone, as for lerobot-datasets. pytouch's requirements have no wheels here; it imports an old torchvision.
+$(PEERS)/.installed: benchmarks/peers/requirements.txt pyproject.toml
+	python3 -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		--requirement benchmarks/peers/requirements.txt
+	$(PEERS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+		--no-deps --no-build-isolation pytouch==0.4.2 torchvision==0.15.2 --editable .
+	@touch $@
+
+$(PEERS)-others/%/.installed:
+	python3 -m venv $(@D)
+	$(@D)/bin/python -m pip --quiet --disable-pip-version-check --no-input install $(PIN_$*)
+	@touch $@
+
 $(TOOLS)/.installed:
 	python3 -m venv $(TOOLS)
 	$(TOOLS)/bin/python -m pip --quiet --disable-pip-version-check install \
@@ -147,4 +176,4 @@ system-deps:
 	done; dpkg --status $(SYSTEM_DEPS) >/dev/null
 
 clean:
-	rm -rf $(VENV) $(TOOLS) $(ROS) $(LEROBOT) $(DOCS) build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(TOOLS) $(ROS) $(LEROBOT) $(DOCS) $(PEERS) $(PEERS)-others build dist out *.egg-info src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -39,6 +39,7 @@ guide
 gallery/index
 api
 accuracy
+peers
 changes
 ```
 """

@@ -52,7 +52,7 @@ html_theme_options = {
     "footer_start": ["sphinx-version"],
     "footer_end": ["theme-version"],
 }
-html_sidebars = {"accuracy": [], "changes": []}
+html_sidebars = {"accuracy": [], "peers": [], "changes": []}
 
 
 def itemize(_app: Any, _what: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:

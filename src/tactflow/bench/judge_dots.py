@@ -103,11 +103,15 @@ def _from_border(points: Floats, size: tuple[int, int]) -> Floats:
 
 
 def judge(
-    labels: Sequence[FrameLabel], data: Path, finder: Finder = find, report: Callable[[str], None] = say
+    labels: Sequence[FrameLabel],
+    data: Path,
+    finder: Finder = find,
+    report: Callable[[str], None] = say,
+    kinds: Iterable[str] | None = None,
 ) -> Iterator[FoundDots]:
     """Look for dots in each labelled frame, as it is and changed; in frames without dots only as they are.
 
-    report : called with the recordings that are not there.
+    report : called with the recordings that are not there. kinds : keys of `CHANGES`; None for all.
 
     Raises
     ------
@@ -124,8 +128,8 @@ def judge(
         dots = _points(label.dots)
         again = second.get((label.recording, label.frame))
         sure, uncertain = (dots, dots[:0]) if again is None else _agreed(dots, _points(again))
-        for kind, change in CHANGES.items() if len(dots) else ():
-            changed, matrix = change(picture)
+        for kind in (CHANGES if kinds is None else kinds) if len(dots) else ():
+            changed, matrix = CHANGES[kind](picture)
             required, possible = (points @ matrix[:, :2].T + matrix[:, 2] for points in (sure, uncertain))
             size = (changed.shape[1], changed.shape[0])
             yield replace(compare(label.lab, finder(changed), required, possible, size), kind=kind)
