@@ -204,11 +204,10 @@ def train(planes: Half, truths: Bytes, unseen: tuple[Half, Bytes], steps: int) -
 
 
 def export(weights: dict[str, Any], path: Path) -> None:
-    """Write the network as ONNX; the sides of its input are free."""
+    """Write the network as ONNX. OpenCV takes input of other sides, too; version 4 reads no free sides."""
     network = Network()
     network.load_state_dict(weights)
     network.eval()
-    free = {"planes": {2: "height", 3: "width"}}
     torch.onnx.export(
         network,
         (torch.zeros(1, PLANES, CELLS, CELLS),),
@@ -216,7 +215,6 @@ def export(weights: dict[str, Any], path: Path) -> None:
         opset_version=13,
         dynamo=False,
         input_names=["planes"],
-        dynamic_axes=free,
     )
 
 
