@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from benchmarks.depth import SETS, chosen, radii_of, read, scale_of
 from benchmarks.peers.common import Numbers, Picture
 from tactflow.bench.timing import BLOCK
-from tactflow.calibration.photometric import INNER, fit_photometry
+from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press, Session
+from tactflow.calibration.samples import INNER
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Scale
 
@@ -173,7 +174,7 @@ def on_ball(
 def errors_on(press: Press, answer: Answer, scale: Scale, radius: float) -> tuple[float, float]:
     """Mean angle of the normals, degrees, and relative error of how far the ball falls to the rim.
 
-    As in `tactflow.calibration.photometric`: the middle of the ball is the median of where the pixels say
+    As in `tactflow.calibration.samples`: the middle of the ball is the median of where the pixels say
     that it is, by the same answer.
     """
     slopes, depth = answer

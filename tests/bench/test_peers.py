@@ -3,11 +3,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks.peers import contact, dots, page
+from benchmarks.peers import contact, depth, dots, page
+from benchmarks.peers.__main__ import CONTACTS, SCENES, available, cases
 from benchmarks.peers.common import another, lines, recording, search
 from tactflow.bench.scenes import Case
+from tactflow.calibration.presses import Press
+from tactflow.sim import open_scene
+from tactflow.vision.types import Scale
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -66,3 +71,34 @@ def test_lines_of_an_adapter_are_those_of_code() -> None:
 
 def test_another_recording_is_half_as_long_and_of_another_seed() -> None:
     assert another(Case("jumps", 40, "worn=0.05")) == Case("jumps", 20, "worn=0.05&seed=11")
+
+
+def test_a_perfect_answer_to_a_ball_has_no_error_wherever_its_outline_says_that_it_is() -> None:
+    scale, radius, (x, y) = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0)), 3.0, np.mgrid[:80, :100][::-1]
+    dx, dy = (x - 52.0) * scale.x, (y - 41.0) * scale.y
+    mask = np.where(np.hypot(dx, dy) < 2.0, 255, 0).astype(np.uint8)
+    picture, hidden = np.zeros((80, 100, 3), np.uint8), np.zeros((80, 100), np.bool_)
+    press = Press(1, picture, mask, hidden, (50.0, 40.0), 20.0)
+    height = np.sqrt(np.maximum(radius**2 - dx**2 - dy**2, 1.0))
+    slopes = np.dstack([-dx, -dy]) / height[..., None]
+    angle, cap = depth.errors_on(press, (slopes, height), scale, radius)
+    assert angle < 1e-4
+    assert abs(cap) < 1e-9
+    flatter = depth.errors_on(press, (0.5 * slopes, 0.5 * height), scale, radius)
+    assert flatter[0] > 5
+    assert flatter[1] == pytest.approx(-0.5, abs=0.01)
+
+
+def test_slopes_are_integrated_to_the_depth_that_has_them() -> None:
+    y, x = np.mgrid[:60, :80]
+    height = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 72.0)
+    slopes = np.dstack([-(x - 40) / 36.0 * height / 0.2, -(y - 30) / 36.0 * height / 0.1])
+    found = depth.integrate(slopes, Scale(0.2, 0.1, (0.0, 0.0), (0.0, 0.0)))
+    assert np.abs(found - height).max() < 0.02
+
+
+def test_the_scenes_of_the_command_exist_and_tactflow_is_always_measured() -> None:
+    for case in cases(f"{SCENES} {CONTACTS}", 4):
+        assert len(open_scene(f"{case.name}?frames=4&{case.query}".rstrip("&"))) == 4
+    assert "tactflow" in available(dots.METHODS)
+    assert {"classic script", "OpenCV difference"} <= set(available(contact.PEERS))
