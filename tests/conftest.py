@@ -33,6 +33,7 @@ MOST_WORKERS = 4
 LONG_FILES = (
     "bench/test_run.py",
     "browser/test_view_page.py",
+    "browser/test_start.py",
     "fleet/test_fleet.py",
     "test_main_job.py",
     "test_install.py",

@@ -96,6 +96,7 @@ class Start:
         )
         self.errors: list[str] = []
         self._told = threading.Condition()
+        self._heard = 0
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
 
@@ -107,10 +108,14 @@ class Start:
                 self._told.notify_all()
 
     def said(self, pattern: str) -> str:
-        """Wait for a line that has a pattern; returns its first group, or all of it."""
+        """Wait for a further line that has a pattern; returns its first group, or all of it."""
 
         def found() -> re.Match[str] | None:
-            return next((match for line in self.errors if (match := re.search(pattern, line))), None)
+            while self._heard < len(self.errors):
+                self._heard += 1
+                if match := re.search(pattern, self.errors[self._heard - 1]):
+                    return match
+            return None
 
         with self._told:
             match = self._told.wait_for(found, PATIENCE / 1000)
@@ -202,7 +207,7 @@ def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
     choose(shown, "Another one, or unknown")
     asked(shown, "untouched")
     choose(shown, "Nothing touches the gel")
-    asked(shown, "which edge")
+    asked(shown, "points away")
     shoot(shown, f"{scene}-2-edge")
     choose(shown, "left edge")
     asked(shown, "several places")
@@ -223,3 +228,55 @@ def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
     assert pipeline["stages"]["capture"]["source"] == gel.address
     assert pipeline["stages"]["preprocess"]["rotate"] == 90
     assert ("tracker" in pipeline["stages"]) == (SENSORS[scene] == "default")
+
+
+def test_a_touch_at_rest_is_noticed_and_the_terminal_answers_as_the_page_does(
+    camera: Callable[[str], Camera], start: Callable[..., Start], tmp_path: Path
+) -> None:
+    gel = camera("press")
+    running = start(gel.address, "--no-run")
+    running.said("Which sensor")
+    running.type("1")
+    running.said("Leave the gel untouched")
+    gel.press()
+    running.type("")
+    running.said("The picture changed by [0-9]+ %, although nothing should touch the gel")
+    gel.pressed.clear()
+    until(lambda: gel.count == 0)
+    running.type("9")
+    running.said("required a number from 1 to 1; Enter is 1")
+    running.type("1")
+    # Frames of the press may still be under way.
+    while running.said("(although nothing should touch|points away)") != "points away":
+        running.type("1")
+    running.type("2")
+    running.said("several places")
+    gel.press()
+    running.type("1")
+    running.said("Proposed: default: finds 100 % of the presses, 0 % false contacts at rest, 80 dots")
+    running.said("2 Look again")
+    running.type("2")
+    gel.pressed.clear()
+    running.said("Leave the gel untouched")
+    running.process.send_signal(signal.SIGINT)
+    assert running.process.wait(PATIENCE / 1000) == 130
+    running.said("stopped; nothing was written")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_script_sets_up_a_live_camera_unless_it_is_touched_at_rest(
+    camera: Callable[[str], Camera], start: Callable[..., Start], tmp_path: Path
+) -> None:
+    gel = camera("unmarked")
+    gel.pressed.set()
+    touched = start(gel.address, "--yes", "--no-run")
+    assert touched.process.wait(PATIENCE / 1000) == 3
+    touched.said("although nothing should touch the gel")
+    assert list(tmp_path.iterdir()) == []
+    gel.pressed.clear()
+    running = start(gel.address, "--yes", "--no-run")
+    running.said("Press the gel in several places")
+    gel.pressed.set()
+    assert running.process.wait(PATIENCE / 1000) == 0
+    running.said("Proposed: markerless: finds 100 % of the presses")
+    assert (tmp_path / "pipeline.yaml").exists()

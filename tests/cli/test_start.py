@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import tactflow
 from tactflow.cli import start
 from tactflow.cli.main import main, make_parser
 from tactflow.engine.errors import SourceError
+from tactflow.view import questions
 from tests.clock import PATIENCE
 
 DATA = Path(os.environ.get("TACTFLOW_RECORDINGS", "recordings"))
@@ -112,6 +114,66 @@ def test_ctrl_c_before_the_end_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     process.stdin.close()
     process.stderr.close()
+
+
+class Scripted:
+    """Answers in place of a person."""
+
+    unattended, url, reader = False, None, None
+
+    def __init__(self, *answers: str) -> None:
+        self.answers = list(answers)
+        self.asked: list[str] = []
+
+    def ask(self, text: str, choices: Mapping[str, str], **_: object) -> str:
+        self.asked.append(text)
+        answer = self.answers.pop(0)
+        assert answer in choices
+        return answer
+
+    def begin(self, *_: object, **__: object) -> None: ...
+
+    def show(self, _: object) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cameras = [str(tmp_path / "busy.avi"), "sim:idle?frames=30", "sim:halo?frames=60"]
+    answers = Scripted("no", "yes", "digit", "90", "write")
+    monkeypatch.setattr(start, "_cameras", lambda _: cameras)
+    monkeypatch.setattr(start, "Questions", lambda *_: answers)
+    out = tmp_path / "made.yaml"
+    assert main(["start", "--no-run", "--out", str(out)]) == 0
+    assert [text for text in answers.asked if "Is this" in text] == [
+        f"Is this the sensor? {source}" for source in cameras[1:]
+    ]
+    made = yaml.safe_load(out.read_text())
+    assert made["stages"]["capture"]["source"] == cameras[2]
+    assert made["stages"]["preprocess"]["rotate"] == 90
+    assert made["sensor"] == "digit"
+
+
+def test_who_quits_gets_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(start, "Questions", lambda *_: Scripted("unknown", "0", "quit"))
+    out = tmp_path / "made.yaml"
+    assert main(["start", "sim:press?frames=60", "--out", str(out)]) == 130
+    assert not out.exists()
+
+
+def test_without_a_page_and_a_terminal_nobody_can_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("not permitted")
+
+    monkeypatch.setattr(questions, "bind", refuse)
+    assert main(["start", "sim:press?frames=60", "--out", str(tmp_path / "made.yaml")]) == 2
+    err = capsys.readouterr().err
+    assert "no page, because 127.0.0.1:8780 cannot be served (not permitted); answer here" in err
+    assert "nobody can answer" in err
 
 
 @pytest.mark.parametrize(("recording", "dots"), [("gels/digit_fots", False), ("gels/gelslim_ball", True)])

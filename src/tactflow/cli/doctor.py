@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
         facts = {"source": seen.source, "frames": seen.frames, "verdict": verdict}
         show_json({**facts, "checks": findings})
     else:
-        show([title, *(line for finding in findings for line in describe_finding(finding)), summary])
+        show([title, *(line for finding in findings for line in _lines(finding)), summary])
     return StageError.exit_code if verdict == "fault" else 0
 
 
@@ -139,7 +139,7 @@ def _rate(rate: float | None) -> str:
     return "-" if rate is None else f"{rate:.3g}/s"
 
 
-def describe_finding(finding: Finding) -> Iterator[str]:
+def _lines(finding: Finding) -> Iterator[str]:
     """A finding: one line, and below it what a fault does and what to change."""
     yield f"  {SIGNS[finding.verdict]:<6} {finding.name:<12} {finding.says}"
     for title, text in (("effect", finding.effect), ("change", finding.advice)):

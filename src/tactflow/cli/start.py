@@ -7,27 +7,25 @@ import math
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from tactflow.cli.cameras import NO_CAMERA
-from tactflow.cli.doctor import describe_finding
 from tactflow.cli.options import add_overwrite, refuse_output, writing
 from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.config.shipped import described_pipelines, find_pipeline
+from tactflow.doctor import Observation, examine
+from tactflow.doctor.observation import watch
 from tactflow.engine.errors import ConfigError, SourceError, StageError
-from tactflow.sources import FrameReader, open_source
+from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.cameras import list_cameras
 from tactflow.system.files import completed
 from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
-
-if TYPE_CHECKING:
-    from tactflow.doctor import Observation
-    from tactflow.ports import Image
-    from tactflow.tune.propose import Attempt, Seen
-    from tactflow.view.questions import Questions
+from tactflow.tune.propose import FEWEST_FOUND, Attempt, Kept, Seen, distinct_pipelines, divide, propose
+from tactflow.tune.recording import CHANGE
+from tactflow.tune.report import changed_pipeline
+from tactflow.view.questions import Questions
 
 SETTLE_SECONDS: Final = 3.0
 """With --yes, time for exposure and white balance before the gel is looked at, s: `settle` of capture."""
@@ -68,14 +66,9 @@ def run(args: argparse.Namespace) -> int:
         With --yes: no pipeline finds the presses, or the gel was touched while it was looked at untouched.
     """
     refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
-    # Imported here: the server and the stages take their time.
-    from tactflow.view.questions import Questions
-
     questions = Questions(None if args.yes else args.port, say)
     try:
         with ending_handled(interrupt), notes("ERROR"), closing(questions):
-            if questions.url is not None:
-                say(f"answer here, or on the page: {questions.url}")
             source, reader = _open(args, questions)
             with closing(reader):
                 _set_up(args, source, reader, questions)
@@ -87,12 +80,9 @@ def run(args: argparse.Namespace) -> int:
         return 0
     from tactflow.cli.main import make_parser
 
-    words = [
-        "run",
-        str(args.out),
-        *([] if questions.url is None else ["--set", f"sinks.view.port={questions.port}"]),
-    ]
-    live = make_parser("run").parse_args(words)
+    # The page stays at its address.
+    port = [] if questions.url is None else ["--set", f"sinks.view.port={questions.port}"]
+    live = make_parser("run").parse_args(["run", str(args.out), *port])
     return int(live.run(live))
 
 
@@ -111,8 +101,9 @@ def _open(args: argparse.Namespace, questions: Questions) -> tuple[str, FrameRea
             except SourceError as error:
                 problems.append(str(error))
                 continue
+            questions.reader = reader if reader.live else None
             choices = {"yes": "Yes, this is the sensor", "no": "No, show the next camera"}
-            if len(sources) == 1 or questions.ask(f"Is this the sensor? {source}", choices, reader) == "yes":
+            if len(sources) == 1 or questions.ask(f"Is this the sensor? {source}", choices) == "yes":
                 return source, reader
             reader.close()
     raise SourceError("\n".join(problems))
@@ -131,109 +122,95 @@ def _cameras(dev: Path) -> list[str]:
 
 def _set_up(args: argparse.Namespace, source: str, reader: FrameReader, questions: Questions) -> None:
     """Ask and propose until a pipeline is accepted, and write it. Raises KeyboardInterrupt if none is."""
-    from tactflow.doctor import examine
-    from tactflow.tune.propose import distinct_pipelines, propose
-
     kinds = {name for names in distinct_pipelines() for name in names} - {"default", "markerless"}
     named = {name: what for name, what in described_pipelines().items() if name in kinds}
-    kind = questions.ask(
-        "Which sensor is this?", {"unknown": "Another one, or unknown"} | named, _live(reader)
-    )
+    kind = questions.ask("Which sensor is this?", {"unknown": "Another one, or unknown"} | named)
+    edges = {value: f"{edge} edge" for value, edge in EDGES.items()}
     answer = "again"
     while answer == "again":
-        observation, seen, rotate = (_look if reader.live else _read)(source, reader, questions)
+        kept = Kept()
+        observation = Observation(source, reader.description, reader.live)
+        if reader.live:
+            rest, kept = _untouched(source, reader, questions)
+            at_rest = len(kept)
+        else:
+            _watch(reader, RECORDED_SECONDS, observation, questions, kept)
+            seen = divide(kept.frames)
+            questions.show(seen.frames[seen.strongest])
+        text = "Where is the end of the gel that points away from the cable? Press it, and choose its edge."
+        rotate = int(questions.ask(text, edges, edges=True))
+        if reader.live:
+            _press(reader, observation, questions, kept)
+            observation.pairs[:0] = rest.pairs
+            seen = divide(kept.frames, at_rest)
         questions.begin("Trying pipelines on these pictures ...")
         dots = observation.dots
-        attempts = propose(seen, None if dots is None else dots.pitch, int(rotate), kind, say)
-        faults = [finding for finding in examine(observation) if finding.verdict in ("warning", "fault")]
-        remarks = [line for finding in faults for line in describe_finding(finding)]
-        answer = _decide(args, attempts[0], seen, remarks, reader, questions)
+        attempts = propose(seen, None if dots is None else dots.pitch, rotate, kind, say)
+        faults = [found for found in examine(observation) if found.verdict in ("warning", "fault")]
+        remarks = [f"{fault.name}: {fault.says}; {fault.effect}. Change: {fault.advice}" for fault in faults]
+        answer = _decide(args, attempts[0], seen, remarks, questions)
     if answer == "quit":
         raise KeyboardInterrupt
     _write(args.out, source, attempts, remarks)
 
 
-def _live(reader: FrameReader) -> FrameReader | None:
-    return reader if reader.live else None
+def _watch(
+    reader: FrameReader,
+    seconds: float,
+    observation: Observation,
+    questions: Questions,
+    kept: Kept,
+    *,
+    at_rest: bool = False,
+    until: str = "",
+) -> None:
+    """Observe, keep and show frames, for some seconds or to an answer. Raises SourceError without frames."""
 
+    def show(arrival: Arrival) -> bool:
+        questions.show(arrival.image)
+        kept.add(arrival.image, at_rest=at_rest)
+        return not until or questions.poll() != until
 
-def _look(source: str, reader: FrameReader, questions: Questions) -> tuple[Observation, Seen, str]:
-    """Look at a live sensor: at rest, then pressed. Returns also the value of `rotate`."""
-    from tactflow.doctor.observation import Observation, watch
-    from tactflow.tune.propose import divide, frames_of
-    from tactflow.tune.recording import CHANGE
-
-    if questions.unattended:
-        watch(reader, SETTLE_SECONDS, Observation(source, "", True), lambda _: None)
-    again = "Leave the gel untouched."
-    while again:
-        questions.ask(again, {"untouched": "Nothing touches the gel"}, reader)
-        rest = Observation(source, reader.description, live=True)
-        questions.begin(f"Looking at the untouched gel for {REST_SECONDS:.0f} s ...")
-        watch(reader, REST_SECONDS, rest, lambda arrival: questions.show(arrival.image))
-        rest.check()
-        untouched = frames_of(rest)
-        change, again = divide(untouched, len(untouched)).restless, ""
-        if change >= CHANGE:
-            again = (
-                f"The picture changed by {100 * change:.0f} %, although nothing should touch the gel. Keep "
-                "away from it, and from its light, for a moment."
-            )
-            if questions.unattended:
-                raise StageError(again)
-    rotate = questions.ask(
-        "Press the end of the gel that points away from the cable. At which edge of the picture is it?",
-        {value: f"{edge} edge" for value, edge in EDGES.items()},
-        reader,
-        sides=True,
-    )
-    pressed = Observation(source, reader.description, live=True)
-    questions.begin("Press the gel in several places, and lift in between.", {"done": "Done"})
-
-    def goes_on(image: Image) -> bool:
-        questions.show(image)
-        return questions.unattended or questions.poll() is None
-
-    seconds = PRESS_SECONDS if questions.unattended else math.inf
-    watch(reader, seconds, pressed, lambda arrival: goes_on(arrival.image))
-    pressed.check()
-    both = replace(pressed, pairs=[*rest.pairs, *pressed.pairs])
-    return both, divide([*untouched, *frames_of(pressed)], len(untouched)), rotate
-
-
-def _read(source: str, reader: FrameReader, questions: Questions) -> tuple[Observation, Seen, str]:
-    """The same from a recording."""
-    from tactflow.doctor.observation import Observation, watch
-    from tactflow.tune.propose import divide, frames_of
-
-    observation = Observation(source, reader.description, live=False)
-    watch(reader, RECORDED_SECONDS, observation, lambda _: None)
+    watch(reader, seconds, observation, show)
     observation.check()
-    seen = divide(frames_of(observation))
-    if seen.reference:
-        say(f"frame {seen.reference} of those that were kept is taken for the untouched gel")
-    questions.show(seen.frames[seen.strongest])
-    rotate = questions.ask(
-        "Which edge of the picture is the end of the gel that points away from the cable?",
-        {value: f"{edge} edge" for value, edge in EDGES.items()},
-        sides=True,
-    )
-    return observation, seen, rotate
+
+
+def _untouched(source: str, reader: FrameReader, questions: Questions) -> tuple[Observation, Kept]:
+    """Look at the gel at rest. Raises StageError with --yes if it is not at rest."""
+    if questions.unattended:
+        _watch(reader, SETTLE_SECONDS, Observation(source, "", live=True), questions, Kept())
+    text = "Leave the gel untouched."
+    while True:
+        questions.ask(text, {"untouched": "Nothing touches the gel"})
+        questions.begin(f"Looking at the untouched gel for {REST_SECONDS:.0f} s ...")
+        rest, kept = Observation(source, reader.description, live=True), Kept()
+        _watch(reader, REST_SECONDS, rest, questions, kept, at_rest=True)
+        change = max(divide(kept.frames, len(kept)).changes)
+        if change < CHANGE:
+            return rest, kept
+        text = (
+            f"The picture changed by {100 * change:.0f} %, although nothing should touch the gel. Keep away "
+            "from it, and from its light, for a moment."
+        )
+        if questions.unattended:
+            raise StageError(text)
+
+
+def _press(reader: FrameReader, observation: Observation, questions: Questions, kept: Kept) -> None:
+    """Look at presses."""
+    questions.begin("Press the gel in several places, and lift in between.", {"done": "Done"})
+    if questions.unattended:
+        _watch(reader, PRESS_SECONDS, observation, questions, kept)
+    else:
+        _watch(reader, math.inf, observation, questions, kept, until="done")
 
 
 def _decide(
-    args: argparse.Namespace,
-    best: Attempt,
-    seen: Seen,
-    remarks: Sequence[str],
-    reader: FrameReader,
-    questions: Questions,
+    args: argparse.Namespace, best: Attempt, seen: Seen, remarks: Sequence[str], questions: Questions
 ) -> str:
     """Show the proposal; returns write, again or quit. Raises StageError with --yes if there is none."""
-    from tactflow.tune.propose import FEWEST_FOUND
-
     choices = {"write": f"Write {args.out}" + ("" if args.no_run else " and go on live")}
-    if reader.live:
+    if questions.reader is not None:
         choices["again"] = "Look again"
     choices["quit"] = "Quit"
     text = f"Proposed: {best}"
@@ -242,19 +219,17 @@ def _decide(
     elif best.failure or best.found < FEWEST_FOUND:
         del choices["write"]
         text = f"No pipeline finds the presses of this gel. The best is {best}"
-    if best.picture is not None:
-        questions.show(best.picture)
     if args.yes:
         if "write" not in choices:
             raise StageError("\n".join([text, *remarks]))
         say("\n".join([*remarks, text]))
-    return questions.ask(text, choices, notes=remarks)
+    if best.picture is not None:
+        questions.show(best.picture)
+    return questions.ask(text, choices, notes=remarks, still=True)
 
 
 def _write(out: Path, source: str, attempts: Sequence[Attempt], remarks: Sequence[str]) -> None:
     """Write the first pipeline, with what was measured as comments."""
-    from tactflow.tune.report import changed_pipeline
-
     file = find_pipeline(attempts[0].pipeline)
     title = f"Made by tactflow start for {shown_address(source)}, from {file.name}. Tried on its pictures:"
     comments = [printable(line) for line in (title, *(f"  {attempt}" for attempt in attempts), *remarks)]

@@ -7,6 +7,7 @@ rest, where every contact is false, and while the gel is pressed, where every fr
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -20,11 +21,10 @@ from numpy.typing import NDArray
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.doctor.checks import STEADY
-from tactflow.doctor.observation import Observation
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
 from tactflow.streaming import stream
-from tactflow.tune.recording import CHANGE, change_between
+from tactflow.tune.recording import CHANGE, MAX_USED, change_between
 from tactflow.tune.space import DOWNSAMPLE, MIN_PITCH, MIN_SIDE
 from tactflow.vision.change import Settling
 from tactflow.vision.types import MarkerStatus
@@ -36,6 +36,10 @@ LARGE: Final = 500
 PRESSED: Final = 0.5
 """Change of light, relative to the largest, from which a frame counts as pressed. Those between are left out,
 because whether they show a contact is a matter of definition."""
+FIRST: Final = 48
+"""Number of first frames that are kept: a second or two."""
+MEMORY: Final = 256_000_000
+"""Bytes of the frames that are kept around the strongest press, at most `MAX_USED` of them."""
 FEWEST_FOUND: Final = 0.5
 """Share of presses below which a pipeline does not find the contacts of a gel: no better than a coin."""
 GEOMETRY: Final = frozenset({"capture", "preprocess", "visualize"})
@@ -60,11 +64,6 @@ class Seen:
     def strongest(self) -> int:
         """Index of the frame that differs most from the reference."""
         return int(np.argmax(self.changes))
-
-    @property
-    def restless(self) -> float:
-        """Largest relative change of light at rest."""
-        return max(self.changes[index] for index in self.rest)
 
 
 @dataclass
@@ -107,11 +106,41 @@ class Attempt:
         return f"{self.pipeline}: {found}, {100 * self.false:.0f} % false contacts at rest, {dots}"
 
 
-def frames_of(observation: Observation) -> list[Image]:
-    """The kept frames of an observation, in order."""
-    images = {pair.number: pair.image for pair in observation.pairs}
-    images |= {pair.number + 1: pair.after for pair in observation.pairs if pair.after is not None}
-    return [images[number] for number in sorted(images)]
+class Kept:
+    """The first frames of a sensor, and those around the strongest press.
+
+    They are consecutive, because pipelines also judge by what changes from frame to frame: of every eighth
+    pair of frames with presses, `markerless` finds a contact in a tenth.
+    """
+
+    def __init__(self) -> None:
+        self._first: list[Image] = []
+        self._window: deque[tuple[float, Image]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._first) + len(self._window)
+
+    @property
+    def frames(self) -> list[Image]:
+        """(H, W, 3) uint8 each, in order."""
+        return [*self._first, *(image for _, image in self._window)]
+
+    def add(self, image: Image, *, at_rest: bool = False) -> None:
+        """Keep a frame, or let it go. at_rest : only as one of the first."""
+        if len(self._first) < FIRST:
+            self._first.append(image.copy())
+            return
+        if at_rest:
+            return
+        room = int(np.clip(MEMORY // image.nbytes, FIRST, MAX_USED))
+        changes = [change for change, _ in self._window]
+        change = change_between(self._first[0], image)
+        if len(changes) == room:
+            # The strongest press comes to lie in the middle, and stays there.
+            if change <= max(changes) and int(np.argmax(changes)) <= room // 2:
+                return
+            self._window.popleft()
+        self._window.append((change, image.copy()))
 
 
 def divide(frames: Sequence[Image], at_rest: int | None = None) -> Seen:
