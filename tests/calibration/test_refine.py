@@ -109,6 +109,14 @@ def test_presses_that_are_no_ball_are_refused(base: Calibration, other: Session)
         fit_photometry(replace(other, presses=idle), SCALE, BALL)
 
 
+def test_a_press_that_is_no_ball_is_left_out_among_others(base: Calibration, other: Session) -> None:
+    odd = replace(other.presses[1], image=np.roll(other.presses[1].image, 1, axis=2))
+    presses = [other.presses[0], odd, *other.presses[2:4]]
+    refined = refine_photometry(replace(other, presses=presses), SCALE, BALL, base)
+    assert refined.kept.tolist() == [True, False, True, True]
+    assert (refined.found.presses, refined.found.rejected) == (3, 1)
+
+
 def test_a_diameter_in_place_of_the_radius_is_asked_about(base: Calibration, other: Session) -> None:
     few = some(other, slice(4))
     right = apparent_radius(few, SCALE, BALL, base)

@@ -68,15 +68,18 @@ def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) ->
         )
 
 
-def check_fit(found: PhotometricEntry) -> None:
-    """Raise ConfigError if presses have been fitted too badly to be a ball's, with what may be wrong."""
-    explained = found.explained
-    if explained is not None and explained < LEAST_EXPLAINED:
+def check_explained(explained: float) -> None:
+    """Raise ConfigError if so little of the slopes of presses is explained that they are no ball's."""
+    if explained < LEAST_EXPLAINED:
         raise ConfigError(
             f"calibrate: the colours explain {100 * explained:.0f} % of the slopes that a ball would "
             f"have ({100 * LEAST_EXPLAINED:.0f} % required): what presses is no ball, nothing "
             "touches the gel, or this gel does not answer to slopes with colour"
         )
+
+
+def check_error(found: PhotometricEntry) -> None:
+    """Raise ConfigError if the error of the depth is too large, with what may be wrong."""
     if found.depth_stderr > LARGEST_ERROR:
         raise ConfigError(
             f"calibrate: the error of the depth would be {100 * found.depth_stderr:.0f} % "

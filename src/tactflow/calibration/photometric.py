@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.calibration.file import PhotometricEntry
-from tactflow.calibration.judgement import FEWEST_PRESSES, check_fit, check_presses
+from tactflow.calibration.judgement import FEWEST_PRESSES, check_error, check_explained, check_presses
 from tactflow.calibration.presses import Session
 from tactflow.calibration.samples import TURNS, Sample, errors_on, prepared, shaped, summary
 from tactflow.vision.arrays import Floats
@@ -96,14 +96,16 @@ def fit_photometry(session: Session, scale: Scale, ball_radius: float | Sequence
     else:
         weights, _ = _fit(samples, np.flatnonzero(kept))
     good = np.flatnonzero(kept)
+    errors = _held_out(session, samples, good, scale)
+    check_explained(errors["explained"])
     found = PhotometricEntry(
         ball_radius=float(np.median(radii)),
         presses=len(good),
         rejected=len(samples) - len(good),
         steepest=max(samples[i].reach / samples[i].ball_radius for i in good),
-        **_held_out(session, samples, good, scale),
+        **errors,
     )
-    check_fit(found)
+    check_error(found)
     pixels = centers / (scale.x, scale.y) + scale.origin
     information = np.mean([samples[i].information(centers[i]) for i in good], axis=0)
     return Photometry(SlopeModel(shaped(weights)), information, found, pixels, kept, misfit)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from tactflow.calibration.file import Calibration, PhotometricEntry
-from tactflow.calibration.judgement import check_fit, check_presses
+from tactflow.calibration.judgement import LEAST_EXPLAINED, check_error, check_explained, check_presses
 from tactflow.calibration.photometric import RIDGE, Photometry
 from tactflow.calibration.presses import Session
 from tactflow.calibration.samples import TURNS, Misfit, Sample, errors_on, flat, prepared, shaped, summary
@@ -33,11 +33,13 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
     the mapped ones as the mean of their prior, and its precision in proportion to the Gram matrix of the
     presses that the base was learned from: with more presses, more of the place and the colour is learned.
 
+    Presses that the base does not take for a ball are left out.
+
     base : with slopes. The other parameters are those of `fit_photometry`.
 
     Raises
     ------
-    ConfigError : no presses, presses that are no ball's, or contacts larger than the ball.
+    ConfigError : no presses, more of no ball than of one, or contacts larger than the ball.
     """
     if base.slopes is None or base.photometric is None or base.information is None:
         raise ConfigError(
@@ -48,28 +50,36 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
     check_presses(session, scale, radii, fewest=1)
     samples = prepared(session, scale, radii)
     start = flat(base.slopes)
-    weights = _refined(samples, start, base.information)
+    explained = np.array([_by_base(sample, start).explained for sample in samples])
+    check_explained(float(np.median(explained)))
+    kept = explained >= LEAST_EXPLAINED
+    good = np.flatnonzero(kept)
+    weights = _refined([samples[i] for i in good], start, base.information)
     centers = np.array([sample.center(sample.start, weights) for sample in samples])
     misfit = np.array([s.misfit(c, weights).angle for s, c in zip(samples, centers, strict=True)])
-    before, count = base.photometric, len(samples)
-    errors = _left_out(session, samples, start, base.information, scale)
+    before, count = base.photometric, len(good)
+    errors = []
+    for number in good:
+        # A press alone is judged by what is refined on itself.
+        others = [samples[i] for i in good if i != number or count == 1]
+        errors += errors_on(session, samples, [number], _refined(others, start, base.information), scale)
+    left_out = summary(errors)
 
     def with_base(name: str) -> float:
         # What the base is known to be off by counts as one press more.
-        return float(np.sqrt((getattr(before, name) ** 2 + count * errors[name] ** 2) / (1 + count)))
+        return float(np.sqrt((getattr(before, name) ** 2 + count * left_out[name] ** 2) / (1 + count)))
 
     found = PhotometricEntry(
         ball_radius=ball_radius,
         presses=count,
-        rejected=0,
-        steepest=max(before.steepest or 0.0, *(s.reach / s.ball_radius for s in samples)),
-        radius_error=errors["radius_error"],
-        explained=float(np.median([_by_base(sample, start).explained for sample in samples])),
+        rejected=len(samples) - count,
+        steepest=max(before.steepest or 0.0, *(samples[i].reach / samples[i].ball_radius for i in good)),
+        radius_error=left_out["radius_error"],
+        explained=float(np.median(explained)),
         **{name: with_base(name) for name in ("normal_error", "sphere_rms", "depth_stderr", "volume_stderr")},
     )
-    check_fit(found)
+    check_error(found)
     pixels = centers / (scale.x, scale.y) + scale.origin
-    kept = np.ones(count, np.bool_)
     return Photometry(SlopeModel(shaped(weights)), base.information, found, pixels, kept, misfit)
 
 
@@ -110,15 +120,3 @@ def apparent_radius(session: Session, scale: Scale, ball_radius: float, base: Ca
 def _by_base(sample: Sample, start: Floats) -> Misfit:
     """How well the base alone, (2, 114), fits a press."""
     return sample.misfit(sample.center(sample.start, start), start)
-
-
-def _left_out(
-    session: Session, samples: Sequence[Sample], start: Floats, information: Floats, scale: Scale
-) -> dict[str, float]:
-    """Errors of each press by what is refined on the others; of a press alone by what is refined on it."""
-    errors = []
-    for number in range(len(samples)):
-        others = [*samples[:number], *samples[number + 1 :]] or samples
-        weights = _refined(others, start, information)
-        errors += errors_on(session, samples, [number], weights, scale)
-    return summary(errors)
