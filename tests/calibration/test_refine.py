@@ -90,6 +90,7 @@ def test_stated_errors_after_one_press_hold_on_the_others(base: Calibration, oth
     found = errors(refined.model, other)
     assert known.photometric is not None
     assert found["depth_stderr"] < refined.found.depth_stderr < known.photometric.depth_stderr
+    assert refined.found.between == pytest.approx(known.photometric.between / 2**0.5)
 
 
 def test_presses_that_are_no_ball_are_refused(base: Calibration, other: Session) -> None:

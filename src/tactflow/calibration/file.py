@@ -86,8 +86,9 @@ class PhotometricEntry(_Entry):
 
     ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. radius_error : median
     of the fitted radius over the true one, less 1. sphere_rms : of the heights from the fitted ball, mm.
-    depth_stderr, volume_stderr : of balls, relative to the value. steepest : see `SurfaceErrors`. explained :
-    share of the slopes of a ball that the fit explains, see `Misfit`; None in files of earlier versions.
+    depth_stderr, volume_stderr : of balls, relative to the value. between : the part of `depth_stderr` that
+    is the difference of sensors of the kind. steepest : see `SurfaceErrors`. explained : share of the slopes
+    of a ball that the fit explains, see `Misfit`; None in files of earlier versions.
     """
 
     ball_radius: float = Field(gt=0)
@@ -98,12 +99,14 @@ class PhotometricEntry(_Entry):
     sphere_rms: float
     depth_stderr: float
     volume_stderr: float
+    between: float = 0.0
     steepest: float | None = None
     explained: float | None = None
 
     def errors(self) -> SurfaceErrors:
         """The basis of the standard errors of heights."""
-        return SurfaceErrors(self.depth_stderr, self.volume_stderr, self.steepest)
+        own = math.sqrt(max(self.depth_stderr**2 - self.between**2, 0))
+        return SurfaceErrors(own, self.volume_stderr, self.steepest, self.between)
 
 
 class LinearForceEntry(_Entry):
@@ -204,6 +207,7 @@ class Calibration(_Entry):
         if photometric is not None:
             own = photometric.model_dump()
             wider = {name: math.hypot(own[name], more) for name, more in KIND_ERRORS.items()}
+            wider["between"] = math.hypot(photometric.between, KIND_ERRORS["depth_stderr"])
             photometric = photometric.model_copy(update=wider)
         pairs = zip(entry.mm_per_pixel, entry.stderr, strict=True)
         stderr = tuple(math.hypot(error, KIND_SCALE * value) for value, error in pairs)

@@ -59,7 +59,7 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
     misfit = np.array([s.misfit(c, weights).angle for s, c in zip(samples, centers, strict=True)])
     before, count = base.photometric, len(good)
     errors = []
-    for number in good:
+    for number in good.tolist():
         # A press alone is judged by what is refined on itself.
         others = [samples[i] for i in good if i != number or count == 1]
         errors += errors_on(session, samples, [number], _refined(others, start, base.information), scale)
@@ -76,6 +76,7 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
         steepest=max(before.steepest or 0.0, *(samples[i].reach / samples[i].ball_radius for i in good)),
         radius_error=left_out["radius_error"],
         explained=float(np.median(explained)),
+        between=before.between / (1 + count) ** 0.5,
         **{name: with_base(name) for name in ("normal_error", "sphere_rms", "depth_stderr", "volume_stderr")},
     )
     check_error(found)

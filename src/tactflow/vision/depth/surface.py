@@ -43,11 +43,13 @@ normal. With 0.85 a cable counts as steep as an edge, and its stated errors are 
 
 class SurfaceErrors(NamedTuple):
     """What a calibration says of its heights: relative errors of depth and volume of balls that it has not
-    seen, and the largest horizontal part of a normal that it was learned from, None where not known."""
+    seen, the largest horizontal part of a normal that it was learned from, None where not known, and by how
+    much the depths of sensors of its kind differ, relative, if it is of another one than this."""
 
     depth: float
     volume: float
     steepest: float | None = None
+    between: float = 0.0
 
 
 class Rest:
@@ -132,7 +134,8 @@ class Surface:
         depth_error = volume_error = None
         if self._errors is not None and gradients is None:
             root, balls = math.sqrt(steep), self._errors
-            depth_error = greatest * math.hypot(DEPTH_SHAPE * balls.depth, DEPTH_ROUNDED, DEPTH_STEEP * root)
+            shape, steep_part = DEPTH_SHAPE * balls.depth, DEPTH_STEEP * root
+            depth_error = greatest * math.hypot(shape, balls.between, DEPTH_ROUNDED, steep_part)
             volume_error = volume * math.hypot(balls.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
         return Depth(heights, greatest, depth_error, volume, volume_error, pressed)
 
