@@ -8,7 +8,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import yaml
@@ -44,6 +44,7 @@ from tactflow.message.result import Result
 from tactflow.sources import open_source
 from tactflow.system.signals import INTERRUPTED, Interrupted
 from tactflow.view.guided import Guiding
+from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
@@ -249,7 +250,7 @@ def _learned(
         if args.refine:
             raise ConfigError(f"calibrate --refine: the calibration of the pipeline does not fit: {misfit}")
         base = None
-    scale, found_by = _scale(args, loaded, session, base if args.refine else None)
+    scale, found_by = _scale(args, session, base if args.refine else None)
     say(
         f"scale: {scale.x:.5f} +- {scale.stderr[0]:.5f} mm per px in x, "
         f"{scale.y:.5f} +- {scale.stderr[1]:.5f} in y"
@@ -447,16 +448,14 @@ def _print_lens(args: argparse.Namespace, words: Sequence[str]) -> int:
     return 0
 
 
-def _scale(
-    args: argparse.Namespace, loaded: Pipeline, session: Session, base: Calibration | None
-) -> tuple[Scale, str]:
+def _scale(args: argparse.Namespace, session: Session, base: Calibration | None) -> tuple[Scale, str]:
     """Millimetres per pixel, and how they were found. base : to take it from where no option tells it."""
     width, height = session.mapping.size
     try:
         if base is not None and args.pitch is None and args.area is None:
             return base.scale_at((width, height)), base.scale_entry.found_by
         if args.target is not None:
-            return _target_scale(args, loaded), f"target of {args.grid}, pitch of {args.pitch:g} mm"
+            return _target_scale(args, session.mapping), f"target of {args.grid}, pitch of {args.pitch:g} mm"
         if args.pitch is not None:
             scale = scale_from_pitch(session.dots, args.pitch, (width, height))
             return scale, f"pitch of {args.pitch:g} mm"
@@ -476,16 +475,27 @@ def _target(args: argparse.Namespace) -> target.Target:
     return target.Target(int(columns), int(rows), args.pitch, args.dots)
 
 
-def _target_scale(args: argparse.Namespace, loaded: Pipeline) -> Scale:
-    """Scale from `--target`, after the pipeline's own preprocess."""
+def _target_scale(args: argparse.Namespace, mapping: PixelMapping) -> Scale:
+    """Scale from `--target`. mapping : from raw to processed pixels, by the pipeline's preprocess."""
     printed = _target(args)
-    images: list[Any] = []
-    pictured = _load(args, loaded.file, source=args.target)
-    _run(pictured, lambda result, _: images.append(result.image), {"image": "preprocess"})
-    points = target.find_target(images[0], printed) if images and images[0] is not None else None
+    reader = open_source(args.target)
+    try:
+        shown = reader.read()
+    finally:
+        reader.close()
+    if shown is None:
+        raise ConfigError(_not_shown(printed, args.target))
+    image, *_ = shown
+    size = (image.shape[1], image.shape[0])
+    if size != mapping.raw_size:
+        raise ConfigError(
+            f"calibrate: {args.target} has {size[0]} x {size[1]} px, required "
+            f"{mapping.raw_size[0]} x {mapping.raw_size[1]} as the frames of the sensor"
+        )
+    points = target.find_target(image, printed)
     if points is None:
         raise ConfigError(_not_shown(printed, args.target))
-    scale, bent = target.scale_from_target(points, printed, (images[0].shape[1], images[0].shape[0]))
+    scale, bent = target.scale_from_target(mapping.to_processed(points), printed, mapping.size)
     if bent > target.BENT:
         say(
             f"the target is off a plane grid by {100 * bent:.1f} % of its pitch: one scale is not right for "
