@@ -78,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     say(f"{args.out} is written. From now on: {typed('tactflow', 'run', str(args.out))}")
     if args.no_run:
         return 0
+    say("Leave the gel untouched while it starts.")
     from tactflow.cli.main import make_parser
 
     # The page stays at its address.
