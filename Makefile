@@ -10,7 +10,7 @@
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
 # make lerobot-env  LeRobot in an environment of its own (650 MB), for the tests of its camera
 # make lerobot-datasets  the same with PyTorch (up to 8 GB), for the tests of its datasets
-# make peers        packages to compare with, in environments of their own (3 GB; with CUDA 12)
+# make peers        packages to compare with, in environments of their own (5 GB; more with CUDA)
 # make peers-page   measures them beside tactflow and writes docs/peers.md; DATA is a folder of recordings
 # make system-deps  what the tests need from the system: a browser, ffmpeg (Debian; needs root)
 

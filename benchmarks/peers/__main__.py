@@ -14,14 +14,14 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata, util
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from benchmarks.peers import contact, depth, dots, page
-from benchmarks.peers.common import FAILURES, lines, one_thread, recording
+from benchmarks.peers.common import FAILURES, errors_of, lines, one_thread, recording
 from tactflow.bench.run import machine
 from tactflow.bench.scenes import Case
 from tactflow.bench.timing import quiet
@@ -73,43 +73,39 @@ def attempts() -> list[dict[str, str]]:
     return answers
 
 
-def memory(names: list[str]) -> dict[str, float]:
-    """Peak memory of a process that runs one method over a scene, MB."""
-    peaks = {}
-    for name in names:
+def memory(methods: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """Peak memory of a process that runs one method over a scene, MB, and of one that runs none."""
+
+    def peak(name: str) -> float:
         command = [sys.executable, "-W", "ignore", "-m", "benchmarks.peers", "--memory-of", name]
-        peaks[name] = float(
-            subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1]
-        )
-    return peaks
+        return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+
+    peaks = {
+        quantity: {name: peak(f"{quantity}/{name}") for name in names} for quantity, names in methods.items()
+    }
+    return peaks | {"bench alone": peak("")}
 
 
 def run_once(name: str) -> None:
     """Run a method of dots or contact over a scene, and print the peak of the memory, MB."""
     quantity, _, method = name.partition("/")
     with TemporaryDirectory() as folder:
-        scene, pictures, truths = recording(Case("press", 40), Path(folder))
-    if quantity == "dots":
-        settings = {key: values[0] for key, values in dots.CHOICES.get(method, {}).items()}
-        dots.errors_of(pictures, truths, method, settings)
-    elif quantity == "contact":
-        settings = {key: values[0] for key, values in contact.CHOICES.get(method, {}).items()}
-        contact.errors_of((scene, pictures, truths), method, settings)
-    status = Path("/proc/self/status").read_text()
-    print(int(status.split("VmHWM:")[1].split()[0]) / 1024)
+        scene = recording(Case("press", 40), Path(folder))
+    for module in (dots, contact):
+        if module.__name__.endswith(f".{quantity}"):
+            settings = {key: values[0] for key, values in module.CHOICES.get(method, {}).items()}
+            errors_of(module.follow, scene, method, settings)
+    print(int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024)
 
 
-def code() -> dict[str, int]:
+def code() -> dict[str, dict[str, int]]:
     """Lines that a user of each method writes."""
-    parts = {"trackpy": dots.locate, "OpenCV Lucas-Kanade": dots.corners}
-    counted = {f"dots/{name}": lines(adapter) for name, adapter in dots.METHODS.items()}
-    for name, part in parts.items():
-        counted[f"dots/{name}"] += lines(part)
-    counted |= {f"contact/{name}": lines(adapter) for name, adapter in contact.ADAPTERS.items()}
+    parts = {"trackpy": [dots.locate], "OpenCV Lucas-Kanade": [dots.corners]}
     network = (depth.PixelNetwork, depth.train, depth.integrate, depth.on_ball)
-    return counted | {
-        "depth/tactflow": lines(depth.Tactflow),
-        f"depth/{depth.NETWORK}": sum(map(lines, network)),
+    return {
+        "dots": {name: sum(map(lines, [one, *parts.get(name, [])])) for name, one in dots.METHODS.items()},
+        "contact": {name: lines(one) for name, one in contact.ADAPTERS.items()},
+        "depth": {"tactflow": lines(depth.Tactflow), depth.NETWORK: sum(map(lines, network))},
     }
 
 
@@ -125,7 +121,7 @@ def main() -> None:
     parser.add_argument("--memory-of", metavar="QUANTITY/METHOD", help=argparse.SUPPRESS)
     args = parser.parse_args()
     one_thread()
-    if args.memory_of:
+    if args.memory_of is not None:
         run_once(args.memory_of)
         return
     names = {"dots": available(dots.METHODS), "contact": available(contact.PEERS)}
@@ -133,18 +129,14 @@ def main() -> None:
     with TemporaryDirectory() as scratch, quiet():
         folder = Path(scratch)
         parts: dict[str, Callable[[], Any]] = {
-            "dots": lambda: dots.on_scenes(cases(SCENES, args.frames), folder, names["dots"]),
+            "dots": lambda: dots.on_named(cases(SCENES, args.frames), folder, names["dots"]),
             "dots_wide": lambda: dots.on_wide(args.wide, names["dots"]),
-            "contact": lambda: contact.on_scenes(cases(CONTACTS, args.frames), folder, names["contact"]),
+            "contact": lambda: contact.on_named(cases(CONTACTS, args.frames), folder, names["contact"]),
             "contact_wide": lambda: contact.on_wide(args.wide, names["contact"]),
             "dots_gels": lambda: dots.on_gels(args.data, names["dots"]),
             "contact_gels": lambda: contact.on_gels(args.data, folder, names["contact"]),
             "depth": lambda: depth.on_balls(args.data, network),
-            "memory": lambda: memory(
-                ["bench alone"]
-                + [f"dots/{name}" for name in names["dots"]]
-                + [f"contact/{name}" for name in [*contact.OURS, *names["contact"]]]
-            ),
+            "memory": lambda: memory(names | {"contact": [*contact.OURS, *names["contact"]]}),
             "code": code,
             "attempts": attempts,
         }

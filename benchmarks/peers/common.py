@@ -6,10 +6,12 @@ import ast
 import inspect
 import textwrap
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import cv2
@@ -17,13 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow import Preprocessor
-from tactflow.bench.scenes import Case, Rendered, rendered
+from tactflow.bench.quantities import Tally
+from tactflow.bench.scenes import Case, rendered
 from tactflow.bench.timing import BLOCK
-from tactflow.sim import Truth
 
 Picture = NDArray[np.uint8]
 Numbers = dict[str, float]
 Settings = dict[str, Any]
+Scene = tuple[Any, Sequence[Picture], Sequence[Any]]
+"""A simulated scene, its processed pictures, the truth about each."""
+Follow = Callable[[Scene, Mapping[str, Settings], Mapping[str, Tally]], dict[str, list[float]]]
+"""Runs methods with their settings over a scene, in turns, and adds their errors to the tallies; times, s."""
 
 
 def one_thread() -> None:
@@ -84,6 +90,8 @@ def turns(methods: Mapping[str, Any]) -> Iterator[tuple[str, int, Any, float]]:
 
 def search(choices: Mapping[str, Sequence[Any]], loss: Callable[[Settings], Any]) -> Settings:
     """The settings with the least loss, one setting after the other, from the first choice of each."""
+    if not choices:
+        return {}
     best = {name: values[0] for name, values in choices.items()}
     least = loss(best)
     for name, values in choices.items():
@@ -104,7 +112,7 @@ def another(case: Case) -> Case:
     return replace(case, frames=case.frames // 2, query=f"{case.query}&seed=11".lstrip("&"))
 
 
-def recording(case: Case, folder: Path) -> tuple[Rendered, list[Picture], list[Truth]]:
+def recording(case: Case, folder: Path) -> Scene:
     """A simulated scene, its pictures as the shipped pipeline prepares them (turned, at half the size), and
     the truth about these."""
     with rendered(case, folder) as scene:
@@ -112,6 +120,32 @@ def recording(case: Case, folder: Path) -> tuple[Rendered, list[Picture], list[T
         preprocess = Preprocessor((width, height), rotate=90, downsample=2)
         pictures = [preprocess(np.array(frame)).copy() for frame in scene.frames]
         return scene, pictures, scene.truths(preprocess.mapping)
+
+
+def errors_of(follow: Follow, scene: Scene, method: str, settings: Settings) -> Numbers:
+    """The errors of one method on a recording."""
+    tally = Tally()
+    follow(scene, {method: settings}, {method: tally})
+    return tally.errors()
+
+
+def on_scenes(
+    cases: Sequence[Case], folder: Path, follow: Follow, settings_for: Callable[[Case], dict[str, Settings]]
+) -> dict[str, Any]:
+    """Errors of every method by scene and over all of them, with its settings; median CPU time, ms."""
+    scenes, whole, times = {}, defaultdict(Tally), defaultdict(list)
+    for case in cases:
+        settings = settings_for(case)
+        tallies = {name: Tally() for name in settings}
+        for name, taken in follow(recording(case, folder), settings, tallies).items():
+            times[name] += taken
+        for name, tally in tallies.items():
+            for key, values in tally.values.items():
+                whole[name].values[key] += values
+        scenes[case.label] = {n: tally.errors() | {"settings": settings[n]} for n, tally in tallies.items()}
+    every = {name: tally.errors() | {"settings": settings[name]} for name, tally in whole.items()}
+    ms = {name: 1e3 * median(taken) for name, taken in times.items()}
+    return {"scenes": scenes, "all": every, "ms": ms}
 
 
 def lines(adapter: Callable[..., Any]) -> int:

@@ -17,10 +17,13 @@ from benchmarks.peers.common import (
     Calls,
     Numbers,
     Picture,
+    Scene,
     Settings,
     another,
     combinations,
+    errors_of,
     failed,
+    on_scenes,
     recording,
     search,
     turns,
@@ -32,7 +35,7 @@ from tactflow.bench.label_file import FrameLabel, load_labels
 from tactflow.bench.lockstep import LockstepPipeline
 from tactflow.bench.metrics import mask_iou
 from tactflow.bench.quantities import Tally
-from tactflow.bench.scenes import Case, Rendered
+from tactflow.bench.scenes import Case
 from tactflow.bench.score import add_decision, add_geometry, add_mask
 from tactflow.classic.functions import difference, mask_marker
 from tactflow.config.shipped import find_pipeline
@@ -42,8 +45,6 @@ from tactflow.sources.files import load_image, to_bgr
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 
-Scene = tuple[Rendered, Sequence[Picture], Sequence[Any]]
-"""A simulated scene, its processed pictures, the truth about each."""
 AS_THEY_ARE: Final = {
     "stages.preprocess.rotate": 0,
     "stages.preprocess.downsample": 1,
@@ -165,41 +166,15 @@ class Ours:
         return [(r.contact_mask if r.contact else None, r.cpu_s) for r in results]
 
 
-def on_scenes(cases: Sequence[Case], folder: Path, peers: Sequence[str]) -> dict[str, Any]:
-    """Peers' settings found on other recordings of every second scene; errors on all of these; median ms."""
+def on_named(cases: Sequence[Case], folder: Path, peers: Sequence[str]) -> dict[str, Any]:
+    """Named scenes: settings found on other recordings of every second of these sensors, all together."""
     others = [recording(another(case), folder) for case in cases[::2]]
-    settings = {name: searched(name, partial(_lost_on, others, name)) for name in peers}
-    names = [*OURS, *peers]
-    whole, scenes = {name: Tally() for name in names}, {}
-    times: dict[str, list[float]] = {name: [] for name in names}
-    for case in cases:
-        tallies = {name: Tally() for name in names}
-        methods = {name: settings.get(name, {}) for name in names}
-        for name, taken in follow(recording(case, folder), methods, tallies).items():
-            times[name] += taken
-        for name, tally in tallies.items():
-            for key, values in tally.values.items():
-                whole[name].values[key] += values
-        scenes[case.label] = {name: tally.errors() for name, tally in tallies.items()}
-    ms = {name: 1e3 * median(times[name]) for name in names}
-    every = {name: tally.errors() | {"settings": settings.get(name, {})} for name, tally in whole.items()}
-    return {"scenes": scenes, "all": every, "ms": ms}
 
+    def loss(name: str, tried: Settings) -> float:
+        return sum(overlap_lost(errors_of(follow, other, name, tried)) for other in others)
 
-def _lost_on(scenes: Sequence[Scene], name: str, settings: Settings) -> float:
-    return float(np.mean([overlap_lost(errors_of(scene, name, settings)) for scene in scenes]))
-
-
-def errors_of(scene: Scene, name: str, settings: Settings) -> Numbers:
-    """The errors of one method on a recording."""
-    tally = Tally()
-    follow(scene, {name: settings}, {name: tally})
-    return tally.errors()
-
-
-def searched(name: str, loss: Callable[[Settings], float]) -> Settings:
-    """The best settings of a peer; none for one that has none."""
-    return search(CHOICES[name], loss) if name in CHOICES else {}
+    settings = {name: search(CHOICES.get(name, {}), partial(loss, name)) for name in peers}
+    return on_scenes(cases, folder, follow, lambda _: {name: {} for name in OURS} | settings)
 
 
 def overlap_lost(errors: Numbers) -> float:
@@ -209,11 +184,9 @@ def overlap_lost(errors: Numbers) -> float:
 
 
 def follow(
-    scene: Scene,
-    methods: Mapping[str, Settings],
-    tallies: Mapping[str, Tally],
+    scene: Scene, methods: Mapping[str, Settings], tallies: Mapping[str, Tally]
 ) -> dict[str, list[float]]:
-    """Run methods over a simulated scene, in turns, and add their errors to the tallies; times, s."""
+    """Find the contacts of a recording. Where a peer raises, it has found none."""
     rendered, pictures, truths = scene
     pipeline = "default" if len(truths[0].origin) else "markerless"
     running = {
@@ -259,9 +232,8 @@ def on_wide(count: int, peers: Sequence[str]) -> dict[str, Any]:
 
     answers = {}
     for name in [*OURS, *peers]:
-        settings = (
-            {} if name in OURS else searched(name, lambda s, n=name: overlap_lost(errors(scenes[::2], n, s)))
-        )
+        loss = partial(errors, scenes[::2], name)
+        settings = search(CHOICES.get(name, {}), lambda tried, loss=loss: overlap_lost(loss(tried)))
         answers[name] = errors(scenes[1::2], name, settings) | {"settings": settings}
     return {"scenes": count, "all": answers}
 

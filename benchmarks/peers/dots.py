@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import median
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -16,10 +15,13 @@ from benchmarks.peers.common import (
     Calls,
     Numbers,
     Picture,
+    Scene,
     Settings,
     another,
     combinations,
+    errors_of,
     failed,
+    on_scenes,
     recording,
     search,
     turns,
@@ -165,11 +167,6 @@ CHOICES: Final = {name: {**FINDING[name], **FOLLOWING[name]} for name in FINDING
 # How they are measured.
 
 
-def searched(method: str, errors: Callable[[Settings], Numbers]) -> Settings:
-    """The settings of a method with the least errors; none for one that has none."""
-    return search(CHOICES[method], lambda tried: badness(errors(tried))) if method in CHOICES else {}
-
-
 def badness(errors: Numbers) -> tuple[float, float]:
     """What the search minimises: dots that are lost or wrong, in whole percent; then the RMS error."""
     bad = errors["wrong_percent"] + errors["lost_percent"]
@@ -177,16 +174,10 @@ def badness(errors: Numbers) -> tuple[float, float]:
 
 
 def follow(
-    pictures: Sequence[Picture],
-    truths: Sequence[Any],
-    methods: Mapping[str, Settings],
-    tallies: Mapping[str, Tally],
+    scene: Scene, methods: Mapping[str, Settings], tallies: Mapping[str, Tally]
 ) -> dict[str, list[float]]:
-    """Follow the dots of a recording with several methods, in turns, and add their errors to the tallies.
-
-    truths : `Truth` of each picture, or what has its `origin`, `position` and `visible`. Where a method
-    raises, all dots are lost. Returns the times, s.
-    """
+    """Follow the dots of a recording. Where a method raises, all dots are lost."""
+    _, pictures, truths = scene
     scores = {name: MarkerScore(tallies[name]) for name in methods}
     times: dict[str, list[float]] = {name: [] for name in methods}
     running = {}
@@ -213,31 +204,15 @@ def lose(tally: Tally, truths: Sequence[Any]) -> None:
         tally.percent(lost_percent=np.ones(visible), wrong_percent=np.zeros(visible))
 
 
-def errors_of(pictures: Sequence[Picture], truths: Sequence[Any], method: str, settings: Settings) -> Numbers:
-    """The errors of one method on a recording."""
-    tally = Tally()
-    follow(pictures, truths, {method: settings}, {method: tally})
-    return tally.errors()
+def on_named(cases: Sequence[Case], folder: Path, methods: Sequence[str]) -> dict[str, Any]:
+    """Named scenes: settings found on another recording of each of these sensors."""
 
+    def settings_for(case: Case) -> dict[str, Settings]:
+        other = recording(another(case), folder)
+        loss = {name: partial(errors_of, follow, other, name) for name in methods}
+        return {n: search(CHOICES.get(n, {}), lambda tried, n=n: badness(loss[n](tried))) for n in methods}
 
-def on_scenes(cases: Sequence[Case], folder: Path, methods: Sequence[str]) -> dict[str, Any]:
-    """Each scene: settings found on another recording of the same sensor, errors on this one; median ms."""
-    scenes: dict[str, Any] = {}
-    times: dict[str, list[float]] = {name: [] for name in methods}
-    whole = {name: Tally() for name in methods}
-    for case in cases:
-        _, pictures, truths = recording(another(case), folder)
-        settings = {name: searched(name, partial(errors_of, pictures, truths, name)) for name in methods}
-        _, pictures, truths = recording(case, folder)
-        tallies = {name: Tally() for name in methods}
-        for name, taken in follow(pictures, truths, settings, tallies).items():
-            times[name] += taken
-        for name, tally in tallies.items():
-            for key, values in tally.values.items():
-                whole[name].values[key] += values
-        scenes[case.label] = {name: tallies[name].errors() | {"settings": settings[name]} for name in methods}
-    ms = {name: 1e3 * median(times[name]) for name in methods}
-    return {"scenes": scenes, "all": {name: tally.errors() for name, tally in whole.items()}, "ms": ms}
+    return on_scenes(cases, folder, follow, settings_for)
 
 
 def on_wide(count: int, methods: Sequence[str]) -> dict[str, Any]:
@@ -248,14 +223,14 @@ def on_wide(count: int, methods: Sequence[str]) -> dict[str, Any]:
     def errors(method: str, scenes: Sequence[WideScene], settings: Settings) -> Numbers:
         tally = Tally()
         for scene in scenes:
-            pictures = [scene.reference, scene.picture]
             truths = [_truth(scene, scene.origin), _truth(scene, scene.position)]
-            follow(pictures, truths, {method: settings}, {method: tally})
+            follow((scene, [scene.reference, scene.picture], truths), {method: settings}, {method: tally})
         return tally.errors()
 
     answers = {}
     for name in methods:
-        settings = searched(name, partial(errors, name, scenes[::2]))
+        loss = partial(errors, name, scenes[::2])
+        settings = search(CHOICES.get(name, {}), lambda tried, loss=loss: badness(loss(tried)))
         answers[name] = errors(name, scenes[1::2], settings) | {"settings": settings}
     return {"scenes": len(scenes[1::2]), "all": answers}
 

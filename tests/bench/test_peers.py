@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.peers import contact, depth, dots, page
 from benchmarks.peers.__main__ import CONTACTS, SCENES, available, cases
-from benchmarks.peers.common import another, lines, recording, search
+from benchmarks.peers.common import another, errors_of, lines, recording, search
 from tactflow.bench.scenes import Case
 from tactflow.calibration.presses import Press
 from tactflow.sim import open_scene
@@ -23,18 +23,20 @@ def test_every_number_of_the_page_is_in_the_file_beside_it() -> None:
 
 
 def test_what_a_peer_does_better_is_bold() -> None:
-    errors = {"tactflow": 0.2, "better": 0.1, "equal when shown": 0.199, "worse": 0.3}
-    rows = list(page.table([("error", errors.get, ".2f", -1)], [*errors, "unknown"]))
+    numbers = {"error": {"tactflow": 0.2, "better": 0.1, "equal when shown": 0.199, "worse": 0.3}}
+    methods = [*numbers["error"], "unknown"]
+    rows = list(page.table(numbers, [("where: error", "error|*", ".2f", -1)], methods))
     assert [row.split(" | ")[-1] for row in rows[2:]] == ["0.20 |", "**0.10** |", "0.20 |", "0.30 |", "- |"]
+    assert list(page.better({"dots": rows})) == ["better, dots, where: error: 0.10 instead of 0.20"]
 
 
 def test_tactflow_is_measured_where_no_peer_is_installed(tmp_path: Path) -> None:
     case = Case("press", 24)
-    found = dots.on_scenes([case], tmp_path, ["tactflow"])
+    found = dots.on_named([case], tmp_path, ["tactflow"])
     assert found["all"]["tactflow"]["displacement_rms"] < 0.05
     assert found["all"]["tactflow"]["lost_percent"] == 0
     assert found["ms"]["tactflow"] > 0
-    found = contact.on_scenes([case], tmp_path, ["OpenCV difference"])
+    found = contact.on_named([case], tmp_path, ["OpenCV difference"])
     assert found["all"]["tactflow, noise"]["contact_iou"] > found["all"]["OpenCV difference"]["contact_iou"]
     assert found["all"]["tactflow, noise"]["false_contacts"] == 0
 
@@ -48,8 +50,7 @@ def test_a_method_that_raises_has_lost_its_dots(monkeypatch: pytest.MonkeyPatch,
             """Nothing to prepare."""
 
     monkeypatch.setitem(dots.METHODS, "failing", Failing)
-    _, pictures, truths = recording(Case("press", 3), tmp_path)
-    errors = dots.errors_of(pictures, truths, "failing", {})
+    errors = errors_of(dots.follow, recording(Case("press", 3), tmp_path), "failing", {})
     assert errors["lost_percent"] == 100
     assert "displacement_rms" not in errors
 
