@@ -49,11 +49,6 @@ RING_MISSES: Final = 2
 OVERLAP: Final = 1.3
 """Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
 
-LONGEST: Final = 10.0
-"""Ratio of the response's curvatures across and along a place, above which it is part of a line: a dead
-column of the camera, an edge. Lowe's value. No mark of 18 recordings is lost or gained; of 32 spots on a dead
-column across wrs_cam1 that continued the lattice of its marks none is left."""
-
 BORDER_MARGIN: Final = 0.8
 """Distance of a mark from the border of the image at least, in radii: others are cut by it."""
 
@@ -63,19 +58,19 @@ class Spots(NamedTuple):
 
     points : (N, 2) float64, px. radius : (N,) float64, of discs of that scale, px. strength : (N,) float64,
     response, grey levels. clear : (N,) float64, least contrast with the ring around over the median, at most
-    1; 1 is a spot alone on even ground. round : (N,) bool, whether the response falls in all directions.
+    1; 1 is a spot alone on even ground. bend : (N,) float64, how fast the response falls in the direction
+    in which it falls least, grey levels per squared scale.
     """
 
     points: Floats
     radius: Floats
     strength: Floats
     clear: Floats
-    round: NDArray[np.bool_]
+    bend: Floats
 
     def at(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> Spots:
         """Some of the spots, by their numbers or by (N,) bool."""
-        clear, rounded = self.clear[which], self.round[which]
-        return Spots(self.points[which], self.radius[which], self.strength[which], clear, rounded)
+        return Spots(*(values[which] for values in self))
 
 
 def joined(*parts: Spots) -> Spots:
@@ -101,7 +96,7 @@ def find_spots(
     """Spots of one scale and polarity, strongest first, without those that the border cuts.
 
     Edges and lines also answer to a difference of Gaussians, but are as dark along themselves: `clear` tells
-    whether a spot differs from (almost) the whole ring around it, `round` whether it is part of no line.
+    whether a spot differs from (almost) the whole ring around it, `bend` whether it is part of no line.
 
     gray : (H, W) float32, grey levels. sigma : px. valid : (H, W) uint8, not 0 where there is gel.
 
@@ -120,7 +115,7 @@ def find_spots(
     peaks, strength = _peaks(response, fine)
     clear = _clearance(narrow if dark else -narrow, peaks, fine * RADIUS_PER_SIGMA)
     points = peaks * factor + (factor - 1) / 2
-    spots = Spots(points, np.full(len(points), radius), strength, clear, _is_round(response, peaks))
+    spots = Spots(points, np.full(len(points), radius), strength, clear, fine**2 * _bend(response, peaks))
     margin, (height, width) = BORDER_MARGIN * radius, gray.shape
     inside = ((points >= margin) & (points <= np.array([width, height]) - 1 - margin)).all(axis=1)
     spots = spots.at(np.flatnonzero(inside))
@@ -164,11 +159,10 @@ def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[Floats, Floats]
     return points, value
 
 
-def _is_round(response: NDArray[np.float32], peaks: Floats) -> NDArray[np.bool_]:
-    """Whether the response falls from its peaks (N, 2), px, in all directions, not only across a line: (N,).
+def _bend(response: NDArray[np.float32], peaks: Floats) -> Floats:
+    """How fast the response falls from its peaks (N, 2), px, where it falls least: (N,), grey levels per px².
 
-    The ratio of the eigenvalues of the matrix of second derivatives grows with its squared trace over its
-    determinant (Lowe 2004, section 4.1).
+    It is the lesser eigenvalue of minus the matrix of second derivatives, and 0 along an edge or a line.
     """
     limits = np.array([response.shape[1] - 2, response.shape[0] - 2])
     columns, rows = np.clip(np.rint(peaks).astype(np.int64), 1, limits).T
@@ -177,10 +171,9 @@ def _is_round(response: NDArray[np.float32], peaks: Floats) -> NDArray[np.bool_]
         return np.asarray(response[rows + down, columns + right], np.float64)
 
     peak = 2 * at(0, 0)
-    across, down = at(0, -1) + at(0, 1) - peak, at(-1, 0) + at(1, 0) - peak
+    across, down = peak - at(0, -1) - at(0, 1), peak - at(-1, 0) - at(1, 0)
     mixed = (at(-1, -1) + at(1, 1) - at(-1, 1) - at(1, -1)) / 4
-    determinant = across * down - mixed * mixed
-    return np.asarray(LONGEST * (across + down) ** 2 < (LONGEST + 1) ** 2 * determinant, np.bool_)
+    return np.asarray((across + down - np.hypot(across - down, 2 * mixed)) / 2, np.float64)
 
 
 def _clearance(smooth: NDArray[np.float32], peaks: Floats, radius: float) -> Floats:
