@@ -51,7 +51,7 @@ def stage(source: Path) -> None:
         path = page.relative_to(REPOSITORY).as_posix()
         text = page.read_text(encoding="utf-8")
         (source / site_name(path)).write_text(with_links(text, page.parent), encoding="utf-8")
-    for picture in REPOSITORY.glob("docs/**/*.jpg"):
+    for picture in [*REPOSITORY.glob("docs/**/*.jpg"), *REPOSITORY.glob("docs/**/*.png")]:
         copy = source / picture.relative_to(REPOSITORY / "docs")
         copy.parent.mkdir(exist_ok=True)
         shutil.copyfile(picture, copy)
