@@ -252,7 +252,9 @@ def _attempt(name: str, settings: dict[str, Any], seen: Seen) -> Attempt:
                     dots.append(int(tracked.sum()))
                     moved.append(np.hypot(*(result.markers.position - result.markers.origin)[tracked].T))
     except StageError as error:
-        attempt.failure = shorten(str(error), 70, placeholder=" ...")
+        # "tracker failed at frame 0: NoMarkersError: 0 markers found: is the sensor ..."
+        reason = str(error).partition("Error: ")[2].partition(": ")[0] or str(error)
+        attempt.failure = shorten(reason, 70, placeholder=" ...")
         return attempt
     contact = np.array(touching)
     attempt.false = float(contact[seen.rest].mean())
