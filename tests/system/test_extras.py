@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from importlib import metadata
 
 import pytest
@@ -39,3 +41,14 @@ def test_two_are_named_once_with_the_command_that_repairs_it(
     said = capsys.readouterr().err
     assert said.count(f"opencv-python 4.10.0 and {OPENCV} 5.0.0 are installed together") == 1
     assert f"pip uninstall --yes opencv-python {OPENCV}, then pip install {OPENCV}" in said
+
+
+def test_a_recording_without_the_packages_for_it_is_refused_with_the_command_that_installs_them() -> None:
+    program = (
+        "import sys; sys.modules['zstandard'] = sys.modules['mcap'] = None; "
+        "from tactflow.cli.main import main; sys.exit(main(['run', 'mini', '--source', 'press.mcap']))"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.returncode == 4
+    assert "pip install 'tactflow[record]'" in ended.stderr
+    assert "Traceback" not in ended.stderr

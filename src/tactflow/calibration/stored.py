@@ -49,15 +49,17 @@ def with_recorded_calibration(pipeline: Pipeline) -> Pipeline:
     if chosen or pipeline.settings.get("calibration", "") is None or not name.endswith(".mcap"):
         return pipeline
     from tactflow.recording import missing_packages
-    from tactflow.recording.records import NotARecordingError
     from tactflow.sources.paths import find_path
+
+    if missing_packages() is not None:
+        return pipeline
+    from tactflow.recording.records import NotARecordingError
 
     # The source reports what is wrong with the recording itself.
     with suppress(SourceError, OSError, ValueError, NotARecordingError):
         path = find_path(name, pipeline.directory)
-        if missing_packages() is None:
-            stored_text(path)
-            return replace(pipeline, calibration=path)
+        stored_text(path)
+        return replace(pipeline, calibration=path)
     return pipeline
 
 

@@ -252,7 +252,7 @@ def _attempt(name: str, settings: dict[str, Any], seen: Seen) -> Attempt:
                     dots.append(int(tracked.sum()))
                     moved.append(np.hypot(*(result.markers.position - result.markers.origin)[tracked].T))
     except StageError as error:
-        # "tracker failed at frame 0: NoMarkersError: 0 markers found: is the sensor ..."
+        # Between the name of the exception and what to do about it.
         reason = str(error).partition("Error: ")[2].partition(": ")[0] or str(error)
         attempt.failure = shorten(reason, 70, placeholder=" ...")
         return attempt
