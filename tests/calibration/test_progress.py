@@ -29,7 +29,7 @@ def test_the_part_with_the_fewest_good_presses_is_asked_for_next() -> None:
     said = progress(presses[:-1], False, 20)
     assert (said["next"], said["now"]) == ((2, 2), "Press the ball firmly at the lower right.")
     assert progress([*presses[:-1], press(86, 75)], False, 20)["next"] == (2, 2), "one at the rim is none"
-    assert progress(presses, False, 20)["now"] == "Press the ball lightly at the middle centre."
+    assert progress(presses, False, 20)["now"] == "Press the ball lightly in the centre."
     lasting = progress(presses, True, 9)
     assert (lasting["now"], lasting["done"], lasting["good"]) == ("Lift the ball.", 8, 8)
     assert progress(presses, False, 9)["now"] == "These are enough presses."

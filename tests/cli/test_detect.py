@@ -19,7 +19,7 @@ def test_what_was_found_is_told_and_drawn(tmp_path: Path, capsys: pytest.Capture
     assert main(["detect", GEL, "--downsample", "2", "--rotate", "90", "--picture", str(file)]) == 0
     title, *lines = capsys.readouterr().out.splitlines()
     assert title == f"{GEL}, frame 0: 300 x 400 px"
-    assert lines[0].startswith("yellow: 80 dark marks, radius 4.9 px, 34.0 px apart")
+    assert lines[0].startswith("yellow circles: 80 dark dots, radius 4.9 px, 34.0 px apart")
     assert lines[1].startswith("green: 142 links; 98 % of the parallelograms")
     picture = cv2.imread(str(file))
     assert picture is not None

@@ -73,7 +73,7 @@ def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str,
     the gel that has the fewest good ones. lasts. presses : center and radius of each, px, and its fault.
 
     >>> progress([], False, 20)["now"]
-    'Press the ball firmly at the middle centre.'
+    'Press the ball firmly in the centre.'
     """
     usual = usual_radius(presses)
     faults = [fault(press, usual) for press in presses]
@@ -81,7 +81,8 @@ def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str,
     good = [press for press, wrong in zip(presses[:done], faults[:done], strict=True) if wrong is None]
     there = [part(press) for press in good]
     row, column = min(_FIRST, key=there.count)
-    now = f"Press the ball {_DEPTHS[there.count((row, column)) % 3]} at the {part_name(row, column)}."
+    where = "in the centre" if (row, column) == (1, 1) else f"at the {part_name(row, column)}"
+    now = f"Press the ball {_DEPTHS[there.count((row, column)) % 3]} {where}."
     if lasts:
         now = "Lift the ball."
     elif done >= wanted:

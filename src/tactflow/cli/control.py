@@ -83,7 +83,7 @@ def run_keys(args: argparse.Namespace) -> int:
         raise ConfigError(f"keys: {error}") from None
     print(f"{publisher} stays here, for the run: {typed('--set', f'sinks.zmq.keys={publisher}')}")
     print(
-        f"{subscriber} goes to the subscriber, over a safe way (scp), and to nobody else: "
+        f"{subscriber} goes to the subscriber, over a secure channel (scp); share it with nobody else: "
         f"tactflow listen tcp://HOST:5556 --keys {subscriber.name}"
     )
     return 0

@@ -103,7 +103,7 @@ def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
     sizes = f"radius {marks.dot_radius:.1f} px"
     if marks.radii is not None:
         sizes = f"radii {marks.radii.min():.1f} to {marks.radii.max():.1f} px, most {marks.dot_radius:.1f} px"
-    yield f"yellow: {len(marks.centers)} {marks.polarity} marks, {sizes}, {marks.pitch:.1f} px apart"
+    yield f"yellow circles: {len(marks.centers)} {marks.polarity} dots, {sizes}, {marks.pitch:.1f} px apart"
     if marks.chosen is not None:
         closed = f"{100 * marks.chosen.lattice:.0f} % of the parallelograms of neighbours close"
         grids = "grids: 80 % and more, random: 30 % and less"

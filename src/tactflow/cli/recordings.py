@@ -166,7 +166,7 @@ def run_repair(args: argparse.Namespace) -> int:
             summary += f"; {result.lost} bytes of it belonged to nothing intact"
         if result.finished:
             copy.unlink()
-            summary = f"{path}: is whole already, nothing to repair ({result.messages} messages)"
+            summary = f"{path}: is intact; nothing to repair ({result.messages} messages)"
         else:
             copy.chmod(path.stat().st_mode & 0o777)
     if not args.quiet:
