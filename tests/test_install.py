@@ -22,9 +22,10 @@ sinks = "sinks={jsonl: {path: out.jsonl}}"
 code = main(["run", "--quiet", "--max-frames", "30", "--source", "sim:press", "--set", sinks])
 import tactflow.stages.hull
 print(tactflow.stages.hull.__file__)
-main(["stages"])
+# Those of the pipeline: `stages` imports others, too.
 total, count = compiled.load()
 print(code, total > 5, count)
+main(["stages"])
 """
 
 

@@ -17,6 +17,7 @@ from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
 from tactflow.ports import Image
 from tactflow.sources import FrameReader
+from tactflow.system.clock import SYSTEM
 from tactflow.view.address import address, bind
 from tactflow.view.compact import encode_packet
 from tactflow.view.hub import Hub
@@ -167,7 +168,7 @@ class Questions:
         if isinstance(picture, Result):
             self._shown = Result(replace(picture.frame, sensor=SENSOR), picture)
         else:
-            self._shown = Result(Frame(SENSOR, 0, time.time(), picture))
+            self._shown = Result(Frame(SENSOR, 0, SYSTEM.unix(), picture))
         now = time.perf_counter()
         if not self._hub.wanted or now < self._due:
             return
