@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -19,9 +18,6 @@ from tactflow.cli.main import main, make_parser
 from tactflow.engine.errors import SourceError
 from tactflow.view import questions
 from tests.clock import PATIENCE
-
-DATA = Path(os.environ.get("TACTFLOW_RECORDINGS", "recordings"))
-"""Folder of real recordings; they do not come with the package."""
 
 
 def propose(source: str, out: Path, *words: str) -> int:
@@ -177,9 +173,7 @@ def test_without_a_page_and_a_terminal_nobody_can_answer(
 
 
 @pytest.mark.parametrize(("recording", "dots"), [("gels/digit_fots", False), ("gels/gelslim_ball", True)])
-def test_real_sensors(recording: str, dots: bool, tmp_path: Path) -> None:
-    if not (DATA / recording).exists():
-        pytest.skip(f"{DATA / recording} is not here")
+def test_real_sensors(recording: str, dots: bool, shared_data: Path, tmp_path: Path) -> None:
     out = tmp_path / "made.yaml"
-    assert propose(str(DATA / recording), out) == 0
+    assert propose(str(shared_data / recording), out) == 0
     assert ("tracker" in yaml.safe_load(out.read_text())["stages"]) == dots
