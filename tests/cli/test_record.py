@@ -174,7 +174,7 @@ def test_repair_leaves_a_whole_file_alone_and_replaces_nothing_unasked(
     whole = out.read_bytes()
     capsys.readouterr()
     assert main(["repair", str(out)]) == 0
-    assert "is whole already" in capsys.readouterr().err
+    assert "is intact; nothing to repair" in capsys.readouterr().err
     assert out.read_bytes() == whole
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
     out.write_bytes(whole[:-200])
