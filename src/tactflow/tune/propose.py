@@ -252,8 +252,8 @@ def _attempt(name: str, settings: dict[str, Any], seen: Seen) -> Attempt:
                     dots.append(int(tracked.sum()))
                     moved.append(np.hypot(*(result.markers.position - result.markers.origin)[tracked].T))
     except StageError as error:
-        # Between the name of the exception and what to do about it.
-        reason = str(error).partition("Error: ")[2].partition(": ")[0] or str(error)
+        # What comes behind the colon is what a user could do about it.
+        reason = str(error.__cause__ or error).partition(": ")[0]
         attempt.failure = shorten(reason, 70, placeholder=" ...")
         return attempt
     contact = np.array(touching)

@@ -169,7 +169,7 @@ class Questions:
             self._shown = Result(replace(picture.frame, sensor=SENSOR), picture)
         else:
             self._shown = Result(Frame(SENSOR, 0, SYSTEM.unix(), picture))
-        now = time.perf_counter()
+        now = SYSTEM.now()
         if not self._hub.wanted or now < self._due:
             return
         self._due = now + SHOW_SECONDS
