@@ -16,12 +16,8 @@ Levels = NDArray[np.int16]
 
 PHASES: Final = 4
 """Sub-pixel phases per axis at which templates are kept. An estimate then lies at most an eighth of a pixel
-from one of them, where the linear model errs by far less than the noise. Chosen by
-hand."""
-
-CONVERGED: Final = 0.25
-"""Length of a step, px, after which another one is made: below it the linear model leaves less than
-0.005 px."""
+from one of them, where the linear model errs by far less than the noise; another step is made where it lies
+nearer to another one. Chosen by hand."""
 
 ROUNDS: Final = 3
 """Steps after the first one, at most. Chosen by hand."""
@@ -325,8 +321,9 @@ def align_marks(
     for n in range(len(marks)):
         x, y = start[n, 0], start[n, 1]
         seen_left, seen_top, varies = -1, -1, 0.0
+        phase_x, phase_y = nearest_phase(x, y, width, height)
+        before_x, before_y = -1, -1
         for number in range(ROUNDS + 1):
-            phase_x, phase_y = nearest_phase(x, y, width, height)
             left, top = phase_x // PHASES, phase_y // PHASES
             which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + marks[n]
             # A step of less than a pixel often sees the same patch from another phase.
@@ -339,10 +336,16 @@ def align_marks(
             safe = max(gain, LEAST_DIVISOR)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
-            far = (now_x - x) * (now_x - x) + (now_y - y) * (now_y - y) > CONVERGED * CONVERGED
-            x, y = now_x, now_y
-            if number == ROUNDS or not (far and r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
+            next_x, next_y = nearest_phase(now_x, now_y, width, height)
+            if next_x == before_x and next_y == before_y:
+                # Between two phases, each of which leads to the other: the same from whichever it began.
+                x, y = (x + now_x) / 2, (y + now_y) / 2
                 break
+            x, y = now_x, now_y
+            settled = next_x == phase_x and next_y == phase_y
+            if settled or not (r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
+                break
+            before_x, before_y, phase_x, phase_y = phase_x, phase_y, next_x, next_y
         position[n, 0], position[n, 1] = x, y
         found[0, n], found[1, n] = gain, r_squared
         found[2, n] = np.sqrt(
