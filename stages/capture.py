@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -172,11 +172,6 @@ class Capture(Source):
     def missed(self) -> int:
         """Frames of a live source that a newer one overtook, or that were only examined: gaps in `seq`."""
         return 0 if self._source is None else self._source.missed + self._references.left_out
-
-    @property
-    def live_threads(self) -> Sequence[int]:
-        """Native ids of threads of its own that frames arrive in."""
-        return () if self._source is None else self._source.threads
 
     def frames(self) -> Iterator[Frame]:
         """Every frame of the source, in order, until its end or `stop()`.

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Image
+from tactflow.system.spelling import listed
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -109,13 +110,12 @@ class Preprocess(Stage):
             *([_SHRUNK[params.downsample]] if params.downsample > 1 else []),
         ]
         if steps:
-            done = " and ".join(filter(None, (", ".join(steps[:-1]), steps[-1])))
             hint = (
                 "; dots may be lost: try downsample: 1"
                 if params.downsample > 1 and min(after) < FEWEST_PIXELS
                 else ""
             )
-            logger.info("%d x %d %s to %d x %d: stages.preprocess%s", *before, done, *after, hint)
+            logger.info("%d x %d %s to %d x %d: stages.preprocess%s", *before, listed(steps), *after, hint)
 
     def _build(self, width: int, height: int) -> Preprocessor:
         params = self.params

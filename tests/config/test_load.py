@@ -213,7 +213,7 @@ def test_set_adds_and_removes_stages_and_changes_the_top_level(load: Load) -> No
     removed = load(BODY, "stages.outline=null", "sinks.out=null")
     assert list(removed.nodes) == ["capture", "prepare", "compare"]
     assert "there are no sinks" in removed.warnings[0]
-    changed = load(BODY, "sensor=right", "skipping=false", "opencv_threads=2", "realtime_priority=false")
+    changed = load(BODY, "sensor=right", "skipping=false", "opencv_threads=2")
     assert (changed.sensor, changed.skipping, changed.opencv_threads) == ("right", False, 2)
 
 

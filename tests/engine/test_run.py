@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import os
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -440,62 +438,6 @@ def test_a_live_source_drops_rather_than_lags_and_counts_it(toy_runner: MakeRunn
     assert link["policy"] == "latest"
     assert link["high_water"] == 1, "no frame waits behind another: the lag cannot grow"
     assert link["drops"] + link["delivered"] == link["offered"] == 300
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has these priorities")
-@pytest.mark.parametrize(
-    ("platform", "refused", "words"),
-    [
-        ("linux", None, "live frames go first: their threads have real-time priority"),
-        (
-            "linux",
-            "no right",
-            "not granted: no right; root has the right, others get it with the limit rtprio",
-        ),
-        ("darwin", None, "not granted: there is none on darwin"),
-    ],
-)
-def test_threads_that_live_frames_wait_for_go_first_where_that_is_asked_for(
-    platform: str,
-    refused: str | None,
-    words: str,
-    toy_runner: MakeRunner,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    given: set[tuple[str, int, int]] = set()
-
-    def schedule(thread: int, policy: int, param: Any) -> None:
-        if refused:
-            raise PermissionError(1, refused)
-        names = {running.native_id: running.name for running in threading.enumerate()}
-        given.add((names.get(thread, str(thread)), policy, param.sched_priority))
-
-    monkeypatch.setattr(os, "sched_setscheduler", schedule)
-    monkeypatch.setattr("tactflow.engine.priority.sys", SimpleNamespace(platform=platform))
-    sinks = {
-        "out": {"use": "Collect"},
-        "far": {"use": "ThreadedCollect"},
-        "later": {"use": "Archive"},
-        "eyes": {"use": "Onlooker"},
-    }
-    live = {"capture": {"realtime": True, "pause": 0.01, "reader": 4711}}
-    with caplog.at_level("INFO", logger="tactflow"):
-        result = ran(toy_runner(live, sinks, realtime_priority=True))
-    granted = platform == "linux" and not refused
-    assert words in caplog.text
-    assert result.stats["priority"] == ("real-time" if granted else "ordinary")
-    urgent = ("tactflow-capture", "tactflow-compute", "tactflow-far", "4711") if granted else ()
-    # The lowest of its kind; what the threads start stays ordinary.
-    assert given == {(name, os.SCHED_RR | os.SCHED_RESET_ON_FORK, 1) for name in urgent}
-
-
-def test_nobody_goes_first_unasked_or_on_a_recording(
-    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "sched_setscheduler", lambda thread, *_: pytest.fail(f"asked for {thread}"))
-    ran(toy_runner({"capture": {"realtime": True}}))
-    ran(toy_runner(realtime_priority=True))
 
 
 def test_frames_that_one_branch_dropped_are_dropped_at_the_join(toy_runner: MakeRunner) -> None:

@@ -38,7 +38,6 @@ class Ramp(contract.Source):
         retake_at: int = -1
         preroll: bool = False
         overtaken: int = 0
-        reader: int | None = None
         says_when: bool = True
 
     def __init__(self, params: Params, sensor: str) -> None:
@@ -50,10 +49,6 @@ class Ramp(contract.Source):
     @property
     def missed(self) -> int:
         return self.params.overtaken
-
-    @property
-    def live_threads(self) -> list[int]:
-        return [] if self.params.reader is None else [self.params.reader]
 
     def open(self) -> None:
         if self.params.refuse:

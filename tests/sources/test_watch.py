@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -246,14 +245,6 @@ def test_capture_counts_frames_that_nobody_took_or_that_were_only_looked_at(capt
     assert (first.reference, second.reference) == (True, False)
     assert second.seq - first.seq > 9
     assert stage.missed >= 9
-
-
-def test_capture_names_the_thread_that_frames_arrive_in(capture: Captures) -> None:
-    stage = capture()
-    next(stage.frames())
-    (reader,) = stage.live_threads
-    names = {thread.native_id: thread.name for thread in threading.enumerate()}
-    assert names[reader] == "tactflow-read-flaky"
 
 
 @pytest.mark.parametrize("on_reconnect", ["keep", "retake"])

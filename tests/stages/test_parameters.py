@@ -40,7 +40,6 @@ WRONG: dict[str, list[dict[str, Any]]] = {
         *({"min_area": -1}, {"max_gap": -1}, {"min_aera": 3}),
         *({"merge": "near"}, {"merge": "largest", "max_gap": 3}),
     ],
-    "smooth": [{"min_cutoff": 0}, {"speed_coefficient": -1}, {"cutoff": 1}],
     "tracker": [{"dot": 0.2}, {"polarity": "red"}, {"max_displacement": 0}],
     "flow_in_mask": [{"dilate": -1}, {"method": "median"}],
     "visualize": [{"arrow_scale": -1}, {"view": "x"}, {"arrows": 3}, {"deepest": 0}],

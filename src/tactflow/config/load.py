@@ -75,7 +75,6 @@ def load_pipeline(
         nodes={draft.id: _node(draft, entries[draft.id], document) for draft in drafts},
         skipping=file.skipping,
         opencv_threads=file.opencv_threads,
-        realtime_priority=file.realtime_priority,
         runs=max(1, len(sensors.names(document))),
         calibration=calibration,
         warnings=_warnings(document, drafts),

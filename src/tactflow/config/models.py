@@ -135,7 +135,6 @@ class Changes(Part):
     calibration: Any = None
     skipping: Any = None
     opencv_threads: Any = None
-    realtime_priority: Any = None
     stages: Any = None
     sinks: Any = None
 
@@ -159,9 +158,6 @@ class PipelineFile(Part):
         ge=0,
         le=MAX_THREADS,
         description="threads of OpenCV; 1: none beside the caller's; null: OpenCV's choice",
-    )
-    realtime_priority: bool = Field(
-        False, description="true asks the system to run the threads of live frames before all else"
     )
     stages: Annotated[dict[Word, Annotated[StageEntry, _EMPTY]], _EMPTY] = Field(
         description="id -> stage, in order; the source of frames is one of them"

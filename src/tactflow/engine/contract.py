@@ -93,11 +93,6 @@ class Part:
     def close(self) -> None:
         """Give it back. Called once after `open` was started, in the reverse order of opening."""
 
-    @property
-    def live_threads(self) -> Sequence[int]:
-        """Native ids of threads of its own that live results wait for: they share the run's priority."""
-        return ()
-
 
 class Declared(NamedTuple):
     """What `Stage.declare` returns: the ports, in the order in which `process` takes inputs and returns a

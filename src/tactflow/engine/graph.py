@@ -138,7 +138,6 @@ class Pipeline:
     nodes: Mapping[str, Node]
     skipping: bool = True
     opencv_threads: int | None = None
-    realtime_priority: bool = False
     runs: int = 1
     calibration: Path | None = None
     warnings: Sequence[str] = field(default_factory=list[str])

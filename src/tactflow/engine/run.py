@@ -19,7 +19,6 @@ from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.link import Link
 from tactflow.engine.node import UNCONNECTED, RunningNode, Slots, TickState
 from tactflow.engine.plan import Plan, make_plan
-from tactflow.engine.priority import ask_for_realtime
 from tactflow.engine.segment import NewReferences, NodeFailedError, Segment
 from tactflow.engine.stats import Durations, NodeStats
 from tactflow.system.signals import INTERRUPTED
@@ -105,7 +104,6 @@ class Runner:
         self._paused = False
         self._steps = 0
         self._source: Source | None = None
-        self._has_priority = False
 
     # -- life cycle ---------------------------------------------------------------------------------------
 
@@ -267,8 +265,6 @@ class Runner:
             self._threads[name] = threading.Thread(target=target, name=f"tactflow-{name}", daemon=True)
         for thread in self._threads.values():
             thread.start()
-        if self._is_live and self.pipeline.realtime_priority:
-            self._go_first()
 
     def _lead_new_references(self) -> None:
         """Let the segment that sees each frame before all other stages do make frames references."""
@@ -285,18 +281,6 @@ class Runner:
     @property
     def _is_live(self) -> bool:
         return self._source is not None and self._source.live
-
-    def _go_first(self) -> None:
-        """Ask for real-time priority for the threads that a live frame's results wait for."""
-        urgent = {self._source_segment, *(name for name, s in self._segments.items() if s.urgent)}
-        own = [self._threads[name].native_id for name in urgent]
-        theirs = [id_ for _, instance in self._opened for id_ in instance.live_threads]
-        refused = ask_for_realtime([id_ for id_ in [*own, *theirs] if id_ is not None])
-        self._has_priority = refused is None
-        if refused is None:
-            logger.info("live frames go first: their threads have real-time priority")
-        else:
-            logger.warning("realtime_priority: not granted: %s", refused)
 
     def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
         """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
@@ -417,7 +401,7 @@ class Runner:
             "frames": self._frames - dropped,
             "dropped": dropped + missed,
             "wall_s": round(time.perf_counter() - self._began, 6),
-            "end": self._end or "eos",
+            **({} if self._end is None else {"end": self._end}),
             "stages": {self.pipeline.source.id: self._source_stats.entry(), **stages},
             "sinks": {
                 node.id: node.stats.entry() | {"counters": dict(node.sink.counters())}
@@ -430,7 +414,6 @@ class Runner:
                 for port, (_, signal) in node.signals.items()
             },
             "links": {link.name: link.stats() for link in self._links},
-            "priority": "real-time" if self._has_priority else "ordinary",
             "latency_ms": {"p50": self.latency.milliseconds(0.5), "p99": self.latency.milliseconds(0.99)},
         }
 

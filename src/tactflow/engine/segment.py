@@ -115,13 +115,6 @@ class Segment:
         """Whether it holds no stage."""
         return all(node.sink is not None for node in self.nodes)
 
-    @property
-    def urgent(self) -> bool:
-        """Whether somebody waits for what it does, rather than only looking on or reading it later."""
-        return any(
-            n.sink is None or (n.sink.when_live == "latest" and not n.sink.observer) for n in self.nodes
-        )
-
     def handle(self, tick: TickState) -> None:
         """Compute this segment's part of a tick and hand the tick on."""
         self._execute(tick)

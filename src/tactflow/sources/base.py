@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import cv2
@@ -67,7 +67,6 @@ class FrameReader:
     description : one line for people.
     state : of a live source: `running`, `waiting since ...` or `reconnecting since ...`.
     missed : frames of a live source that a newer one replaced before they were read.
-    threads : native ids of threads of its own that frames arrive in.
 
     name : what messages call the source.
     """
@@ -79,7 +78,6 @@ class FrameReader:
     description = ""
     state = "running"
     missed = 0
-    threads: Sequence[int] = ()
     parser_errors: tuple[type[Exception], ...] = (OSError,)
     """What `_frames` may raise on damaged data; it reaches the caller as a SourceError."""
 

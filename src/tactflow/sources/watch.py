@@ -117,7 +117,6 @@ class Watched(FrameReader):
             target=self._work, args=(source,), name=f"tactflow-read-{name}", daemon=True
         )
         self._reader.start()
-        self.threads = [id_ for id_ in (self._reader.native_id,) if id_ is not None]
 
     @property
     def state(self) -> str:  # type: ignore[override]
