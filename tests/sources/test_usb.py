@@ -123,20 +123,6 @@ def test_more_raw_pictures_than_a_port_carries_are_told(tmp_path: Path) -> None:
     assert said.startswith("left asks for 590 Mbit/s of raw pictures on a port of 480: ask for MJPG")
 
 
-@pytest.mark.parametrize(
-    ("bulk", "words"), [(False, "gets what the cameras leave"), (True, "takes bandwidth from cameras")]
-)
-def test_a_hub_shared_with_a_disc_is_told(tmp_path: Path, bulk: bool, words: str) -> None:
-    add_camera(tmp_path, 0, "usb1", "1-1", bulk=bulk)
-    add_device(tmp_path, "usb1", "1-4", "Portable SSD", "480", {"1.0": "0806"})
-    add_device(tmp_path, "usb3", "3-1", "Another disc", "480", {"1.0": "0806"})
-    (bus,) = buses(tmp_path)
-    assert bus.discs == ("Portable SSD",)
-    (said,) = advice(tmp_path, SMALL)
-    assert said.startswith("left shares a 480 Mbit/s hub (usb1) with the disc Portable SSD")
-    assert words in said
-
-
 def test_cameras_of_usb_3_fit_on_a_hub_of_their_own(tmp_path: Path) -> None:
     for number in range(3):
         add_camera(tmp_path, number, "usb2", f"2-{number + 1}", "5000")

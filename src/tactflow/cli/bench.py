@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print the tables, write what was asked for; returns the exit code."""
     stored = None if args.against is None else load_errors(args.against, quick=args.quick)
-    if args.html is not None and (problem := missing("--html", "plot", ["matplotlib"])):
+    if args.html is not None and (problem := missing("plots", "plot", ["matplotlib"])):
         raise ConfigError(problem)
     for name in ("json", "html"):
         if getattr(args, name) is not None:

@@ -21,10 +21,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from tactflow.system.spelling import listed
+
 INTERFACE, ENDPOINT, COMPANION = 4, 5, 0x30
 """Types of descriptors."""
-VIDEO, STREAMING, STORAGE = 14, 2, 8
-"""Classes of interfaces, and the subclass that carries pictures."""
+VIDEO, STREAMING = 14, 2
+"""Class of interfaces, and the subclass that carries pictures."""
 ISOCHRONOUS, BULK = 1, 2
 """Types of endpoints: with a reservation, and with what is left."""
 HIGH_SPEED: Final = 480.0
@@ -115,15 +117,14 @@ class UsbCamera:
 
 @dataclass(frozen=True, slots=True)
 class UsbBus:
-    """A root hub and what hangs on it.
+    """A root hub and its cameras.
 
-    root : `usb1`. speed : Mbit/s; None where not known. cameras : on it. discs : names of drives on it.
+    root : `usb1`. speed : Mbit/s; None where not known. cameras : on it.
     """
 
     root: str
     speed: float | None
     cameras: tuple[UsbCamera, ...] = ()
-    discs: tuple[str, ...] = ()
 
     @property
     def budget(self) -> float | None:
@@ -141,10 +142,8 @@ class UsbBus:
         wanted = [camera.reserves((modes or {}).get(camera.device)) for camera in self.cameras]
         unknown = [name for name, mbit in zip(called, wanted, strict=True) if mbit is None]
         if self.budget is None or unknown:
-            yield f"{_and(unknown or called)}: what the USB reserves is not known; compare the frame rates"
+            yield f"{listed(unknown or called)}: what the USB reserves is not known; compare the frame rates"
             return
-        share = "share" if len(called) > 1 else "shares"
-        hub = f"a {self.speed:.0f} Mbit/s hub ({self.root})"
         total = sum(mbit or 0.0 for mbit in wanted)
         for camera, name in zip(self.cameras, called, strict=True):
             mode = (modes or {}).get(camera.device)
@@ -156,14 +155,10 @@ class UsbBus:
         if total > self.budget and len(called) > 1:
             most = "" if all(camera.reserved for camera in self.cameras) else " at most"
             yield (
-                f"{_and(called)} share {hub} and reserve {total:.0f} Mbit/s{most}, of {self.budget:.0f}: "
-                f"move one to another root hub, or ask for {self._smaller(modes)}"
+                f"{listed(called)} share a {self.speed:.0f} Mbit/s hub ({self.root}) and reserve "
+                f"{total:.0f} Mbit/s{most}, of {self.budget:.0f}: move one to another root hub, or ask for "
+                f"{self._smaller(modes)}"
             )
-        for disc in self.discs:
-            busy = "gets what the cameras leave"
-            if any(camera.bulk for camera in self.cameras):
-                busy = "takes bandwidth from cameras that reserve none"
-            yield f"{_and(called)} {share} {hub} with the disc {disc}, which {busy}: move the disc"
 
     def _smaller(self, modes: Mapping[str, Mode] | None) -> str:
         if modes and all(not mode.raw for mode in modes.values()):
@@ -187,7 +182,7 @@ def usb_buses(devices: Sequence[str], sys: Path = Path("/sys")) -> list[UsbBus]:
         here = tuple(camera for camera in cameras.values() if camera.root == root)
         folder = next(iter(sys.glob(f"bus/usb/devices/{root}")), None)
         speed = None if folder is None else _number(folder / "speed")
-        buses.append(UsbBus(root, speed, here, tuple(_discs(sys, root))))
+        buses.append(UsbBus(root, speed, here))
     return buses
 
 
@@ -251,13 +246,6 @@ def _descriptors(data: bytes) -> Iterator[bytes]:
         data = data[data[0] :]
 
 
-def _discs(sys: Path, root: str) -> Iterator[str]:
-    """Names of drives below a root hub."""
-    for interface in sorted(sys.glob("bus/usb/devices/*:*")):
-        if _text(interface / "bInterfaceClass") == f"{STORAGE:02x}" and root in interface.resolve().parts:
-            yield _text(interface.resolve().parent / "product") or interface.name.partition(":")[0]
-
-
 def _text(path: Path) -> str:
     try:
         return path.read_text(errors="replace").strip()
@@ -270,7 +258,3 @@ def _number(path: Path) -> float | None:
         return float(_text(path))
     except ValueError:
         return None
-
-
-def _and(names: Sequence[str]) -> str:
-    return " and ".join(names) if len(names) < 3 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,9 +1,9 @@
-"""Suggestions for misspelled words."""
+"""Words in messages: suggestions for misspelled ones, and lists."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 MISSPELLED: Final = 0.75
@@ -35,3 +35,12 @@ def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: 
     if guess is not None:
         return f"; did you mean {guess}?"
     return f"; {otherwise}{', '.join(candidates)}" if candidates else ""
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words as a list in a sentence.
+
+    >>> listed(["mcap"]), listed(["mcap", "av"]), listed(["mcap", "av", "zarr"])
+    ('mcap', 'mcap and av', 'mcap, av and zarr')
+    """
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
