@@ -121,4 +121,4 @@ def test_the_command_prints_every_sensor_of_a_file_and_fails_for_one_that_is_gon
     assert main(["doctor", str(file), "--seconds", "30", "--json"]) == 3
     found = json.loads(capsys.readouterr().out)
     assert [rate["sensor"] for rate in found["rates"]] == ["left", "right"]
-    assert main(["doctor", str(file), "--html", str(tmp_path / "page.html")]) == 2
+    assert main(["doctor", str(file), "--report", str(tmp_path / "report.json")]) == 2

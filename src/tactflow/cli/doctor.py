@@ -19,7 +19,7 @@ from tactflow.sources import KINDS
 from tactflow.system.signals import ending_handled, interrupt
 
 if TYPE_CHECKING:
-    from tactflow.doctor import Finding, Observation
+    from tactflow.doctor import Finding
 
 LIVE_SECONDS = 10.0
 """How long a source is looked at unless told otherwise, s: time for some presses."""
@@ -51,7 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "last, and press it in between",
     )
     add_json(parser)
-    parser.add_argument("--html", type=Path, metavar="FILE", help="also write the table as a page")
     parser.add_argument(
         "--report",
         type=Path,
@@ -91,8 +90,6 @@ def run(args: argparse.Namespace) -> int:
         summary = f"{counts['fault']} to change, {summary}"
     elif verdict == "good":
         summary = "nothing is wrong with these pictures"
-    if args.html is not None:
-        _write_page(args.html, title, summary, seen, findings)
     if args.report is not None:
         try:
             write_bug_report(args.report, seen, findings, pipeline.read_text("utf-8"), picture=args.picture)
@@ -110,9 +107,8 @@ def _run_together(args: argparse.Namespace) -> int:
     """Print the rates of all sensors of a pipeline; returns 0, or 3 if one is far too slow."""
     from tactflow.doctor import Sensor, measure_together
 
-    if args.html is not None or args.report is not None:
-        option = "--report" if args.html is None else "--html"
-        raise ConfigError(f"{option} is for the pictures of one sensor: give --source")
+    if args.report is not None:
+        raise ConfigError("--report is for the pictures of one sensor: give --source")
     file = find_pipeline(args.pipeline)
     names: list[str | None] = [*sensor_names(file)] or [None]
     loaded = [load_pipeline(file, sensor=name) for name in names]
@@ -147,14 +143,3 @@ def _lines(finding: Finding) -> Iterator[str]:
             lines = textwrap.wrap(text, WIDTH - INDENT)
             yield f"{title + ': ':>{INDENT}}{lines[0]}"
             yield from (" " * INDENT + line for line in lines[1:])
-
-
-def _write_page(path: Path, title: str, summary: str, seen: Observation, findings: list[Finding]) -> None:
-    from tactflow.report import Section, Table, mark, picture, write_report
-
-    rows = [
-        [mark(SIGNS[f.verdict], f.verdict in ("good", "unknown")), f.name, f.says, f.effect, f.advice]
-        for f in findings
-    ]
-    table = Table(["", "check", "measured", "effect", "what to change"], rows)
-    write_report(path, title, [Section(summary, pictures=[picture(seen.pairs[0].image)], tables=[table])])

@@ -229,19 +229,6 @@ def _banding(observed: Observation) -> Measured | str:
     )
 
 
-@check("light", "%", warning=50.0, fault=math.inf)
-def _light(observed: Observation) -> Measured:
-    typical = np.maximum(observed.typical, measures.DIM)
-    levels = np.array([float(np.median(gray / typical)) for gray in observed.grays])
-    change = 100.0 * float(levels.max() / max(levels.min(), 1e-9) - 1.0)
-    return Measured(
-        change,
-        f"changes by {change:.1f} %",
-        "harmless up to 50 %; more was not measured",
-        "fixed exposure and white balance; warm up the lamps",
-    )
-
-
 # JPEG qualities of about 30 and 10: the step is 11.5 at quality 50 (ITU-T T.81, table K.1).
 @check("compression", "grey levels", warning=18.0, fault=55.0)
 def _compression(observed: Observation) -> Measured:
