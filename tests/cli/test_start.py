@@ -5,9 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -19,20 +21,48 @@ from tactflow.engine.errors import SourceError
 from tactflow.view import questions
 from tests.clock import PATIENCE
 
+Recorded = Callable[[str], str]
+"""Name and settings of a simulated scene -> a recording of it with few pixels."""
+
 
 def propose(source: str, out: Path, *words: str) -> int:
     return main(["start", source, "--yes", "--no-run", "--out", str(out), *words])
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    folder = tmp_path_factory.mktemp("recorded")
+
+    @cache
+    def record(scene: str) -> str:
+        gel = tactflow.open_scene(scene)
+        file = folder / f"{scene.partition('?')[0]}-{len(gel)}.npy"
+        np.save(file, np.stack([cv2.resize(gel.frame(seq), (400, 300)) for seq in range(len(gel))]))
+        return str(file)
+
+    return record
+
+
 @pytest.mark.parametrize(
-    ("source", "base", "dots"),
-    [("sim:press?frames=120", "default", True), ("sim:halo?frames=120", "markerless", False)],
+    ("scene", "base", "dots"),
+    [
+        ("press", "default", True),
+        ("halo", "markerless", False),
+        ("bright_dots", "default", True),
+        ("painted", "default", True),
+        ("mixed", "default", True),
+    ],
 )
 def test_a_script_takes_the_proposals_and_the_file_finds_the_contacts(
-    source: str, base: str, dots: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: str,
+    base: str,
+    dots: bool,
+    recorded: Recorded,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "made.yaml"
-    assert propose(source, out) == 0
+    assert propose(recorded(f"{scene}?frames=120"), out) == 0
     assert "is written" in capsys.readouterr().err
     text = out.read_text()
     assert f"from {base}.yaml" in text.splitlines()[0]
@@ -44,21 +74,22 @@ def test_a_script_takes_the_proposals_and_the_file_finds_the_contacts(
 
 
 def test_a_file_is_never_replaced_without_being_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "pipeline.yaml"
     out.write_text("mine")
-    assert propose("sim:press?frames=60", out) == 2
+    source = recorded("press?frames=60")
+    assert propose(source, out) == 2
     assert "already there; give --overwrite" in capsys.readouterr().err
     assert out.read_text() == "mine"
-    assert propose("sim:press?frames=60", out, "--overwrite") == 0
+    assert propose(source, out, "--overwrite") == 0
     assert out.read_text() != "mine"
 
 
 def test_without_a_press_the_proposal_says_that_contacts_are_untested(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert propose("sim:idle?frames=40", tmp_path / "made.yaml") == 0
+    assert propose(recorded("idle?frames=40"), tmp_path / "made.yaml") == 0
     assert "No press was seen" in capsys.readouterr().err
 
 
@@ -135,9 +166,9 @@ class Scripted:
 
 
 def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cameras = [str(tmp_path / "busy.avi"), "sim:idle?frames=30", "sim:halo?frames=60"]
+    cameras = [str(tmp_path / "busy.avi"), "sim:idle?frames=30", recorded("halo?frames=60")]
     answers = Scripted("no", "yes", "digit", "90", "write")
     monkeypatch.setattr(start, "_cameras", lambda _: cameras)
     monkeypatch.setattr(start, "Questions", lambda *_: answers)
@@ -152,10 +183,10 @@ def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
     assert made["sensor"] == "digit"
 
 
-def test_who_quits_gets_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_quits_gets_no_file(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(start, "Questions", lambda *_: Scripted("unknown", "0", "quit"))
     out = tmp_path / "made.yaml"
-    assert main(["start", "sim:press?frames=60", "--out", str(out)]) == 130
+    assert main(["start", recorded("press?frames=60"), "--out", str(out)]) == 130
     assert not out.exists()
 
 

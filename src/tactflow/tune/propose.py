@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import takewhile
 from textwrap import shorten
 from typing import Any, Final
@@ -163,7 +164,8 @@ def divide(frames: Sequence[Image], at_rest: int | None = None) -> Seen:
     return Seen(list(frames), reference, rest, pressed, changes)
 
 
-def distinct_pipelines() -> list[list[str]]:
+@cache
+def distinct_pipelines() -> Sequence[Sequence[str]]:
     """Shipped pipelines by what they compute, as lists of names; those of built-in stages only.
 
     Pipelines that differ in geometry alone are in one list. Those that rectify the picture of a certain
