@@ -217,12 +217,14 @@ def test_listen_prints_one_readable_line_a_message(
 
     assert run_listen(publisher, "--count", "4", "--timeout", str(LONG), send=send) == 0
     out, err = capsys.readouterr()
-    contact = "contact 5124 px^2 at (150.2, 201.7)  angle -12.3 deg  flow (+1.21, -0.33) px of 9  markers 2/3"
+    contact = (
+        "contact 5124 px^2 at (150.2, 201.7)  angle -12.3 deg  flow (+1.21, -0.33) px (9 dots)  dots 2/3"
+    )
     assert out.splitlines() == [
-        "main 0  t 0.000 s  no contact  markers 2/3",
+        "main 0  t 0.000 s  no contact  dots 2/3",
         f"main 1  t 0.100 s  {contact}",
         f"main 4  t 0.400 s  {contact}  (2 lost)",
-        f"main 5  t 0.500 s  {contact.replace('angle -12.3 deg', 'angle -')}",
+        f"main 5  t 0.500 s  {contact.replace('angle -12.3 deg', 'no direction')}",
     ]
     assert err == ""
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tactflow.cli.options import add_json, add_pipeline, load_plan
+from tactflow.cli.progress import END_WORDS
 from tactflow.cli.statistics import Statistics, milliseconds
 from tactflow.cli.terminal import show, show_json
 from tactflow.engine.contract import Sink
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 def _whole_run(run: Statistics) -> str:
     latency = f"latency p50 {milliseconds(run.latency_ms.p50)}, p99 {milliseconds(run.latency_ms.p99)}"
     frames = f"{run.frames} frames in {run.wall_s:.1f} s, {run.dropped} dropped"
-    return f"the run: {frames}, {latency}, end: {run.end}"
+    return f"the run: {frames}, {latency}, ended: {END_WORDS.get(run.end, run.end)}"
 
 
 def _facts(

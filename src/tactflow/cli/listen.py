@@ -82,16 +82,16 @@ def describe(result: Result) -> str:
     parts = [f"{result.sensor} {result.seq}", f"t {result.t:.3f} s"]
     if contact is not None:
         parts.append(f"contact {contact.area:.0f} px^2 at {_pair(contact.center, '.1f')}")
-        parts.append("angle -" if contact.angle is None else f"angle {contact.angle:.1f} deg")
+        parts.append("no direction" if contact.angle is None else f"angle {contact.angle:.1f} deg")
     else:
         reason = result.skipped.get("contact", "no_contact")
         parts.append("no contact" if reason == "no_contact" else f"no contact ({reason})")
     if flow is not None:
-        mean = "-" if flow.mean is None else f"{_pair(flow.mean, '+.2f')} px"
-        parts.append(f"flow {mean} of {flow.count}")
+        mean = "unknown" if flow.mean is None else f"{_pair(flow.mean, '+.2f')} px"
+        parts.append(f"flow {mean} ({flow.count} dots)")
     if markers is not None:
         tracked = np.count_nonzero(markers.status == MarkerStatus.TRACKED)
-        parts.append(f"markers {tracked}/{len(markers.status)}")
+        parts.append(f"dots {tracked}/{len(markers.status)}")
     return printable("  ".join(parts))
 
 

@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from tactflow.cli.terminal import progress_bar
 from tactflow.engine.run import Progress, Runner, RunResult
 
+END_WORDS = {"eos": "end of source", "max_frames": "--max-frames reached", "signal": "stopped"}
+"""`end` of the statistics, in words."""
+
 
 @contextmanager
 def run_progress(runner: Runner, *, shown: bool) -> Iterator[Callable[[Progress], None]]:
@@ -28,7 +31,7 @@ def summary(result: RunResult, runner: Runner) -> str:
     """How a run ended: frames, drops, contacts, latency, and where each sink wrote."""
     stats = result.stats
     # The error itself has been printed already.
-    end = "error" if result.error is not None else stats["end"]
+    end = "error" if result.error is not None else END_WORDS.get(stats["end"], stats["end"])
     lines = [f"{_frames(stats['frames'])} in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({end})"]
     # Of several, the last one is what the results carry.
     contacts = [s for name, s in stats["signals"].items() if name.endswith(".contact")]

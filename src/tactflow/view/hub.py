@@ -188,7 +188,7 @@ class Hub:
 
     def end(self) -> None:
         """Send every page the reason for the end of the run, and disconnect it."""
-        self._end = str(self._commands.snapshot().get("end", "eos"))
+        self._end = str(self._commands.snapshot()["end"])
         for page in self.pages:
             page.ended = True
         self.post_stats()
