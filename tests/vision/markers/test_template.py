@@ -54,8 +54,8 @@ def test_in_a_picture_that_does_not_change_marks_stay_where_they_are() -> None:
     """Small marks near the middle between two phases, where either template may lead to the other."""
     origin = grid(7, 6, PITCH, corner=(14.2, 14.1))
     model = MarkerTemplates(render(SIZE, origin, 2.2)[:, :, 0].astype(np.float32), origin, 2.2)
-    image = render(SIZE, origin + (0.3, 0.4), 2.2, noise=6.0, seed=1)
-    found = [model.align(image, origin + (0.3, 0.4)).position]
+    image = render(SIZE, np.add(origin, (0.3, 0.4)), 2.2, noise=6.0, seed=1)
+    found = [model.align(image, np.add(origin, (0.3, 0.4))).position]
     for _ in range(4):
         found.append(model.align(image, found[-1]).position)
     np.testing.assert_array_equal(found[-1], found[-2])

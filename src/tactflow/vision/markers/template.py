@@ -323,7 +323,7 @@ def align_marks(
         seen_left, seen_top, varies = -1, -1, 0.0
         phase_x, phase_y = nearest_phase(x, y, width, height)
         before_x, before_y = -1, -1
-        for number in range(ROUNDS + 1):
+        for _ in range(ROUNDS + 1):
             left, top = phase_x // PHASES, phase_y // PHASES
             which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + marks[n]
             # A step of less than a pixel often sees the same patch from another phase.
