@@ -107,7 +107,10 @@ def test_statistics_say_how_often_and_what_it_cost(
     (pipeline / "run.json").write_text(json.dumps(STATISTICS))
     assert main(["explain", "--stats", "run.json"]) == 0
     out = capsys.readouterr().out
-    assert "the run: 100 frames in 1.5 s, 2 dropped, latency p50 2.00 ms, p99 5.00 ms, ended: end of source" in out
+    assert (
+        "the run: 100 frames in 1.5 s, 2 dropped, latency p50 2.00 ms, p99 5.00 ms, ended: end of source"
+        in out
+    )
     facts = paragraphs(out)
     # 59 frames left out at 0.3 ms each, over 100 frames; the failed one is no gain.
     assert facts["outline"]["statistics"] == (

@@ -316,7 +316,7 @@ def test_one_signal_ends_all_sensors_well(folder: Path, number: int) -> None:
     _, errors = process.communicate(timeout=PATIENCE)
     if number == signal.SIGINT:
         assert process.returncode == 0, errors
-        assert errors.count("(signal)") == 2
+        assert errors.count("(stopped)") == 2
     # The last that a sensor writes, also where nobody is left to tell it.
     statistics = [folder / "stats-left.json", folder / "stats-right.json"]
     until(lambda: all(file.exists() and file.read_text().endswith("}\n") for file in statistics))
