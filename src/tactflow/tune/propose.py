@@ -165,7 +165,7 @@ def divide(frames: Sequence[Image], at_rest: int | None = None) -> Seen:
 
 
 @cache
-def distinct_pipelines() -> Sequence[Sequence[str]]:
+def distinct_pipelines() -> list[list[str]]:
     """Shipped pipelines by what they compute, as lists of names; those of built-in stages only.
 
     Pipelines that differ in geometry alone are in one list. Those that rectify the picture of a certain
