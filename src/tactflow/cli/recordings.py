@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 
 EXPORTS = "tactflow.exports"
 """Group of entry points: name of a format -> function that writes a dataset. It is called with a folder to
-fill, `(name, results)` of each recording, and `fps`, `task` and `pictures` as keywords."""
+fill, `(name, results)` of each recording, and `fps`, `task` and `pictures` as keywords. One whose
+`fps` is None by default can keep every frame and its time."""
 _frame_rate = number(int, 1, 1000, "1 to 1000 frames a second")
 
 
@@ -28,8 +30,8 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `export`."""
     parser.add_argument(
         "format",
-        help="lerobot (a LeRobot dataset, layout v3.0), replay-buffer (Zarr, for Diffusion Policy), or that "
-        "of a plug-in",
+        help="hdf5 or zarr (all frames and numbers as plain arrays), lerobot (a dataset of layout v3.0), "
+        "replay-buffer (Zarr, for Diffusion Policy), or that of a plug-in",
     )
     parser.add_argument(
         "recordings",
@@ -44,7 +46,9 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
         "--pipeline", metavar="PIPELINE", help="what finds contact and flow (default: as `tactflow run`)"
     )
     parser.add_argument(
-        "--fps", type=_frame_rate, help="of the dataset (default: that of the first recording)"
+        "--fps",
+        type=_frame_rate,
+        help="of the dataset (default: that of the first recording; hdf5 and zarr: every frame at its time)",
     )
     parser.add_argument(
         "--task", default="touch", help="what is done, in words: the dataset keeps it (default: touch)"
@@ -68,7 +72,9 @@ def run_export(args: argparse.Namespace) -> int:
     exporter = _exporter(args.format)
     if args.out.exists():
         raise ConfigError(f"--out: {args.out} is already there; give another folder")
-    fps = args.fps or _rate(args.recordings[0])
+    rate = signature(exporter).parameters.get("fps")
+    keeps_every_frame = rate is not None and rate.default is None
+    fps = args.fps if args.fps or keeps_every_frame else _rate(args.recordings[0])
     started: list[str] = []
     try:
         with notes(), writing(args.out), completed(args.out) as folder:
@@ -77,7 +83,7 @@ def run_export(args: argparse.Namespace) -> int:
     except StageError as error:
         raise StageError(f"{started[-1]}: {error}" if started else str(error)) from error
     count = len(args.recordings)
-    say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'} at {fps} fps")
+    say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'}{f' at {fps} fps' if fps else ''}")
     return 0
 
 

@@ -1,0 +1,194 @@
+"""`tactflow export hdf5` and `zarr`: plain arrays that are what the pipeline found, and that play again."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import redirect_stderr
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tactflow
+from tactflow.adapters import array_files
+from tactflow.adapters.array_files import FILL, UNIT, Hdf5, Zarr, write
+from tactflow.cli.main import main
+from tactflow.engine.errors import StageError
+from tactflow.engine.frame import Frame
+from tactflow.message.columns import frame_columns
+from tactflow.message.result import Result
+from tactflow.sources import open_source
+from tactflow.vision.types import Markers
+from tests.faults.rig import fill, small_disk
+
+h5py = pytest.importorskip("h5py", reason="the extra hdf5 is not installed")
+zarr = pytest.importorskip("zarr", reason="the extra zarr is not installed")
+
+SPECS = ["sim:press?frames=100", "sim:twist?frames=20"]
+SUFFIXES = {"hdf5": ".h5", "zarr": ".zarr"}
+
+
+def opened(path: Path) -> Any:
+    return h5py.File(path, "r") if path.suffix == ".h5" else zarr.open_group(path, mode="r")
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Result]]:
+    """Both formats of the same recordings, and what the pipeline finds in the first one."""
+    out = tmp_path_factory.mktemp("export")
+    for name in SUFFIXES:
+        with redirect_stderr(StringIO()) as said:
+            assert main(["export", name, *SPECS, "--out", str(out / name)]) == 0
+        assert said.getvalue().endswith(f"{out / name}: 2 episodes\n")
+    return out, list(tactflow.stream(source=SPECS[0], settings={"sinks": {}}, images=True))
+
+
+@pytest.mark.parametrize("name", SUFFIXES)
+def test_the_arrays_are_what_was_found(name: str, exported: tuple[Path, list[Result]]) -> None:
+    out, results = exported
+    file = opened(out / name / f"episode_000{SUFFIXES[name]}")
+    assert np.array_equal(file["frames"][:], [r.frame.image for r in results])
+    assert list(file["t"][:]) == [r.t for r in results]
+    assert list(file["seq"][:]) == list(range(100))
+    assert list(file["reference"][:]) == [r.frame.reference for r in results]
+    touched = np.array([r.contact is not None for r in results])
+    assert 20 < touched.sum() < 80
+    assert np.array_equal(np.isfinite(file["contact_area"][:]), touched)
+    assert np.array_equal(file["flow_count"][:] >= 0, touched)
+    for index, result in enumerate(results):
+        assert result.markers is not None
+        assert np.array_equal(file["markers_position"][index], result.markers.position)
+        assert np.array_equal(file["markers_origin"][index], result.markers.origin)
+        assert np.array_equal(file["markers_status"][index], result.markers.status)
+        hull = file["contact_hull"][index]
+        found = np.empty((0, 2)) if result.contact is None else result.contact.hull
+        assert np.array_equal(hull[np.isfinite(hull[:, 0])], found)
+        if result.contact is not None and result.flow is not None:
+            assert file["contact_area"][index] == result.contact.area
+            assert file["flow_count"][index] == result.flow.count
+
+
+@pytest.mark.parametrize("name", SUFFIXES)
+def test_its_attributes_say_what_is_in_it(name: str, exported: tuple[Path, list[Result]]) -> None:
+    out, results = exported
+    file = opened(out / name / f"episode_001{SUFFIXES[name]}")
+    assert file.attrs["recording"] == SPECS[1]
+    assert (file.attrs["sensor"], file.attrs["schema"]) == ("main", "tactflow.frame/1")
+    mapping = results[0].value("mapping")
+    assert np.array_equal(file.attrs["raw_to_processed"], mapping.matrix)
+    units = {"t": "s", "contact_area": "px^2", "contact_angle": "degrees", "force_value_z": "N"}
+    units |= {"markers_position": "px", "contact_volume_mm3": "mm^3", "scale_origin_x": "px"}
+    units |= {"scale_mm_per_px_x": "mm per px", "contact_center_mm_x": "mm", "contact_slope": ""}
+    assert {key: file[key].attrs.get("units", "") for key in units} == units
+    assert file["markers_status"].attrs["description"] == "(N, M): 0 tracked, 1 inferred, 2 lost"
+    assert file["flow_count"].attrs["missing"] == -1
+
+
+def test_every_length_angle_and_force_has_its_unit() -> None:
+    bare = {c.name for c in frame_columns() if c.kind in FILL and not UNIT.search(c.description)}
+    assert bare == {
+        *("seq", "contact_slope", "contact_confidence", "flow_count", "features_values"),
+        *("contact_normal_x", "contact_normal_y", "contact_normal_z"),
+        *("flow_divergence", "flow_divergence_stderr", "flow_shear_1", "flow_shear_2", "flow_shear_stderr"),
+        *("slip_slipping", "slip_stick_ratio", "force_in_range"),
+    }
+
+
+@pytest.mark.parametrize("name", SUFFIXES)
+def test_it_plays_again_with_the_same_results(name: str, exported: tuple[Path, list[Result]]) -> None:
+    out, results = exported
+    source = f"{out / name / f'episode_000{SUFFIXES[name]}'}?dataset=frames&times=t"
+    again = list(tactflow.stream(source=source, settings={"sinks": {}}, images=True))
+    assert len(again) == len(results)
+    for one, other in zip(again, results, strict=True):
+        assert np.array_equal(one.frame.image, other.frame.image)
+        assert one.to_json(detail=True) == other.to_json(detail=True)
+
+
+def black(count: int, markers: int = 0) -> list[Result]:
+    """Frames of black pictures with so many markers; none where 0."""
+    image = np.zeros((8, 6, 3), np.uint8)
+    points = np.arange(2.0 * markers).reshape(-1, 2)
+    found = Markers(points, points, np.zeros(markers, np.uint8), np.zeros(markers)) if markers else None
+    return [Result(Frame("main", seq, seq / 10, image), {"markers": found}) for seq in range(count)]
+
+
+@pytest.mark.parametrize("kind", [Hdf5, Zarr])
+def test_what_is_missing_differs_from_every_number_and_black_frames_are_frames(
+    kind: type[Hdf5 | Zarr], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Many chunks, the last of which is not full.
+    monkeypatch.setattr(array_files, "CHUNK_ROWS", 4)
+    path = tmp_path / ("black.h5" if kind is Hdf5 else "black.zarr")
+    file = kind(path)
+    assert write(file, "black", [*black(5), *black(3, 2), *black(5, 3)]) == 13
+    file.close()
+    found = opened(path)
+    assert found["frames"].chunks[0] == 4
+    assert found["markers_position"].shape == (13, 3, 2)
+    assert np.isfinite(found["markers_position"][:, :, 0]).sum(1).tolist() == [0] * 5 + [2] * 3 + [3] * 5
+    assert found["markers_status"][6].tolist() == [0, 0, 255]
+    assert np.isnan(found["contact_area"][:]).all()
+    assert found["force_in_range"][:].tolist() == [-1] * 13
+    source = open_source(f"{path}?dataset=frames")
+    assert sum(1 for _ in iter(source.read, None)) == 13
+    source.close()
+
+
+def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there, out = tmp_path / "there", tmp_path / "out"
+    there.mkdir()
+    for name, arguments, code, said in (
+        ("hdf5", ["sim:press?frames=2", "--out", str(there)], 2, "is already there"),
+        ("hdf5", ["sim:press?frames=2", "no-such.mcap"], 4, "no-such.mcap: no such file"),
+    ):
+        options = [] if "--out" in arguments else ["--out", str(out)]
+        assert main(["export", name, *arguments, *options]) == code
+        assert said in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == [there]
+    monkeypatch.setattr(array_files, "missing", lambda what, _, modules: f"{what} need {modules[0]}")
+    for name, needed in (("hdf5", "HDF5 files need h5py"), ("zarr", "Zarr files need zarr")):
+        assert main(["export", name, "sim:press?frames=2", "--out", str(out)]) == 3
+        assert needed in capsys.readouterr().err
+        assert not out.exists()
+
+
+def test_frames_at_a_rate_are_the_nearest(tmp_path: Path) -> None:
+    assert main(["export", "hdf5", "sim:press?frames=10", "--fps", "20", "--out", str(tmp_path / "out")]) == 0
+    assert opened(tmp_path / "out/episode_000.h5")["seq"][:].tolist() == [0, 3, 6, 9]
+
+
+def test_a_recording_without_a_frame_is_refused(tmp_path: Path) -> None:
+    file = Hdf5(tmp_path / "none.h5")
+    with pytest.raises(StageError, match="there is no frame in it"):
+        write(file, "none", [])
+    file.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mounts a small disk")
+@pytest.mark.parametrize("name", SUFFIXES)
+@pytest.mark.parametrize("free", [0, 4 << 20])
+def test_a_full_disk_is_told_and_leaves_nothing(name: str, free: int, tmp_path: Path) -> None:
+    # In a process of its own: HDF5 can crash it as it ends.
+    with small_disk() as disk:
+        (disk / "spare").write_bytes(bytes(free))
+        fill(disk)
+        (disk / "spare").unlink()
+        command = [sys.executable, "-m", "tactflow", "export", name, "sim:press?frames=30"]
+        done = subprocess.run(
+            [*command, "--out", str(disk / "out")],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=os.environ | {"TMPDIR": str(tmp_path)},
+        )
+        assert (done.returncode, done.stdout) == (3, ""), done.stderr
+        assert f"{disk / 'out'}: cannot be written" in done.stderr
+        assert "No space left on device" in done.stderr
+        assert [path.name for path in disk.iterdir()] == ["filler"]
