@@ -17,6 +17,10 @@ from tests import chromium
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+# Matrices here are small: threads of the linear algebra would wait in a loop and take half of the processors.
+for library in ("OPENBLAS", "OMP", "MKL"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
 # Tests start hundreds of processes; without files of byte code each would compile every module anew (0.3 s).
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

@@ -243,9 +243,18 @@ def settled(page: Any) -> None:
 
 
 def test_a_recording_is_paused_stepped_resumed_and_stopped(
-    run: Callable[..., Run], open_page: Callable[..., Any]
+    run: Callable[..., Run], open_page: Callable[..., Any], tmp_path: Path
 ) -> None:
-    started = run("--source", ENDLESS, pipeline="pipelines/markerless.yaml")
+    # At full speed it would take all processors while the page is clicked.
+    (tmp_path / "slow.py").write_text(
+        "import time\n"
+        "from tactflow import Frame, Sink\n"
+        "class Slow(Sink):\n"
+        "    def write(self, frame: Frame) -> None:\n"
+        "        time.sleep(0.02)\n"
+    )
+    slow = ("--set", f"sinks.slow={{use: {tmp_path}/slow.py:Slow}}")
+    started = run("--source", ENDLESS, *slow, pipeline="pipelines/markerless.yaml")
     page = open_page(started.url, lost=True)
     watch(page)
     page.click("#pause")
