@@ -19,7 +19,8 @@ RUN = """
 from tactflow.cli.main import main
 from tactflow.vision import compiled
 sinks = "sinks={jsonl: {path: out.jsonl}}"
-code = main(["run", "--quiet", "--max-frames", "30", "--source", "sim:press", "--set", sinks])
+options = ["--quiet", "--max-frames", "30", "--source", "sim:unmarked", "--set", sinks]
+code = main(["run", "markerless", *options])
 import tactflow.stages.hull
 print(tactflow.stages.hull.__file__)
 # Those of the pipeline: `stages` imports others, too.
@@ -64,7 +65,7 @@ def test_the_wheel_runs_in_a_fresh_environment_and_compiles_nothing_after_warmup
     program = tmp_path / "venv" / "bin" / "tactflow"
     empty = tmp_path / "empty"
     empty.mkdir()
-    warm = command(program, "warmup", cwd=empty)
+    warm = command(program, "warmup", "markerless", cwd=empty)
     said = re.search(r"(\d+) loops are ready; (\d+) of them were compiled", warm)
     assert said is not None
     assert 0 < int(said[2]) <= int(said[1])

@@ -141,7 +141,7 @@ def test_marks_as_bright_as_lamps_are_still_marks() -> None:
 @pytest.mark.parametrize("pitch", [8, 24])
 @pytest.mark.parametrize("kind", ["threads", "uneven threads", "checks"])
 def test_the_crossings_of_a_cloth_are_refused_in_words(kind: str, pitch: int) -> None:
-    y, x = np.mgrid[:360, :480] / pitch
+    y, x = np.mgrid[: 15 * pitch, : 20 * pitch] / pitch
     warp, weft = np.sin(2 * np.pi * x), np.sin(2 * np.pi * y)
     cloth = {
         "threads": warp + weft,
