@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Image
-from tactflow.system.spelling import listed
+from tactflow.system.spelling import joined
 from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -115,7 +115,7 @@ class Preprocess(Stage):
                 if params.downsample > 1 and min(after) < FEWEST_PIXELS
                 else ""
             )
-            logger.info("%d x %d %s to %d x %d: stages.preprocess%s", *before, listed(steps), *after, hint)
+            logger.info("%d x %d %s to %d x %d: stages.preprocess%s", *before, joined(steps), *after, hint)
 
     def _build(self, width: int, height: int) -> Preprocessor:
         params = self.params

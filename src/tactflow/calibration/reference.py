@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 
 from tactflow.engine.errors import ConfigError
 from tactflow.system.files import expanded
-from tactflow.system.spelling import listed
+from tactflow.system.spelling import joined
 from tactflow.vision.arrays import Floats
 
 NAMES: Final = {
@@ -121,7 +121,7 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
     if missing:
         raise ConfigError(
             f"{path}: the first line must name the columns, separated by commas; "
-            f"missing {listed(missing)}, found {', '.join(filter(None, found[:8])) or 'nothing'}"
+            f"missing {joined(missing)}, found {', '.join(filter(None, found[:8])) or 'nothing'}"
         )
     return columns
 

@@ -21,7 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tactflow.system.spelling import listed
+from tactflow.system.spelling import joined
 
 INTERFACE, ENDPOINT, COMPANION = 4, 5, 0x30
 """Types of descriptors."""
@@ -142,7 +142,7 @@ class UsbBus:
         wanted = [camera.reserves((modes or {}).get(camera.device)) for camera in self.cameras]
         unknown = [name for name, mbit in zip(called, wanted, strict=True) if mbit is None]
         if self.budget is None or unknown:
-            yield f"{listed(unknown or called)}: what the USB reserves is not known; compare the frame rates"
+            yield f"{joined(unknown or called)}: what the USB reserves is not known; compare the frame rates"
             return
         total = sum(mbit or 0.0 for mbit in wanted)
         for camera, name in zip(self.cameras, called, strict=True):
@@ -155,7 +155,7 @@ class UsbBus:
         if total > self.budget and len(called) > 1:
             most = "" if all(camera.reserved for camera in self.cameras) else " at most"
             yield (
-                f"{listed(called)} share a {self.speed:.0f} Mbit/s hub ({self.root}) and reserve "
+                f"{joined(called)} share a {self.speed:.0f} Mbit/s hub ({self.root}) and reserve "
                 f"{total:.0f} Mbit/s{most}, of {self.budget:.0f}: move one to another root hub, or ask for "
                 f"{self._smaller(modes)}"
             )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
 
-from tactflow.system.spelling import listed
+from tactflow.system.spelling import joined
 
 OPENCV = "opencv-python-headless"
 """The OpenCV package that tactflow depends on."""
@@ -25,7 +25,7 @@ def missing(what: str, extra: str, modules: Sequence[str]) -> str | None:
     absent = [name for name in modules if importlib.util.find_spec(name) is None]
     if not absent:
         return None
-    return f"{what} need {listed(absent)}: pip install 'tactflow[{extra}]'"
+    return f"{what} need {joined(absent)}: pip install 'tactflow[{extra}]'"
 
 
 def opencv_conflict() -> str | None:

@@ -37,10 +37,10 @@ def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: 
     return f"; {otherwise}{', '.join(candidates)}" if candidates else ""
 
 
-def listed(words: Sequence[str]) -> str:
+def joined(words: Sequence[str]) -> str:
     """Words as a list in a sentence.
 
-    >>> listed(["mcap"]), listed(["mcap", "av"]), listed(["mcap", "av", "zarr"])
+    >>> joined(["mcap"]), joined(["mcap", "av"]), joined(["mcap", "av", "zarr"])
     ('mcap', 'mcap and av', 'mcap, av and zarr')
     """
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
