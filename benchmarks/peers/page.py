@@ -7,6 +7,8 @@ from pathlib import Path
 from string import Template
 from typing import Any, Final
 
+from benchmarks.peers.depth import NETWORK
+
 Numbers = Mapping[str, Any]
 Column = tuple[str, str, str, int]
 """Heading; path in the numbers, with * for the method; format; 1 if more is better, -1 if less is."""
@@ -42,13 +44,16 @@ CONTACT: Final[Sequence[Column]] = (
     ("MB", "memory|contact|*", ".0f", -1),
     ("lines", "code|contact|*", ".0f", -1),
 )
+SETS: Final = ("gelslam", "mini_ball", "mini_ball_9mm", "digit_fots", "wedge_ball")
 DEPTH: Final[Sequence[Column]] = (
-    ("normals, deg", "normals", ".1f", -1),
-    ("cap, %", "cap", ".1f", -1),
-    ("ms", "ms", ".1f", -1),
-    ("s to learn", "learning_s", ".1f", -1),
+    *(
+        (f"{'normals, deg: ' * (not i)}{name}", f"depth|{name}|*|normals", ".1f", -1)
+        for i, name in enumerate(SETS)
+    ),
+    *((f"{'cap, %: ' * (not i)}{name}", f"depth|{name}|*|cap", ".1f", -1) for i, name in enumerate(SETS)),
+    ("ms, mini_ball", "depth|mini_ball|*|ms", ".1f", -1),
+    ("s to learn", "depth|mini_ball|*|learning_s", ".1f", -1),
 )
-"""Paths below those of a set and a method."""
 
 
 def write(numbers: Numbers, path: Path) -> None:
@@ -60,25 +65,19 @@ def write(numbers: Numbers, path: Path) -> None:
 def text(numbers: Numbers, picture: str) -> str:
     """The page, Markdown."""
     ours = [name for name in numbers["contact"]["all"] if name.startswith("tactflow")]
-    contacts = [*ours, "tactflow, chosen", *(name for name in numbers["contact"]["all"] if name not in ours)]
+    contacts = [*ours, *(name for name in numbers["contact"]["all"] if name not in ours)]
     tables = {
         "dots": list(table(numbers, DOTS, list(numbers["dots"]["all"]))),
         "contact": list(table(numbers, CONTACT, contacts)),
-        "depth": [],
+        "depth": list(table(numbers, DEPTH, ["tactflow", NETWORK])),
     }
-    for name, answers in numbers["depth"].items():
-        columns = [(head, f"depth|{name}|*|{key}", form, sign) for head, key, form, sign in DEPTH]
-        rows = list(table(numbers, columns, [key for key in answers if key != "presses"], f"{name}, "))
-        tables["depth"] += rows[2:] if tables["depth"] else rows
     others = {
         "machine": [", ".join(f"{key} {value}" for key, value in numbers["machine"].items())],
         "better": ["; ".join(better(tables))],
         "picture": [picture],
-        "dots_scenes": scene_table(numbers["dots"]["scenes"], "displacement_rms", ".3f"),
-        "contact_scenes": scene_table(numbers["contact"]["scenes"], "contact_iou", ".2f"),
-        "settings": settings(numbers),
+        "settings": ["; ".join(settings(numbers))],
         "attempts": attempts(numbers["attempts"]),
-        "failures": failures(numbers["failures"]),
+        "failures": ["; ".join(failures(numbers["failures"]))],
     }
     values = Values({name: "\n".join(lines) for name, lines in (tables | others).items()})
     values.numbers = numbers
@@ -110,9 +109,7 @@ def at(numbers: Numbers, path: str, method: str = "") -> Any:
     return None if value == {} else value
 
 
-def table(
-    numbers: Numbers, columns: Sequence[Column], methods: Sequence[str], label: str = ""
-) -> Iterator[str]:
+def table(numbers: Numbers, columns: Sequence[Column], methods: Sequence[str]) -> Iterator[str]:
     """Lines of a table with a row for each method, the first of which is the one to beat."""
     yield "| | " + " | ".join(heading for heading, *_ in columns) + " |"
     yield "| --- |" + " --- |" * len(columns)
@@ -123,79 +120,49 @@ def table(
             shown = "-" if value is None else format(value, form)
             is_better = value is not None and sign * (float(shown) - float(format(ours, form))) > 0
             cells.append(f"**{shown}**" if is_better else shown)
-        yield f"| {label}{method} | " + " | ".join(cells) + " |"
+        yield f"| {method} | " + " | ".join(cells) + " |"
 
 
 def better(tables: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """What a peer does better than tactflow's default: the bold numbers, but for memory and lines."""
-    for name, (header, _, *rows) in tables.items():
-        headings = header.strip("| ").split(" | ")
-        ours: list[str] = []
+    for name, (header, _, first, *rows) in tables.items():
+        headings, ours = header.strip("| ").split(" | "), first.strip("| ").split(" | ")[1:]
         for row in rows:
             method, *cells = row.strip("| ").split(" | ")
-            ours = cells if not ours or method.endswith(", tactflow") else ours
             kind = ""
             for heading, cell, beaten in zip(headings, cells, ours, strict=True):
                 kind = heading.partition(": ")[0] + ": " if ": " in heading else kind
                 if cell.startswith("**") and "tactflow" not in method and heading not in ("MB", "lines"):
-                    where = heading if ": " in heading or name == "depth" else kind + heading
-                    yield f"{method}, {name}, {where}: {cell.strip('*')} instead of {beaten}"
-
-
-def scene_table(scenes: Numbers, key: str, form: str) -> Iterator[str]:
-    """Lines of a table with a row for each scene; of dots with the share that is lost or wrong."""
-    methods = list(next(iter(scenes.values())))
-    yield "| scene | " + " | ".join(methods) + " |"
-    yield "| --- |" + " --- |" * len(methods)
-    for scene, answers in scenes.items():
-        cells = []
-        for method in methods:
-            errors = answers[method]
-            shown = format(errors[key], form) if key in errors else "-"
-            bad = f"{errors.get('wrong_percent', 0.0) + errors.get('lost_percent', 0.0):.1f}"
-            cells.append(shown if bad == "0.0" else f"{shown} ({bad})")
-        yield f"| {scene} | " + " | ".join(cells) + " |"
+                    where = heading if ": " in heading else kind + heading
+                    yield f"{method}, {name}, {where} {cell.strip('*')} instead of {beaten}"
 
 
 def settings(numbers: Numbers) -> Iterator[str]:
-    """Lines about the settings that were found."""
-    parts = {
-        "dots, random sensors": [numbers["dots_wide"]["all"]],
-        "dots, named scenes (`peers.json` has those of each)": list(numbers["dots"]["scenes"].values()),
-        "contact, random sensors": [numbers["contact_wide"]["all"]],
-        "contact, named scenes": [numbers["contact"]["all"]],
-    }
-    for what, answers in parts.items():
-        found: dict[str, dict[str, set[Any]]] = {}
-        for method, errors in (pair for one in answers for pair in one.items()):
-            for key, value in errors["settings"].items():
-                found.setdefault(method, {}).setdefault(key, set()).add(value)
-        texts = {
-            method: ", ".join(
-                f"{key} {' or '.join(map(str, sorted(values)))}" for key, values in chosen.items()
-            )
-            for method, chosen in found.items()
-        }
-        yield f"- {what}: " + "; ".join(f"{method}: {chosen}" for method, chosen in texts.items())
+    """The settings that were found for random sensors."""
+    for quantity in ("dots", "contact"):
+        for method, errors in numbers[f"{quantity}_wide"]["all"].items():
+            if errors["settings"]:
+                found = ", ".join(f"{key} {value}" for key, value in errors["settings"].items())
+                yield f"{method} ({found})"
 
 
 def attempts(tried: Sequence[Mapping[str, str]]) -> Iterator[str]:
     """Lines of a table of packages that were tried in vain."""
-    yield from ("| package | tried | outcome |", "| --- | --- | --- |")
+    yield from ("| package | what it says |", "| --- | --- |")
     for one in tried:
-        yield f"| {one['package']} {one['version']} | `{one['tried']}` | {one['error']} |"
+        yield f"| {one['package']} {one['version']} | {one['error']} |"
 
 
 def failures(parts: Numbers) -> Iterator[str]:
-    """Lines about errors, counted by part, method and kind."""
+    """Errors, counted by method and kind."""
     counts: dict[str, int] = {}
-    for part, methods in parts.items():
+    for methods in parts.values():
         for method, messages in methods.items():
             for message, count in messages.items():
                 kind = "no dots were found" if "NoMarkersError" in message else message
-                line = f"- {part.replace('_', ', ')}: {method}: {kind}, times "
-                counts[line] = counts.get(line, 0) + count
-    yield from (f"{line}{count}" for line, count in counts.items())
+                what = f"{method}: {kind}"
+                counts[what] = counts.get(what, 0) + count
+    yield from (f"{what}, {count} times" for what, count in counts.items())
 
 
 def plot(numbers: Numbers, path: Path) -> None:
@@ -220,7 +187,7 @@ def plot(numbers: Numbers, path: Path) -> None:
             name: (f"depth|{name}|*|ms", f"depth|{name}|*|normals") for name in numbers["depth"]
         },
     }
-    methods = list(numbers["dots"]["all"]), list(numbers["contact"]["all"]), ["tactflow", "pixel network"]
+    methods = list(numbers["dots"]["all"]), list(numbers["contact"]["all"]), ["tactflow", NETWORK]
     figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), constrained_layout=True)
     for axis, (title, kinds), names in zip(axes, panels.items(), methods, strict=True):
         for marker, (kind, (ms, error)) in zip("osD^v", kinds.items(), strict=False):
