@@ -37,9 +37,9 @@ ROOT: Final = """
 
 guide
 gallery/index
-api
-accuracy
-peers
+Reference <api>
+Accuracy <accuracy>
+Peers <peers>
 changes
 ```
 """
