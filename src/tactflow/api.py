@@ -114,7 +114,7 @@ def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:
 def check(pipeline: str | Path | None = None, *, settings: Settings | None = None) -> list[str]:
     """Every mistake in a pipeline file, each a text with its place; empty if it can be run.
 
-    pipeline, settings : as for `load`.
+    pipeline, settings : as for `load`, whose errors are what it returns; it raises none.
 
     Examples
     --------
@@ -144,7 +144,8 @@ def run(
 
     Parameters
     ----------
-    pipeline : what `load` returned, or what it takes; then the other parameters are those of `load`.
+    pipeline : what `load` returned, or what it takes.
+    source, settings, sensor, realtime : as for `load`; only where `pipeline` is not loaded yet.
     max_frames : stop after so many.
 
     Returns

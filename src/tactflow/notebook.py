@@ -37,6 +37,10 @@ def contact(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> Contact |
     -------
     The contact, in pixels of `image`; None where nothing touches.
 
+    Raises
+    ------
+    ValueError : the pictures differ in shape. TactflowError : they are no pictures that the pipeline takes.
+
     Examples
     --------
     >>> import tactflow
@@ -98,6 +102,8 @@ def to_frame(results: Iterable[Result]) -> pd.DataFrame:
     Columns are the numbers of the result message with its standard errors (`contact_area`, `flow_mean_x`,
     `flow_stderr_x`, ...), then the outputs of your own stages that are numbers, truth values or texts. A
     column in which nothing is known is left out.
+
+    results : from `stream`, or received.
 
     Raises
     ------
