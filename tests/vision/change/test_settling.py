@@ -66,6 +66,18 @@ def test_the_touch_of_before_is_not_taken_for_the_untouched_gel() -> None:
     assert settling.touched_before(settling.best())
 
 
+def test_a_grasp_in_which_a_lamp_changes_is_not_taken_for_the_untouched_gel() -> None:
+    """The pattern of a gel without dots is so strong that a contact hardly makes it less even."""
+    pattern = 1 + 0.3 * np.sin(X / 6)[..., None]
+    frames = [picture() for _ in range(7)]
+    frames += [picture(1, 0.15 * i) for i in range(1, 4)]
+    frames += [picture((1, 1.03, 0.95), 0.5) for _ in range(20)]
+    frames = [np.asarray(np.clip(frame * pattern, 0, 255), np.uint8) for frame in frames]
+    settling = settled(frames, 30.0)
+    assert settling.steady
+    assert settling.best() == 0
+
+
 @pytest.mark.parametrize(("rate", "looked_at"), [(100.0, 10), (25.0, 10), (15.0, 6), (12.5, 5), (2.0, 4)])
 def test_light_must_be_steady_for_a_time_but_never_for_fewer_frames_than_tell(
     rate: float, looked_at: int

@@ -265,7 +265,9 @@ class Settling:
         calm = self._calm_frames(than)
         passing = len(calm) < self._calm / 2
         apart = np.abs(self._level(state)[0] - self._level(than)[0]).max()
-        if (passing and than is not self._states[0]) or calm[0] != than[0] or apart > STEADY:
+        # A camera that sets its exposure does not hold one light at first, whatever a lamp does later.
+        unsettled = than is not self._states[0] or apart > STEADY
+        if (passing and unsettled) or calm[0] != than[0]:
             return here < there * (AS_EVEN if self._is_steady(state) else EVENER)
         return here < there * (EVENER if passing else MUCH_EVENER)
 
