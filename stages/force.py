@@ -9,7 +9,7 @@ from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Unmarked, Untouched
-from tactflow.vision.force import seen, total_change
+from tactflow.vision.force import BY_CHANGE, BY_DEPTH, LightChange, seen
 from tactflow.vision.types import Contact, Depth, Flow, Scale
 from tactflow.vision.types import Force as ForceOnGel
 
@@ -28,8 +28,15 @@ class Force(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         known = None if calibration is None else Calibration.load(calibration).force
+        if known is not None and not known.press.stiffness.keys() <= {*BY_DEPTH, *BY_CHANGE}:
+            logger.warning(
+                "force: %s has a force that an earlier version fitted; run `tactflow calibrate force` again",
+                calibration,
+            )
+            known = None
         self._entry = known
         self._model = None if known is None else known.model()
+        self._light: LightChange | None = None
         self._warned = False
 
     def process(
@@ -50,7 +57,9 @@ class Force(Stage):
             if depth is None:
                 return Absent("no_depth")
         else:
-            change = scale.area(total_change(unmarked, untouched)) - model.change_at_rest
+            if self._light is None or self._light.untouched is not untouched:
+                self._light = LightChange(untouched)
+            change = scale.area(self._light(unmarked)) - model.change_at_rest
         force = model.force(seen(contact, scale, depth, change, flow))
         if not force.in_range and not self._warned:
             self._warned = True

@@ -85,6 +85,18 @@ def test_the_stated_errors_of_forces_that_the_fit_has_not_seen_are_honest() -> N
         assert 0.91 <= two <= 0.99
 
 
+def test_recordings_of_one_object_are_left_out_together() -> None:
+    watched, references = sessions(range(4))
+    things = ("ball_1.avi", "ball_2.avi", "cube.mcap", "key 3.mcap")
+    by_object = fit_force(
+        dict(zip(things, watched.values(), strict=True)), dict(zip(things, references.values(), strict=True))
+    )
+    assert by_object.entry.left_out == "object"
+    assert by_object.entry.press.stiffness == fit_force(watched, references).entry.press.stiffness
+    two = {name: watched[name] for name in ("0", "1")}
+    assert fit_force(two, {name: references[name] for name in two}).entry.left_out == "press"
+
+
 def test_a_clock_that_is_ahead_and_a_gauge_that_is_turned_are_noticed() -> None:
     watched, references = sessions(range(3))
     late = references["1"]

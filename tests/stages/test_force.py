@@ -13,6 +13,7 @@ from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry,
 from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import Absent
 from tactflow.stages.force import Force
+from tactflow.vision.force import LightChange
 from tactflow.vision.types import Contact, Depth, Flow, Scale
 
 SCALE = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
@@ -24,7 +25,7 @@ BY_DEPTH = LinearForceEntry(
     stiffness={"volume": 2.0, "area": 0.5}, greatest={"volume": 2, "area": 9.0}, **FIT
 )  # type: ignore[arg-type]
 BY_CHANGE = LinearForceEntry(
-    stiffness={"change": 0.1, "area": 0.5}, greatest={"change": 90, "area": 9.0}, **FIT
+    stiffness={"root_change": 0.1, "area": 0.5}, greatest={"root_change": 90, "area": 9.0}, **FIT
 )  # type: ignore[arg-type]
 DRAG = LinearForceEntry(stiffness={"shear_by_area": 0.5}, greatest={"shear_by_area": 4.0}, **FIT)  # type: ignore[arg-type]
 
@@ -32,7 +33,7 @@ DRAG = LinearForceEntry(stiffness={"shear_by_area": 0.5}, greatest={"shear_by_ar
 def stage(folder: Path, press: LinearForceEntry, drag: LinearForceEntry | None = None) -> Force:
     """The stage with a calibration that knows such a force."""
     force = ForceEntry(
-        press=press, drag=drag, change_at_rest=2.0, recordings={"a": 0.0}, presses=9, left_out="press"
+        press=press, drag=drag, change_at_rest=0.2, recordings={"a": 0.0}, presses=9, left_out="press"
     )
     made = Calibration(
         sensor="main",
@@ -61,10 +62,28 @@ def test_the_force_is_linear_in_what_is_seen_with_its_error(tmp_path: Path) -> N
 
 
 def test_without_heights_the_change_of_the_light_stands_for_them(tmp_path: Path) -> None:
-    found = stage(tmp_path, BY_CHANGE).process(CONTACT, SCALE, GEL + np.uint8(1), GEL)
+    gel = np.full((96, 128, 3), 90, np.uint8)
+    pressed = gel.copy()
+    pressed[32:64, 40:88] = 113
+    force = stage(tmp_path, BY_CHANGE)
+    found = force.process(CONTACT, SCALE, pressed, gel)
     assert not isinstance(found, Absent)
-    # 24 x 32 x 3 grey levels on 0.01 mm^2 each, less what is there at rest.
-    assert found.value[2] == pytest.approx(0.1 * (23.04 - 2) + 0.5 * 4)
+    change = SCALE.area(LightChange(gel)(pressed))
+    # About the root of 23 / 90 on 32 x 48 pixels of 0.01 mm^2.
+    assert change == pytest.approx(15.36 * np.sqrt(23 / 90), rel=0.25)
+    assert found.value[2] == pytest.approx(0.1 * (change - 0.2) + 0.5 * 4)
+    # Another exposure is no change.
+    darker = force.process(CONTACT, SCALE, np.uint8(0.8 * pressed), gel)
+    assert not isinstance(darker, Absent)
+    assert darker.value[2] == pytest.approx(found.value[2], rel=0.02)
+
+
+def test_a_force_of_an_earlier_version_is_not_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    old = BY_CHANGE.model_copy(update={"stiffness": {"change": 0.1}})
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        force = stage(tmp_path, old)
+    assert "run `tactflow calibrate force` again" in caplog.text
+    assert force.process(CONTACT, SCALE, GEL, GEL) == Absent("no_calibration")
 
 
 def test_nothing_is_said_without_a_calibration_or_without_the_heights_it_needs(tmp_path: Path) -> None:

@@ -59,6 +59,7 @@ TERMS: Final = PLACE_TERMS * COLOUR_TERMS
 
 Pair = Annotated[tuple[float, float], BeforeValidator(tuple)]
 Size = Annotated[tuple[int, int], BeforeValidator(tuple)]
+LeftOut = Literal["object", "recording", "press"]
 
 
 class _Entry(BaseModel):
@@ -136,7 +137,7 @@ class ForceEntry(_Entry):
 
     press : of z. drag : of x and y; None where the reference had no such columns. change_at_rest : see
     `ForceModel`. recordings : source -> by how much its frames' time is ahead of that of its CSV, s.
-    presses : in all of them. left_out : whether `rmse` is of whole recordings or of single presses that the
+    presses : in all of them. left_out : whether `rmse` is of objects, recordings or presses that the
     fit has not seen.
     """
 
@@ -145,7 +146,7 @@ class ForceEntry(_Entry):
     change_at_rest: float
     recordings: dict[str, float]
     presses: int
-    left_out: Literal["recording", "press"]
+    left_out: LeftOut
 
     def model(self) -> ForceModel:
         """The model that the stage `force` evaluates."""

@@ -2,7 +2,7 @@
 
 What the force is linear in, and why, says `tactflow.vision.force`. Stiffnesses are never negative, so that
 what lies a little outside of the fit cannot become absurd. The errors are those of forces that the fit has
-not seen: each recording in turn is left out, or each press where there are too few recordings.
+not seen: each object in turn is left out, or each recording or press where there are too few of the others.
 """
 
 from __future__ import annotations
@@ -10,25 +10,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from tactflow.calibration.file import ForceEntry, LinearForceEntry
+from tactflow.calibration.file import ForceEntry, LeftOut, LinearForceEntry
 from tactflow.calibration.reference import Reference, time_offset
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
 from tactflow.vision.arrays import Floats
-from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, Seen, seen, total_change
+from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, LightChange, Seen, seen
 
 NEEDED: Final = {"contact": "hull", "untouched": "untouched", "scale": "scale"}
 """Ports that a pipeline must have -> the stage that gives them; heights need `depth`, shear a flow."""
 FEWEST_PRESSES: Final = 4
 """Presses that a fit needs at least; ten or more are advised. Chosen by hand."""
-FEWEST_RECORDINGS: Final = 3
-"""Recordings from which on whole ones are left out to judge the fit. Chosen by hand."""
+FEWEST_GROUPS: Final = 3
+"""Objects, or else recordings, from which on whole ones are left out to judge the fit. Chosen by hand."""
 GAP: Final = 3
 """Frames without a contact that do not end a press: a light one flickers. Chosen by hand."""
 RATIOS: Final = np.concatenate([[0.0], np.logspace(-3, 1, 41)])
@@ -63,13 +64,16 @@ class Watcher:
         self._frames: list[tuple[int, float]] = []
         self._contacts: list[Seen | None] = []
         self._changes: list[float] = []
+        self._light: LightChange | None = None
 
     def add(self, result: Result) -> None:
         """Look at one result."""
         scale, unmarked, contact = result.scale, result.get("unmarked", result.image), result.contact
         if scale is None or unmarked is None:
             return
-        change = scale.area(total_change(unmarked, result["untouched"]))
+        if self._light is None or self._light.untouched is not result["untouched"]:
+            self._light = LightChange(result["untouched"])
+        change = scale.area(self._light(unmarked))
         self._frames.append((result.seq, result.t))
         self._contacts.append(
             None if contact is None else seen(contact, scale, result.depth, change, result.flow)
@@ -131,8 +135,8 @@ def align(name: str, watched: Watched, reference: Reference, change_at_rest: flo
             "untouched"
         )
     known = dict(watched.press)
-    if "change" in known:
-        known["change"] = np.maximum(known["change"] - change_at_rest, 0)
+    if "root_change" in known:
+        known["root_change"] = np.maximum(known["root_change"] - change_at_rest, 0)
     press = np.stack(list(known.values()), axis=1)
     seconds = reference.seconds(watched.frames, watched.times)
     offset = time_offset(reference, seconds, watched.times, press)
@@ -176,9 +180,7 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
             f"calibrate force: required {FEWEST_PRESSES} presses or more (ten are better, by all that the "
             f"sensor will meet), found {first[-1]} in {len(aligned)} recordings"
         )
-    left_out: Literal["recording", "press"] = "recording" if len(aligned) >= FEWEST_RECORDINGS else "press"
-    recordings = np.repeat(np.arange(len(aligned)), [len(part.press) for part in aligned])
-    groups = presses if left_out == "press" else recordings
+    left_out, groups = _left_out(aligned, presses)
     force = np.concatenate([part.force for part in aligned])
     features = np.concatenate([part.press for part in aligned])
     entry = ForceEntry(
@@ -198,6 +200,19 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
             "stages tracker and flow_in_mask, or leave these columns out"
         )
     return _with_drag(entry, drag[known], force[known, 0] + 1j * force[known, 1], groups[known])
+
+
+def _left_out(aligned: Sequence[Aligned], presses: NDArray[np.intp]) -> tuple[LeftOut, NDArray[np.intp]]:
+    """What is left out in turn to judge the fit, and the group of each frame: (n,), as presses are."""
+    names = [Path(part.name).stem for part in aligned]
+    # Recordings of one object are told apart by a number at the end.
+    objects = [name.rstrip("0123456789").rstrip("_- ") for name in names]
+    ways: list[tuple[LeftOut, list[str]]] = [("object", objects), ("recording", names)]
+    for left_out, labels in ways:
+        kinds, numbers = np.unique(labels, return_inverse=True)
+        if len(kinds) >= FEWEST_GROUPS:
+            return left_out, np.repeat(numbers, [len(part.press) for part in aligned])
+    return "press", presses
 
 
 def _with_drag(

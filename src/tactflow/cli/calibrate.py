@@ -406,7 +406,7 @@ def _force_words(fit: force.Fit, references: Mapping[str, Reference]) -> list[st
 
 def _quality(part: LinearForceEntry, left_out: str) -> str:
     absolute, relative = part.error
-    groups = "recordings" if left_out == "recording" else "presses"
+    groups = {"object": "objects", "recording": "recordings", "press": "presses"}[left_out]
     return (
         f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
         f"{100 * part.r2:.0f} % of the variance explained, by {groups} that the fit has not seen; "
