@@ -31,7 +31,7 @@ class Tracker(Stage):
             None, ge=1, le=200, description="radius of a mark, processed px; null finds it"
         )
         polarity: Literal["auto", "dark", "bright"] = Field(
-            "auto", description="marks against the gel; auto takes the stronger family"
+            "auto", description="marks against the gel; auto takes the better lattice"
         )
         max_displacement: float | None = Field(
             None,

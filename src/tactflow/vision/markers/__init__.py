@@ -1,8 +1,7 @@
 """The printed markers of a gel: detection, mask, removal and tracking.
 
-Once for each reference, `detection` finds them: `scale_space` looks for spots of every size, `family` tells
-which of them are marks by the `lattice` that they form and by their `likeness`, and `picture` draws what was
-found.
+Once for each reference, `detection` finds them: `scale_space` looks for spots of every size, and `selection`
+tells which of them are marks by the `lattice` that they form and by how much they look like each other.
 
 In each frame, `mask` tells where markers cover the gel, and `inpaint` fills these places. `tracking` follows
 the markers: `template` aligns each one from where it was last, and `graph` tells whether neighbours move

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
@@ -13,23 +12,19 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from tactflow.vision.arrays import Floats
-from tactflow.vision.markers import family
-from tactflow.vision.markers.family import Family, Sign
 from tactflow.vision.markers.lattice import LONGEST_LINK, corners, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
+from tactflow.vision.markers.selection import Group, Sign, groups, links, marks_of
 
 Polarity = Literal["auto", "dark", "bright"]
 
-LEAST_SHARE: Final = 0.4
-"""Share of parallelograms of neighbours that close, at least, to be a lattice: random textures have up to
-0.31, painted dots 0.45 and more (measured)."""
-
 LEAST_SCORE: Final = 2.5
-"""Score of the weakest family that is believed to be marks (see `family.families`). Real gels with marks
-score 4 and more; dust, reflections and noise on gels without at most 0.4, what compression leaves along edges
-up to 3, in 36 of 38 such pictures of wedge_grasp up to 2.4 (measured). Marks 3.5 px apart need as little."""
+"""Score of the weakest group of spots that is believed to be marks (see `selection.groups`). Real gels with
+marks score 4 and more; dust, reflections and noise on gels without at most 0.4, what compression leaves along
+edges up to 3, in 36 of 38 such pictures of wedge_grasp up to 2.4 (measured). Marks 3.5 px apart need as
+little."""
 
-MOST_BETWEEN: Final = 0.02
+MOST_BETWEEN: Final = 0.01
 """Level half-way between two neighbouring marks, on the way from the gel's (0) to that of the marks (1), at
 most, in the better one of two directions: dashes may touch in the other one. The gel is looked at on the
 diagonal, 0.7 of the way to the middle of a cell, where another lattice may have its marks. Two waves that
@@ -44,10 +39,10 @@ TEXTURE_STRENGTH: Final = 5.0
 by hand."""
 
 CLOSE: Final = 0.75
-"""Score of the next best family over that of the best, from which on the choice was close. Chosen by hand."""
+"""Score of the next best group over that of the best, from which on the choice was close. Chosen by hand."""
 
 SAME_MARKS: Final = 0.5
-"""Share of the spots of another family that lie on the marks, from which on it is no rival but they again, at
+"""Share of the spots of another group that lie on the marks, from which on it is no rival but they again, at
 another scale or their highlights. Chosen by hand."""
 
 ONE_SIZE: Final = 1.1 * SIGMA_STEP
@@ -58,14 +53,6 @@ CROWDED: Final = 0.37
 on sts_torque160."""
 LEAST_RADIUS: Final = 0.5
 """Of a mark, px: none is smaller than a pixel, not even of two that are found at one place."""
-
-SATURATED: Final = 250.0
-"""Grey level of a lamp, or its mirror image, in the picture, at least. Chosen by hand."""
-NEARLY_WHITE: Final = 230.0
-MOST_MARKS: Final = 90.0
-"""Grey level that so many of 100 bright marks keep below, where one that saturates the camera is a lamp:
-marks throw back a part of a lamp's light. On sts_640, beside whose marks lamps are, 90 of 100 are below 210;
-on tactip_video, 62 of 100 pins are saturated."""
 
 LONE_PITCH: Final = 8.0
 """Pitch of a single mark, in radii. Chosen by hand."""
@@ -179,16 +166,16 @@ def detect_markers(
 ) -> Detection:
     """Find the marks of a gel: of one size or many, of any shape, in one lattice or several.
 
-    Differences of Gaussians over a range of scales give families of spots. The one with the most contrast in
-    the best lattice wins; a random texture forms none. Spots of other scales that its lattice wants join it.
-    Weak and lonely spots, ones between the others and ones cut by the border are left out.
+    Differences of Gaussians over a range of scales give spots of every size. Those of one scale with the most
+    contrast in the best lattice are marks; a random texture forms none. Spots of other scales join where the
+    lattice wants a mark. Weak spots, ones between the others and ones cut by the border are left out.
 
     Parameters
     ----------
     image : (H, W, 3) uint8 BGR or (H, W) uint8, grey levels.
     dot_radius : of a (whole) mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at
         least four marks in an even arrangement, lest dust passes for them.
-    polarity : "dark" or "bright" against the gel; "auto" takes the stronger family.
+    polarity : "dark" or "bright" against the gel; "auto" takes the better lattice.
     valid : (H, W) uint8, not 0 where there is gel; no mark is looked for where most of what lies around is
         none. None: everywhere.
 
@@ -199,7 +186,7 @@ def detect_markers(
 
     Raises
     ------
-    NoMarkersError : nothing looks like a family of marks.
+    NoMarkersError : nothing looks like marks.
     ValueError : the image or a parameter is not of that kind.
 
     References
@@ -240,28 +227,19 @@ def _found_in(
     scales = {
         sign: {s: find_spots(gray, s, sign, valid) for s in sigmas(dot_radius, shortest)} for sign in signs
     }
-    found = family.families(scales) if shortest >= 8 else []
+    found = groups(scales) if shortest >= 8 else []
     if not found:
         raise NoMarkersError(_NO_MARKERS)
     best = found[0]
     if dot_radius is None:
         _require_lattice(found)
-        best, by_scale = _without_lamps(gray, best, scales[best.polarity])
-        marks = family.united(gray, best, by_scale)
+        _require_gel_between(gray, best, best.spots)
+        marks = marks_of(gray, best, scales[best.polarity])
         if not len(marks.points):
             raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(best))
-        return _with_gel_between(gray, _detection(gray, best, marks, found[1:]))
+        _require_gel_between(gray, best, marks)
+        return _detection(gray, best, marks, found[1:])
     return _detection(gray, best, best.spots, found[1:])
-
-
-def _without_lamps(
-    gray: NDArray[np.float32], best: Family, by_scale: Mapping[float, Spots]
-) -> tuple[Family, Mapping[float, Spots]]:
-    """The family, and the spots of its polarity, without those that saturate the camera if marks do not."""
-    if best.polarity == "dark" or np.percentile(_levels(gray, best.spots.points), MOST_MARKS) > NEARLY_WHITE:
-        return best, by_scale
-    kept = {s: spots.at(_levels(gray, spots.points) < SATURATED) for s, spots in by_scale.items()}
-    return best._replace(spots=best.spots.at(_levels(gray, best.spots.points) < SATURATED)), kept
 
 
 def _levels(gray: NDArray[np.float32], points: Floats) -> NDArray[np.float32]:
@@ -269,9 +247,9 @@ def _levels(gray: NDArray[np.float32], points: Floats) -> NDArray[np.float32]:
     return np.asarray(map_coordinates(gray, points.T[::-1], order=1, mode="nearest"), np.float32)
 
 
-def _require_lattice(found: list[Family]) -> None:
+def _require_lattice(found: list[Group]) -> None:
     """Raises NoMarkersError for spots, best first, that are too few, too faint, or in no lattice."""
-    if found[0].share >= LEAST_SHARE and found[0].score >= LEAST_SCORE:
+    if found[0].score >= LEAST_SCORE:
         return
     best = max(found, key=lambda other: float(other.spots.strength.sum()))
     count = len(best.spots.points)
@@ -285,34 +263,32 @@ def _require_lattice(found: list[Family]) -> None:
     raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(found[0]))
 
 
-def _with_gel_between(gray: NDArray[np.float32], found: Detection) -> Detection:
-    """What was found. Raises NoMarkersError for spots between which there is no even gel, as in a weave."""
-    around = corners(found.centers, found.edges)
-    if len(around.points):
-        smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.2 * found.dot_radius), np.float32)
-        mark = found.centers[around.middle]
-        first, last = found.centers[around.first], found.centers[around.last]
-        diagonal = 0.3 * mark + 0.35 * (first + last)
-        marks, gel, one, other = (
-            _levels(smooth if found.polarity == "dark" else -smooth, points)
-            for points in (mark, diagonal, (mark + first) / 2, (mark + last) / 2)
+def _require_gel_between(gray: NDArray[np.float32], best: Group, spots: Spots) -> None:
+    """Raises NoMarkersError for marks between which there is no even gel, as in a weave."""
+    points, radius = spots.points, best.sigma * RADIUS_PER_SIGMA
+    around = corners(points, links(points))
+    if not len(around.points):
+        return
+    smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.2 * radius), np.float32)
+    mark, first, last = points[around.middle], points[around.first], points[around.last]
+    marks, gel, one, other = (
+        _levels(smooth if best.polarity == "dark" else -smooth, places)
+        for places in (mark, 0.3 * mark + 0.35 * (first + last), (mark + first) / 2, (mark + last) / 2)
+    )
+    if np.median(gel - np.maximum(one, other)) > MOST_BETWEEN * np.median(gel - marks):
+        raise NoMarkersError(
+            f"{_NO_MARKERS} ({len(points)} {best.polarity} spots of radius {radius:.1f} px run into each "
+            "other, like the threads of a cloth; if they are marks, give their radius in pixels)",
+            _candidate(best),
         )
-        if np.median(gel - np.maximum(one, other)) > MOST_BETWEEN * np.median(gel - marks):
-            raise NoMarkersError(
-                f"{_NO_MARKERS} ({len(found.centers)} {found.polarity} spots of radius "
-                f"{found.dot_radius:.1f} px run into each other, like the threads of a cloth; if they are "
-                "marks, give their radius in pixels)",
-                found.chosen,
-            )
-    return found
 
 
-def _candidate(found: Family) -> Candidate:
+def _candidate(found: Group) -> Candidate:
     radius = found.sigma * RADIUS_PER_SIGMA
     return Candidate(found.spots.points, radius, found.polarity, found.score, found.share)
 
 
-def _detection(gray: NDArray[np.float32], best: Family, marks: Spots, others: list[Family]) -> Detection:
+def _detection(gray: NDArray[np.float32], best: Group, marks: Spots, others: list[Group]) -> Detection:
     """The marks with exact centres, in reading order, and what else they might be."""
     dark = gray if best.polarity == "dark" else 255 - gray
     radius = best.sigma * RADIUS_PER_SIGMA
@@ -334,8 +310,8 @@ def _detection(gray: NDArray[np.float32], best: Family, marks: Spots, others: li
     return Detection(centers, radius, best.polarity, pitch, edges, sizes, _candidate(best), rival)
 
 
-def _same(other: Family, centers: Floats, radii: Floats) -> bool:
-    """Whether another family lies where the marks are."""
+def _same(other: Group, centers: Floats, radii: Floats) -> bool:
+    """Whether another group lies where the marks are."""
     away = np.hypot(*(other.spots.points[:, None] - centers).transpose(2, 0, 1))
     return bool((away < radii).any(axis=1).mean() > SAME_MARKS)
 

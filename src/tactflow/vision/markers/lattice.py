@@ -177,15 +177,6 @@ def support(points: Floats, expected: Corners) -> Indices:
     return np.asarray(np.count_nonzero(_within(points, expected), axis=1), np.int64)
 
 
-def others_support(centers: Floats, expected: Corners) -> Indices:
-    """How many of the corners of other marks each mark (N, 2) closes, (N,)."""
-    closed = _within(centers, expected)
-    column = np.arange(len(expected.points))
-    for part in (expected.first, expected.middle, expected.last):
-        closed[part, column] = False
-    return np.asarray(np.count_nonzero(closed, axis=1), np.int64)
-
-
 def _within(points: Floats, expected: Corners) -> Flags:
     """(n, M) which points close which corners."""
     if len(expected.points) == 0:

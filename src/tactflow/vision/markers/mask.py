@@ -74,7 +74,7 @@ def find_dot(
     ----------
     image : (H, W, 3) uint8, BGR grey levels.
     radius : of a marker, px, if it is known.
-    polarity : of the markers; "auto" takes the stronger family of spots.
+    polarity : of the markers; "auto" takes the better lattice.
     valid : (H, W) uint8, not 0 where there is gel; None: everywhere.
 
     Returns

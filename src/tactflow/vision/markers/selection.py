@@ -1,0 +1,327 @@
+"""Which spots of a picture are the marks: those that are alike and form a lattice.
+
+The spots of one scale and polarity with the most contrast in the best lattice come first. Spots of other
+scales, and ones that others crowd, join them where the lattice wants a mark and they look like those around.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.vision.arrays import Floats
+from tactflow.vision.markers import lattice
+from tactflow.vision.markers.lattice import LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
+from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, Spots, joined
+
+Sign = Literal["dark", "bright"]
+
+LEAST_STRENGTH: Final = 0.35
+"""Response of a mark over that of the typical one of its scale, at least. Chosen by hand: dirt and grain are
+a tail."""
+
+BETWEEN: Final = 0.55
+"""Distance, pitches, below which the weaker of two spots lies between marks. Chosen by hand."""
+
+LONELY: Final = 2.3
+"""Distance of the second nearest mark, pitches, beyond which a spot is lonely. Chosen by hand."""
+
+RANDOM_SHARE: Final = 0.3
+"""Share of parallelograms that close among spots in no lattice: 0.1 to 0.25 on rendered textures, 0.31 where
+spots keep nearly the distance of a lattice from each other (measured)."""
+
+LONG_LINK: Final = 1.8
+"""Length of a link of the lattice, over the median one at either end, at most: longer ones lead to something
+else. Chosen on tactip_video, whose pins have a bright rim around them."""
+
+MOST_SCALES: Final = 2.1
+"""Radius of a mark over that of most of them, and its inverse, at most: painted marks and those far off in
+perspective. Chosen on handmade_dots and sts_640."""
+
+APART: Final = 0.9
+"""Distance of two marks, sums of their radii, at least. Chosen by hand."""
+
+ALONE: Final = 0.75
+"""Clearance of a spot that needs no lattice to be a mark. Dots on even ground have 0.8 to 1, pieces of edges
+and lines 0.3 to 0.7 (tactip_video, sts_640)."""
+
+CLEAR: Final = 0.55
+"""Clearance of a spot that is a mark where a single corner or line of the lattice wants one. Chosen on
+sts_640."""
+
+ALIKE_STRENGTH: Final = (0.6, 1.7)
+"""Response of such spots, over that of the marks around. Chosen by hand."""
+
+NEAR_STRENGTH: Final = (0.3, 3.0)
+"""Response of a spot where the lattice wants a mark, over that of the marks around. Chosen by hand: light and
+dirt weaken marks, and the rim of a lamp is stronger."""
+
+NEAR_RADIUS: Final = (0.65, 1.5)
+"""Radius of such a spot, over those of the marks around. Chosen by hand."""
+
+LEAST_BEND: Final = 0.15
+"""Bend of a mark over that of most marks, at least: a piece of an edge or a line has 0. Of the dots marked on
+18 sensors 0.2 loses 0.2 % more, and 0.1 takes a fifth more places for dots that are none."""
+
+LEAST_SUPPORT: Final = 2
+"""Corners and lines of the lattice that want a mark there, at least: one may be a coincidence."""
+
+RING_CONTRAST: Final = 0.3
+"""Clearance of a spot that is more than a piece of an edge, a line or a texture, at least. Chosen by hand."""
+
+ALIKE: Final = 0.64
+"""Likeness of a spot to the marks around, at least, to be one of them where the lattice wants one and other
+marks are too near for the ring to tell. Chosen on pictures of eight sensors, shrunk until their marks were 3
+to 8 px apart: 0.6 finds 0.2 % more of them and 0.2 % more that are none."""
+
+MARKS_AROUND: Final = 4
+"""Nearest marks that are compared with such a spot. Chosen by hand."""
+
+MOST_ROWS: Final = 12
+"""Rows by which a lattice grows. Chosen by hand."""
+
+LEAST_CLUSTER: Final = 6
+"""Marks of a lattice beside a larger one, at least: four or five spots form a parallelogram by chance
+(sts_torque160)."""
+
+MEMBER_SHARE: Final = 0.3
+"""Share of closed parallelograms of a mark, at least. Chosen on sts_640."""
+
+WINDOW: Final = 2.6
+"""Radius of the discs that are compared, in radii of the marks: they hold the gaps to the neighbours, too.
+Chosen on sts_640 and sts_torque160, where glare correlates less with marks than with 1.9 radii."""
+
+LEAST_WINDOW: Final = 2.0
+"""Radius of these discs at least, px: smaller ones hold too few pixels to differ. Chosen by hand."""
+
+SAMPLES: Final = 4
+"""Samples along the radius of a disc. Chosen by hand."""
+
+
+class Group(NamedTuple):
+    """Spots of one scale and polarity that look like the marks of one gel.
+
+    score : how much so. share : of parallelograms of neighbours that close. sigma : scale, px.
+    """
+
+    score: float
+    share: float
+    sigma: float
+    polarity: Sign
+    spots: Spots
+
+
+def groups(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Group]:
+    """The group of each polarity and scale that has one, the best first.
+
+    scales : for each polarity and scale, px, its spots.
+    """
+    found = []
+    for polarity, by_scale in scales.items():
+        for sigma, spots in by_scale.items():
+            members = _alike(spots.at(spots.clear > RING_CONTRAST))
+            if len(members.points):
+                share = lattice.closed_share(members.points, links(members.points))
+                # More contrast is evidence, but six lamps are no better than a hundred faint dots.
+                total = float(np.median(members.strength)) * len(members.points)
+                score = max(share - RANDOM_SHARE, 0.0) * total**0.5
+                found.append(Group(score, share, sigma, polarity, members))
+    return sorted(found, key=lambda group: (group.score, float(group.spots.strength.sum())), reverse=True)
+
+
+def marks_of(gray: NDArray[np.float32], group: Group, by_scale: Mapping[float, Spots]) -> Spots:
+    """The marks of a group in all their sizes, without spots that only look like them.
+
+    gray : (H, W) float32, grey levels. by_scale : the spots of the group's polarity.
+    """
+    least = NEAR_STRENGTH[0] * float(np.percentile(group.spots.strength, 10))
+    near = [s for s in by_scale if 1 / MOST_SCALES <= s / group.sigma <= MOST_SCALES]
+    spots = joined(*(by_scale[s].at(by_scale[s].strength > least) for s in near))
+    larger = spots.at((spots.radius > 1.01 * group.sigma * RADIUS_PER_SIGMA) & (spots.clear > RING_CONTRAST))
+    covers = np.any(_distances(larger.points, group.spots.points) < larger.radius[:, None], axis=1)
+    either = joined(group.spots, larger.at(covers))
+    marks = _grown(gray, _in_lattice(_apart(either, either.strength)), spots)
+    return marks.at(marks.bend > LEAST_BEND * np.median(marks.bend)) if len(marks.points) else marks
+
+
+def links(points: Floats) -> NDArray[np.int64]:
+    """The neighbours (E, 2) among marks (N, 2)."""
+    if len(points) < 2:
+        return np.zeros((0, 2), np.int64)
+    edges = neighbour_graph(points, LONGEST_LINK * pitch_of(points))
+    length = np.hypot(*(points[edges[:, 0]] - points[edges[:, 1]]).T)
+    usual = _median_of_links(edges, length, len(points))
+    return np.asarray(edges[length < LONG_LINK * usual[edges].min(axis=1)], np.int64)
+
+
+def _median_of_links(edges: NDArray[np.int64], values: Floats, count: int) -> Floats:
+    """For each mark the (lower) median of the values (E,) of its links; infinity for a mark without."""
+    mark, value = edges.T.ravel(), np.tile(values, 2)
+    order = np.lexsort((value, mark))
+    degree = np.bincount(mark, minlength=count)
+    middle = np.cumsum(degree) - degree + (degree - 1) // 2
+    return np.where(degree > 0, np.append(value[order], np.inf)[np.where(degree > 0, middle, -1)], np.inf)
+
+
+def _alike(spots: Spots) -> Spots:
+    """The spots of one scale that may be marks of one gel: about as strong, none between others or lonely."""
+    order = np.argsort(-spots.strength, kind="stable")
+    if len(order) == 0:
+        return spots
+    # Strengths of marks are alike, those of dirt and grain are a tail: cut at a part of the typical one,
+    # which is found from the top down so that the tail's length does not matter.
+    ranked = spots.strength[order]
+    typical = ranked[0]
+    for _ in range(8):
+        typical = float(np.median(ranked[ranked > LEAST_STRENGTH * typical]))
+    kept = spots.at(order[ranked > LEAST_STRENGTH * typical])
+    for _ in range(3):
+        if len(kept.points) < 3:
+            return kept
+        distances, near = nearest(kept.points, 2)
+        pitch = float(np.median(distances[:, 0]))
+        between = (distances[:, 0] < BETWEEN * pitch) & (kept.strength < kept.strength[near[:, 0]])
+        lonely = distances[:, 1] > LONELY * pitch
+        if not (between | lonely).any():
+            break
+        kept = kept.at(~(between | lonely))
+    return kept
+
+
+def _in_lattice(marks: Spots) -> Spots:
+    """The marks that are part of a lattice, or stand alone on even ground."""
+    for _ in range(3):
+        if len(marks.points) < 4:
+            break
+        share, cluster = lattice.own_shares(marks.points, links(marks.points))
+        member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE)
+        strength = marks.strength / np.median(marks.strength)
+        alike = (strength > ALIKE_STRENGTH[0]) & (strength < ALIKE_STRENGTH[1])
+        kept = member | (alike & (marks.clear > ALONE))
+        if kept.all():
+            break
+        marks = marks.at(kept)
+    return marks
+
+
+def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
+    """The marks, and spots where their lattice wants one, a row at a time."""
+    for _ in range(MOST_ROWS):
+        if len(marks.points) < MARKS_AROUND:
+            break
+        touching = APART * (spots.radius[:, None] + marks.radius)
+        spots = spots.at(np.all(_distances(spots.points, marks.points) > touching, axis=1))
+        new = _wanted(gray, marks, spots)
+        if len(new.points) == 0:
+            break
+        marks = joined(marks, new)
+    return marks
+
+
+def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
+    """Of spots that touch no mark, those that go on with the lattice and are like the marks around."""
+    support = lattice.support(spots.points, _expected(marks.points))
+    wanted, support = spots.at(support > 0), support[support > 0]
+    away = _distances(wanted.points, marks.points)
+    around = np.argsort(away, axis=1, kind="stable")[:, :MARKS_AROUND]
+    usual = np.median(marks.radius[around], axis=1)
+    radius = wanted.radius / usual
+    strength = wanted.strength / np.median(marks.strength[around], axis=1)
+    bend = np.median(marks.bend[around], axis=1)
+    fits = (wanted.bend > LEAST_BEND * bend) & (radius > NEAR_RADIUS[0]) & (radius < NEAR_RADIUS[1])
+    fits &= (strength > NEAR_STRENGTH[0]) & (strength < NEAR_STRENGTH[1])
+    sure = (wanted.clear > CLEAR) & (strength > ALIKE_STRENGTH[0]) & (strength < ALIKE_STRENGTH[1])
+    chosen = (wanted.clear > RING_CONTRAST) & ((support >= LEAST_SUPPORT) | sure)
+    left = np.flatnonzero(fits & ~chosen)
+    chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > ALIKE
+    rank = wanted.strength * np.minimum(radius, 1 / radius)
+    return _apart(wanted.at(fits & chosen), rank[fits & chosen])
+
+
+def _expected(points: Floats) -> Corners:
+    """Where the lattice wants marks: the corners of parallelograms, and the next place along each line."""
+    edges = links(points)
+    found = lattice.corners(points, edges)
+    first, last = np.concatenate([edges, edges[:, ::-1]]).T
+    step = points[last] - points[first]
+    reach = lattice.CLOSED * np.hypot(*step.T)
+    return Corners(
+        np.concatenate([found.points, points[last] + step]),
+        np.concatenate([found.reach, reach]),
+        np.concatenate([found.first, first]),
+        np.concatenate([found.middle, last]),
+        np.concatenate([found.last, last]),
+    )
+
+
+def _apart(spots: Spots, rank: Floats) -> Spots:
+    """Of spots that touch each other, the one of the highest rank."""
+    left = np.ones(len(rank), bool)
+    kept = []
+    for n in np.argsort(-rank, kind="stable"):
+        if left[n]:
+            kept.append(n)
+            away = np.hypot(*(spots.points - spots.points[n]).T)
+            left &= away > APART * (spots.radius + spots.radius[n])
+    return spots.at(np.array(kept, np.int64))
+
+
+def _distances(points: Floats, others: Floats) -> Floats:
+    """(n, N) distances, px."""
+    x = points[:, :1] - others[:, 0]
+    y = points[:, 1:] - others[:, 1]
+    return np.asarray(np.sqrt(x * x + y * y), np.float64)
+
+
+def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: Floats) -> Floats:
+    """How much the discs around points look like those around others: mean correlation, -1 to 1.
+
+    Brightness, contrast and the slope of the light play no part.
+
+    Parameters
+    ----------
+    gray : (H, W) float32, grey levels.
+    points : (n, 2) float64, px. others : (n, K, 2) float64, px, with which each is compared.
+    radius : (n,) float64, of the marks there, px.
+
+    Returns
+    -------
+    likeness : (n,) float64, mean over K; 0 for a disc on even ground.
+
+    References
+    ----------
+    J. P. Lewis, "Fast normalized cross-correlation", Vision Interface (1995).
+
+    Examples
+    --------
+    >>> gray = np.zeros((20, 40), np.float32)
+    >>> gray[8:11, 8:11], gray[8:11, 28:31] = 50, 100
+    >>> likeness(gray, np.array([[9.0, 9.0]]), np.array([[[29.0, 9.0]]]), np.array([1.5])).round(3)
+    array([1.])
+    """
+    count, compared = others.shape[:2]
+    if not count:
+        return np.zeros(0)
+    reach = np.maximum(WINDOW * radius, LEAST_WINDOW)
+    own = _surroundings(gray, points, reach)
+    theirs = _surroundings(gray, others.reshape(-1, 2), np.repeat(reach, compared))
+    return np.asarray(np.einsum("np,nkp->nk", own, theirs.reshape(count, compared, -1)).mean(axis=1))
+
+
+def _surroundings(gray: NDArray[np.float32], points: Floats, reach: Floats) -> Floats:
+    """The levels of the discs around points (n, 2) without their mean and slope, as unit vectors (n, P)."""
+    axis = np.linspace(-1, 1, 2 * SAMPLES + 1)
+    x, y = (part.ravel() for part in np.meshgrid(axis, axis))
+    inside = x * x + y * y <= 1
+    x, y = x[inside], y[inside]
+    column = (points[:, :1] + reach[:, None] * x).astype(np.float32)
+    row = (points[:, 1:] + reach[:, None] * y).astype(np.float32)
+    sampled = cv2.remap(gray, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    levels = sampled.astype(np.float64)
+    plane, _ = np.linalg.qr(np.column_stack([np.ones_like(x), x, y]))
+    levels -= levels @ plane @ plane.T
+    return np.asarray(levels / np.maximum(np.linalg.norm(levels, axis=1, keepdims=True), 1e-9))
