@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -150,7 +151,9 @@ def main() -> None:
             numbers.setdefault("failures", {})[part] = {
                 name: dict(counts) for name, counts in FAILURES.items()
             }
-            numbers["machine"] = machine() | {"date": time.strftime("%Y-%m-%d", time.gmtime())} | versions()
+            # One for the bench itself: what is above it, others took.
+            now = {"date": time.strftime("%Y-%m-%d", time.gmtime()), "load": f"{os.getloadavg()[1]:.0f}"}
+            numbers["machine"] = machine() | now | versions()
             stored.write_text(json.dumps(numbers, indent=1) + "\n")
             print(f"{part}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
     if unmeasured := set(parts) - set(numbers):
