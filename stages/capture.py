@@ -49,7 +49,7 @@ class Capture(Source):
             description="the reference is taken once exposure and white balance of the camera are steady, "
             "after so many seconds at most; 0: at once",
         )
-        skip: int = Field(0, ge=0, description="frames thrown away at the start")
+        skip: int = Field(0, ge=0, description="frames discarded at the start")
         width: int | None = Field(None, ge=1, description="ask the camera for this width, px")
         height: int | None = Field(None, ge=1, description="ask the camera for this height, px")
         fps: float | None = Field(
@@ -67,7 +67,7 @@ class Capture(Source):
 
         reconnect: bool = Field(
             True,
-            description="open a camera or stream anew when it is gone, frozen or black; if false, a camera "
+            description="reopen a camera or stream that is gone, frozen or black; if false, a camera "
             "that stops is an error and a stream that ends is the end",
         )
         on_reconnect: Literal["keep", "retake"] = Field(
@@ -78,19 +78,19 @@ class Capture(Source):
         no_frame_timeout: float | None = Field(
             30.0,
             ge=0,
-            description="a camera or stream without a good frame for so long ends the run with an error, s; "
-            "0 waits for ever",
+            description="time without a good frame of a camera or stream after which the run ends with an "
+            "error, s; 0: never",
         )
         frozen_after: float | None = Field(
             3.0,
             gt=0,
-            description="pictures of a camera or stream that are the same bit for bit for so long are a "
-            "fault, s; null never",
+            description="bit-identical pictures of a camera or stream for this time are a fault, s; null: "
+            "never",
         )
         black_after: float | None = Field(
             1.0,
             gt=0,
-            description="black pictures of a camera or stream for so long are a fault, s; null never",
+            description="black pictures of a camera or stream for this time are a fault, s; null: never",
         )
 
         @field_validator("source", mode="before")

@@ -186,7 +186,7 @@ def test_tables_that_cannot_be_written_end_the_run(
 @pytest.mark.parametrize(
     ("wrong", "code", "said"),
     [
-        ("no rate is known", 2, "does not say how many frames come in a second; give --fps"),
+        ("no rate is known", 2, "does not state its frame rate; give --fps"),
         ("a camera", 2, "required a recording, not a camera or a stream"),
         ("av is missing", 3, "need av: pip install 'tactflow[lerobot]'"),
     ],

@@ -145,7 +145,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     there, out = tmp_path / "there", tmp_path / "out"
     there.mkdir()
     for name, arguments, code, said in (
-        ("hdf5", ["sim:press?frames=2", "--out", str(there)], 2, "is already there"),
+        ("hdf5", ["sim:press?frames=2", "--out", str(there)], 2, "already exists"),
         ("hdf5", ["sim:press?frames=2", "no-such.mcap"], 4, "no-such.mcap: no such file"),
     ):
         options = [] if "--out" in arguments else ["--out", str(out)]

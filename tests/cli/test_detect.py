@@ -63,7 +63,7 @@ def test_what_was_found_as_json(capsys: pytest.CaptureFixture[str]) -> None:
         ([GEL, "--dot", "nan"], 2, "--dot: required dot_radius"),
         ([GEL, "--picture", "found.txt"], 2, "ends in .png or .jpg, got found.txt"),
         ([GEL, "--picture", "here.png/found.png"], 2, "is not a folder"),
-        ([GEL, "--picture", "here.png"], 2, "here.png is already there; give --overwrite"),
+        ([GEL, "--picture", "here.png"], 2, "here.png already exists; give --overwrite"),
     ],
 )
 def test_wrong_input_is_refused_in_words(

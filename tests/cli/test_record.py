@@ -95,7 +95,7 @@ def frames_of(path: Path) -> list[Arrival]:
     ("out", "words"),
     [
         ("a.avi", "required a file whose name ends in .mcap"),
-        ("there.mcap", "is already there; give --overwrite"),
+        ("there.mcap", "already exists; give --overwrite"),
     ],
 )
 def test_a_wrong_file_is_refused_before_anything_starts(

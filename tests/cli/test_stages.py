@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactflow.cli.main import main
-from tactflow.config.registry import available
+from tactflow.config.registry import catalogue
 
 PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 
@@ -20,7 +20,7 @@ def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFix
     assert err == ""
     heading, *rows = out.splitlines()
     assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT", "IT", "DOES"]
-    assert [row.split()[:2] for row in rows] == [[c.name, c.kind] for c in available()]
+    assert [row.split()[:2] for row in rows] == [[c.name, c.kind] for c in catalogue()[0]]
     hull = next(row for row in rows if row.startswith("hull "))
     ports = ["contact_mask,", "evidence?", "contact"]
     assert hull.split()[:6] == ["hull", "stage", *ports, "built-in"]
@@ -29,7 +29,7 @@ def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFix
 def test_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stages", "--json"]) == 0
     every = {part["name"]: part for part in json.loads(capsys.readouterr().out)}
-    assert sorted(every) == sorted(c.name for c in available())
+    assert sorted(every) == sorted(c.name for c in catalogue()[0])
     assert main(["stages", "hull", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [every["hull"]]
     assert every["hull"]["outputs"] == {"contact": "Contact (may be absent)"}
@@ -55,7 +55,7 @@ def test_one_stage_is_explained_with_ports_and_parameters(
     assert "lens.fisheye: true | false = false" in lines
 
 
-@pytest.mark.parametrize("component", available(), ids=lambda component: component.name)
+@pytest.mark.parametrize("component", catalogue()[0], ids=lambda component: component.name)
 def test_every_parameter_of_a_built_in_is_described(component: object) -> None:
     from tactflow.engine.graph import Component
 

@@ -80,7 +80,7 @@ def test_a_file_is_never_replaced_without_being_told(
     out.write_text("mine")
     source = recorded("press?frames=60")
     assert propose(source, out) == 2
-    assert "already there; give --overwrite" in capsys.readouterr().err
+    assert "already exists; give --overwrite" in capsys.readouterr().err
     assert out.read_text() == "mine"
     assert propose(source, out, "--overwrite") == 0
     assert out.read_text() != "mine"

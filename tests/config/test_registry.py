@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.config.registry import available, catalogue, resolve
+from tactflow.config.registry import catalogue, resolve
 from tactflow.engine.errors import ConfigError
 
 STAGE = """
@@ -67,7 +67,7 @@ def test_a_plug_in_is_found_by_the_name_of_its_entry_point(install: Install, tmp
     component = resolve("edges", "stages", tmp_path)
     assert component.origin == "plug-in gel-tools 2.1"
     assert component.cls.__module__ == module
-    assert "edges" in [c.name for c in available()]
+    assert "edges" in [c.name for c in catalogue()[0]]
 
 
 def test_a_built_in_wins_over_a_plug_in_of_its_name_which_is_listed_as_a_problem(

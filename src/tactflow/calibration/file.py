@@ -270,7 +270,7 @@ class Calibration(_Entry):
         except Exception as error:
             # YAML, ZIP and numpy raise many kinds of errors about damaged data.
             reason = str(error)
-        raise ConfigError(f"calibration {path}: {reason}; make it anew with `tactflow calibrate`")
+        raise ConfigError(f"calibration {path}: {reason}; make a new one with `tactflow calibrate`")
 
     def misfit(self, mapping: PixelMapping) -> str | None:
         """Why it cannot be used for frames of this geometry; None if it can."""

@@ -61,7 +61,7 @@ class KeptPresses:
             _save(path, untouched=untouched, corners=corners)
             return
         before = _read(path)
-        remedy = f"begin anew with --fresh, which forgets the {len(self.presses)} presses in {self.folder}"
+        remedy = f"start over with --fresh, which discards the {len(self.presses)} presses in {self.folder}"
         same_shape = before["untouched"].shape == untouched.shape
         if not same_shape or np.abs(np.subtract(before["corners"], corners)).max() > 1:
             raise ConfigError(f"calibrate: the session of before had another preprocess; {remedy}")

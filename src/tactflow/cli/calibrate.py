@@ -84,13 +84,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_sensor(parser)
     option("--out", type=Path, metavar="FILE", help="default: calibration/SENSOR.yaml")
     option("--realtime", action="store_true", help="play a recording at its own pace, like a camera")
-    option("--fresh", action="store_true", help="forget the presses of a session that was broken off")
+    option("--fresh", action="store_true", help="discard the presses of an interrupted session")
     add_overwrite(parser)
     option(
         "--pitch",
         type=_millimetres,
         metavar="MM",
-        help="distance of neighbouring dots of the gel, which stand in a square grid, or of the target",
+        help="spacing of the gel's dots, which form a square grid, or of the target's",
     )
     option(
         "--area",
@@ -104,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--presses",
         type=positive,
         metavar="N",
-        help=f"of a live source: enough presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE})",
+        help=f"end a live session after N presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE})",
     )
     option("--view", action="store_true", help="show the live page, which says where to press next")
     _add_kind(parser)
@@ -155,7 +155,7 @@ def _add_target_and_force(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="S",
-        help="for force: add so much to the time of the CSV; the rest, up to 2 s, is estimated",
+        help="for force: add this to the times of the CSV; up to 2 s more are estimated",
     )
 
 
@@ -206,14 +206,14 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         if not kept.presses:
             raise
         raise ConfigError(
-            f"{error}. {len(kept.presses)} presses are kept in {kept.folder}: run the command again to go "
-            "on, or with --fresh to begin anew"
+            f"{error}. {len(kept.presses)} presses are kept in {kept.folder}: run the command again to "
+            "continue, or with --fresh to start over"
         ) from None
     calibration.save(out)
     if args.ball_radius is not None and len(kept.presses) >= args.presses:
         kept.clear()
     elif kept.presses:
-        say(f"to go on to {args.presses} presses, run the command again with --overwrite")
+        say(f"to continue to {args.presses} presses, run the command again with --overwrite")
     say(
         f"{out} is written. To use it, write into the pipeline file: calibration: {out}\n"
         f"or give it to a run: {typed('--set', f'calibration={out}')}"
@@ -302,7 +302,7 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     session = _find_presses(_load(args, pipeline), guide)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
-        show([f"does not fit: {misfit}; name the pipeline that it was made with, or calibrate anew"])
+        show([f"does not fit: {misfit}; name the pipeline that it was made with, or calibrate again"])
         return 3
     unlike = calibration.unlikeness(session.untouched)
     limit = f"up to {100 * UNLIKE:.0f} % fits"
@@ -314,7 +314,7 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
         fits.append(_check_presses(calibration, then, session))
     if args.csv is not None:
         fits.append(_check_force(args, path, calibration.force, pipeline))
-    show(["it still fits" if all(fits) else "it does not fit; if none of this explains it, calibrate anew"])
+    show(["it still fits" if all(fits) else "it does not fit; if none of this explains it, calibrate again"])
     return 0 if all(fits) else 3
 
 

@@ -15,12 +15,12 @@ from tactflow.cli.terminal import say, show
 from tactflow.sources.cameras import CameraInfo, list_cameras
 from tactflow.sources.usb import UsbBus, usb_buses
 
-NO_CAMERA = """no camera is plugged in (/dev/video* is empty)
+NO_CAMERA = """no camera is plugged in (there is no /dev/video*)
   plug it in and look at the last lines of: sudo dmesg
   in a virtual machine or a container, pass it through first (docker run --device /dev/video0 ...)
   a network camera is not listed: give its address, --source rtsp://..."""
 
-NO_NAMES = """on this system cameras have no names, only numbers in the order of plugging in
+NO_NAMES = """on this system, cameras have no names, only numbers in the order in which they were connected
   try: tactflow run --source 0, then 1, 2, ..."""
 
 

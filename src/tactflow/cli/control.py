@@ -13,11 +13,11 @@ from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
 
 COMMANDS = {
     "take-reference": "take the next frame as the reference",
-    "pause": "hold capturing",
-    "resume": "go on",
-    "record-start": "begin a recording (the pipeline needs a record sink)",
+    "pause": "pause capturing",
+    "resume": "resume capturing",
+    "record-start": "start a recording (the pipeline needs a record sink)",
     "record-stop": "finish it",
-    "ping": "see whether it is there",
+    "ping": "check whether it answers",
     "stats": "print its statistics so far, as JSON",
 }
 

@@ -1,4 +1,4 @@
-"""`tactflow detect`: which marks of a gel are found and why, in words and in one picture."""
+"""`tactflow detect`: which dots of a gel are found and why, in words and in one picture."""
 
 from __future__ import annotations
 
@@ -36,17 +36,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("first", nargs="?", metavar="SRC", help="the same as --source SRC")
     parser.add_argument("--source", metavar="SRC", help="as in 'tactflow run': of the untouched gel")
     add_json(parser)
-    parser.add_argument(
-        "--picture", type=Path, metavar="FILE", help="write what was found and why, to look at or to send"
-    )
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw what was found, and why")
     add_overwrite(parser)
-    parser.add_argument("--frame", type=_index, default=0, metavar="N", help="which frame, the first is 0")
+    parser.add_argument("--frame", type=_index, default=0, metavar="N", help="index of the frame, from 0")
     parser.add_argument("--rotate", type=int, default=0, choices=(0, 90, 180, 270), help="as in preprocess")
     parser.add_argument(
         "--downsample", type=int, default=1, choices=(1, 2, 4, 8, 16), help="as in preprocess"
     )
-    parser.add_argument("--dot", type=float, metavar="PX", help="radius of a mark, if it is known")
-    parser.add_argument("--polarity", default="auto", choices=("auto", "dark", "bright"), help="of the marks")
+    parser.add_argument("--dot", type=float, metavar="PX", help="radius of a dot, if known")
+    parser.add_argument("--polarity", default="auto", choices=("auto", "dark", "bright"), help="of the dots")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     title = f"{shown_address(source)}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
     without = 0.0 if valid is None else float(np.mean(valid == 0))
     if without > 0:
-        lines.append(f"dim: {100 * without:.0f} % of the picture show no gel")
+        lines.append(f"dim: {100 * without:.0f} % of the picture shows no gel")
     text = "\n".join(map(printable, [title, *lines]))
     if args.json:
         found = {} if marks is None else {key: getattr(marks, key) for key in IN_JSON}
@@ -110,7 +108,7 @@ def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
         yield f"green: {len(marks.edges)} links; {closed} ({grids}); score {marks.chosen.score:.1f}"
     yield from _best(rival, "next best")
     if rival is None:
-        yield "nothing else in the picture looks like marks"
+        yield "nothing else in the picture looks like dots"
     if marks.doubt is not None:
         yield f"warning: {marks.doubt}"
 

@@ -62,7 +62,7 @@ def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object inste
 
 def add_overwrite(parser: argparse._ActionsContainer, what: str = "FILE") -> None:
     """Declare `--overwrite`."""
-    parser.add_argument("--overwrite", action="store_true", help=f"replace {what} if it is there")
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {what} if it exists")
 
 
 def add_endpoint(parser: argparse.ArgumentParser, default: str) -> None:
@@ -151,7 +151,7 @@ def refuse_output(option: str, path: Path, *, overwrite: bool, suffixes: Sequenc
     if path.is_dir():
         raise ConfigError(f"{option}: {path} is a folder; required a file")
     if path.exists() and not overwrite:
-        raise ConfigError(f"{option}: {path} is already there; give --overwrite to replace it")
+        raise ConfigError(f"{option}: {path} already exists; give --overwrite to replace it")
 
 
 @contextmanager

@@ -37,13 +37,15 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
         "recordings",
         nargs="+",
         metavar="RECORDING",
-        help="each becomes an episode: whatever --source of `tactflow run` takes that ends",
+        help="each becomes an episode: whatever `tactflow run --source` takes, except live sources",
     )
     parser.add_argument(
-        "--out", required=True, type=Path, metavar="DATASET", help="folder; must not be there"
+        "--out", required=True, type=Path, metavar="DATASET", help="folder; must not exist yet"
     )
     parser.add_argument(
-        "--pipeline", metavar="PIPELINE", help="what finds contact and flow (default: as `tactflow run`)"
+        "--pipeline",
+        metavar="PIPELINE",
+        help="pipeline that computes the results (default: as `tactflow run`)",
     )
     parser.add_argument(
         "--fps",
@@ -51,13 +53,13 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
         help="of the dataset (default: that of the first recording; hdf5 and zarr: every frame at its time)",
     )
     parser.add_argument(
-        "--task", default="touch", help="what is done, in words: the dataset keeps it (default: touch)"
+        "--task", default="touch", help="description of the task, stored in the dataset (default: touch)"
     )
     parser.add_argument(
         "--pictures",
         choices=("video", "png"),
         default="video",
-        help="of lerobot: video is H.264, small, loses a little (default); png keeps every bit",
+        help="for lerobot: video is H.264, small and slightly lossy (default); png is lossless",
     )
 
 
@@ -71,7 +73,7 @@ def run_export(args: argparse.Namespace) -> int:
     """
     exporter = _exporter(args.format)
     if args.out.exists():
-        raise ConfigError(f"--out: {args.out} is already there; give another folder")
+        raise ConfigError(f"--out: {args.out} already exists; give another folder")
     rate = signature(exporter).parameters.get("fps")
     keeps_every_frame = rate is not None and rate.default is None
     fps = args.fps if args.fps or keeps_every_frame else _rate(args.recordings[0])
@@ -118,7 +120,7 @@ def _rate(recording: str) -> int:
     if live:
         raise ConfigError(f"{recording}: required a recording, not a camera or a stream")
     if rate is None:
-        raise ConfigError(f"{recording}: does not say how many frames come in a second; give --fps")
+        raise ConfigError(f"{recording}: does not state its frame rate; give --fps")
     return max(round(rate), 1)
 
 
@@ -128,7 +130,7 @@ def add_arguments_repair(parser: argparse.ArgumentParser) -> None:
         "file",
         type=Path,
         metavar="FILE",
-        help="an .mcap file that is damaged, or was not finished; it stays as it is",
+        help="an .mcap file that is damaged or was not finished; it is not changed",
     )
     parser.add_argument(
         "--out", type=Path, metavar="FILE", help="where the copy goes; default: FILE-repaired.mcap, beside it"
@@ -167,9 +169,9 @@ def run_repair(args: argparse.Namespace) -> int:
             result = repair(path, copy, lambda done: update(completed=done))
         except NotARecordingError as error:
             raise SourceError(f"{path}: {error}") from None
-        summary = f"{out}: {result.messages} messages; {path} stays as it is"
+        summary = f"{out}: {result.messages} messages; {path} is unchanged"
         if result.lost:
-            summary += f"; {result.lost} bytes of it belonged to nothing intact"
+            summary += f"; {result.lost} bytes of it were damaged and are left out"
         if result.finished:
             copy.unlink()
             summary = f"{path}: is intact; nothing to repair ({result.messages} messages)"

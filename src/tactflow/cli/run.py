@@ -44,12 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_pipeline(parser)
     parser.add_argument("--source", metavar="SRC", help="replaces the source of the pipeline's capture stage")
     parser.add_argument(
-        "--jsonl", metavar="PATH", help="also write one result message a frame ('-': standard output)"
+        "--jsonl", metavar="PATH", help="also write a result message for each frame ('-': standard output)"
     )
     parser.add_argument(
         "--video",
         metavar="PATH",
-        help="also write the pictures with what was found drawn on them (.mp4, .avi, ...)",
+        help="also write a video with the results drawn on the pictures (.mp4, .avi, ...)",
     )
     parser.add_argument("--max-frames", type=positive, metavar="N", help="stop after N frames")
     parser.add_argument(
@@ -66,21 +66,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--end-with-stdin",
         action="store_true",
-        help="end well when standard input ends: when the program that started this one is gone",
+        help="end the run when standard input ends, that is, with the program that started this one",
     )
     parser.add_argument(
         "--sign-of-life",
         type=Path,
         metavar="FILE",
-        help="touch this file every second while the run is alive and no stage hangs in a frame",
+        help="touch this file every second while the run makes progress",
     )
     parser.add_argument(
         "--hang-after",
         type=seconds,
         default=HANG_AFTER,
         metavar="SECONDS",
-        help="of several sensors, kill and start again one that has given no sign of life for so long "
-        "(%(default)g, and to start it has no less); more than the slowest stage may take for a frame",
+        help="with several sensors, kill and restart one that has given no sign of life for this time "
+        "(default: %(default)g, also the least while it starts); longer than the slowest stage takes",
     )
     add_quiet(parser)
     parser.add_argument(
@@ -235,17 +235,18 @@ def add_arguments_record(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar="FILE.mcap",
-        help="frames without loss, results, pipeline; tactflow run --source FILE.mcap plays it",
+        help="lossless frames, results, pipeline; tactflow run --source FILE.mcap plays it",
     )
     existing = parser.add_mutually_exclusive_group()
     add_overwrite(existing, "FILE.mcap")
-    existing.add_argument(
-        "--number", action="store_true", help="if it is there, record to FILE-001.mcap, ..."
-    )
+    existing.add_argument("--number", action="store_true", help="if it exists, record to FILE-001.mcap, ...")
     parser.add_argument(
-        "--rotate-size", type=int, metavar="MB", help="go on in FILE-001.mcap, ... when a file has so many MB"
+        "--rotate-size",
+        type=int,
+        metavar="MB",
+        help="continue in FILE-001.mcap, ... when a file has this size",
     )
-    parser.add_argument("--rotate-after", type=float, metavar="SECONDS", help="... or when it is so long")
+    parser.add_argument("--rotate-after", type=float, metavar="SECONDS", help="... or this length")
 
 
 def run_record(args: argparse.Namespace) -> int:
@@ -271,7 +272,7 @@ def _recording_options(args: argparse.Namespace, out: Path) -> dict[str, Any]:
         out = next_name(out)
     if out.exists() and not args.overwrite:
         raise ConfigError(
-            f"--out: {out} is already there; give --overwrite to replace it or --number to record beside it"
+            f"--out: {out} already exists; give --overwrite to replace it or --number to record beside it"
         )
     rotation = {"rotate_size": args.rotate_size, "rotate_after": args.rotate_after}
     chosen = {key: value for key, value in rotation.items() if value is not None}

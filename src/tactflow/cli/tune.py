@@ -35,7 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RECORDING",
         help="of the sensor: untouched at first, then some presses; as 'tactflow run --source', not live",
     )
-    parser.add_argument("--max-error", type=_above_0, metavar="PX", help="of the camera's picture")
+    parser.add_argument(
+        "--max-error", type=_above_0, metavar="PX", help="largest error, pixels of the camera's picture"
+    )
     parser.add_argument("--max-ms", type=_above_0, metavar="MS", help="CPU time of a frame with contact")
     parser.add_argument(
         "--error",
@@ -44,10 +46,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="which error counts: contact's centre, displacement of dots, mean flow; default: the largest",
     )
     parser.add_argument(
-        "--budget", type=seconds, default=120.0, metavar="TIME", help="as 90s, 2min (default)"
+        "--budget",
+        type=seconds,
+        default=120.0,
+        metavar="TIME",
+        help="time limit, such as 90s or 2min (default)",
     )
     parser.add_argument(
-        "--seed", type=_seed, default=0, metavar="N", help="the same errors again; not the times"
+        "--seed",
+        type=_seed,
+        default=0,
+        metavar="N",
+        help="of the simulated recordings: makes errors repeatable",
     )
     add_sensor(parser)
     parser.add_argument(

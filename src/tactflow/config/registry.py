@@ -55,13 +55,9 @@ def resolve(use: str, section: Section, *folders: Path) -> Component:
     return found
 
 
-def available() -> list[Component]:
-    """Every built-in and installed stage and sink that can be loaded, stages first, by name."""
-    return catalogue()[0]
-
-
 def catalogue() -> tuple[list[Component], list[str]]:
-    """Like `available`, with one message for each built-in or plug-in that cannot be used."""
+    """Every built-in and installed stage and sink that can be loaded, stages first, by name, and one message
+    for each that cannot be used."""
     components: list[Component] = []
     problems: list[str] = []
     sections: tuple[Section, ...] = get_args(Section)

@@ -90,7 +90,7 @@ class OnError(BaseModel, frozen=True, extra="forbid", strict=True):
 
     action: ErrorAction = Field(
         default="stop",
-        description="stop: the run ends; skip_frame: the frame goes on without its outputs; disable: it is "
+        description="stop: the run ends; skip_frame: the frame continues without its outputs; disable: it is "
         "not called again",
     )
     budget: int = Field(default=10, ge=0, description="frames that skip_frame may skip before the run ends")

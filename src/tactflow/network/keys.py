@@ -61,7 +61,7 @@ def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
         )
     publisher, subscriber = folder / "publisher", folder / name
     if subscriber.exists():
-        raise WrongKeysError(f"{subscriber} is there already; choose another name")
+        raise WrongKeysError(f"{subscriber} already exists; choose another name")
     mask = os.umask(0o077)
     try:
         (publisher / "subscribers").mkdir(parents=True, exist_ok=True)

@@ -178,7 +178,7 @@ class Watched(FrameReader):
         return SourceError(
             f"{self.name}: {fault.what if fault else 'no frames'}, no good frame for "
             f"{now - self._good_at:.1f} s{detail}; check its cable, power and light and what else may be "
-            "using it; no_frame_timeout says how long to wait (0: for ever)"
+            "using it; no_frame_timeout sets how long to wait (0: forever)"
         )
 
     def _report(self, what: str, since: float, now: float, detail: str = "") -> None:

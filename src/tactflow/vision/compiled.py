@@ -137,7 +137,7 @@ class _StoredCode:
             if self._checksum.read_text(errors="replace") != self._sum():
                 for path in self._files():
                     path.unlink()
-                text = "%s: its compiled code is damaged or incomplete on disk and is made anew"
+                text = "%s: its compiled code on disk is damaged or incomplete, and is compiled again"
                 logging.getLogger("tactflow").warning(text, self._name)
 
     def sign(self) -> None:
