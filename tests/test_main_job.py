@@ -124,23 +124,6 @@ def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
     assert json.loads(stats.read_text())["sinks"]["zmq"]["counters"]["serialised"] == 50
 
 
-def test_a_subscriber_that_never_reads_loses_messages_and_costs_no_frame(
-    subscriber: zmq.Socket[bytes], tmp_path: Path
-) -> None:
-    endpoint = free_endpoint()
-    subscriber.rcvhwm = 1
-    subscriber.connect(endpoint)
-    out, stats = tmp_path / "out.jsonl", tmp_path / "stats.json"
-    words = [
-        *("run", str(PIPELINE), *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={endpoint}", "--quiet"),
-        *("--set", f"sinks.zmq.wait_for_subscriber={PATIENCE}", "--source", "sim:press?frames=150"),
-        *("--jsonl", str(out), "--stats", str(stats)),
-    ]
-    assert main(words) == 0
-    assert len(messages(out.read_text())) == 150
-    assert json.loads(stats.read_text())["sinks"]["zmq"]["runs"] == 150
-
-
 def test_nothing_is_serialised_while_nobody_subscribes(tmp_path: Path) -> None:
     stats = tmp_path / "stats.json"
     words = [
