@@ -140,7 +140,7 @@ def test_a_file_that_is_no_calibration_is_refused(
 @pytest.mark.parametrize("text", ["", "- 1\n", "press", "left: 3", PIPELINE])
 def test_a_file_of_another_kind_is_refused_in_words(text: str, tmp_path: Path) -> None:
     (tmp_path / "left.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"left\.yaml: is not a calibration file; make it anew"):
+    with pytest.raises(ConfigError, match=r"left\.yaml: is not a calibration file; make a new one"):
         Calibration.load(tmp_path / "left.yaml")
 
 
@@ -286,7 +286,7 @@ def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path
     path = tmp_path / "left.yaml"
     CALIBRATION.save(path)
     path.with_suffix(".npz").write_bytes(b"PK\x03\x04 broken")
-    with pytest.raises(ConfigError, match="make it anew"):
+    with pytest.raises(ConfigError, match="make a new one"):
         Calibration.load(path)
     np.savez_compressed(path.with_suffix(".npz"), look=np.zeros(2 << 20, np.uint8))
     with pytest.raises(ConfigError, match="unpack to more than 1 MiB"):
@@ -295,5 +295,5 @@ def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path
     with pytest.raises(ConfigError, match=r"left\.npz"):
         Calibration.load(path)
     path.write_text("[" * 5000)
-    with pytest.raises(ConfigError, match="make it anew"):
+    with pytest.raises(ConfigError, match="make a new one"):
         Calibration.load(path)

@@ -128,7 +128,7 @@ def test_machine_code_with_flipped_bits_is_made_anew_with_a_line(folder: Path) -
         file.write_bytes(code.tobytes())
     second, third = run(folder), run(folder)
     assert (second.stdout, third.stdout, third.stderr) == (f"3 2 {RESULTS}", f"3 0 {RESULTS}", "")
-    assert "loops.twice: its compiled code is damaged" in second.stderr
+    assert "loops.twice: its compiled code on disk is damaged" in second.stderr
 
 
 def test_where_nothing_can_be_kept_loops_are_compiled_in_each_run(folder: Path) -> None:
