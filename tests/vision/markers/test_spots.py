@@ -1,11 +1,11 @@
-"""Spots: peaks of the response, and which points lie near which."""
+"""Spots: peaks of the response."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from tactflow.vision.markers.spots import CELL, NearPoints, find_peaks
+from tactflow.vision.markers.scale_space import find_peaks
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 3), (5, 40), (41, 37)])
@@ -32,25 +32,3 @@ def test_a_peak_is_at_the_vertex_of_its_parabolas() -> None:
     y, x = np.mgrid[:9, :12]
     points, _ = find_peaks((50 - (x - 6.3) ** 2 - (y - 3.8) ** 2).astype(np.float32), 0.0, reach=2)
     np.testing.assert_allclose(points, [[6.3, 3.8]], atol=1e-5)
-
-
-def test_points_are_near_others_within_a_disc_to_the_width_of_a_cell() -> None:
-    rng = np.random.default_rng(9)
-    pitch, both = 24.0, 0
-    under_test = NearPoints((150, 170), pitch)
-    for _ in range(100):
-        points, others = (rng.uniform((0, 0), (170, 150), (rng.integers(1, 40), 2)) for _ in range(2))
-        distance = float(rng.uniform(0.3, 1.2))
-        found = under_test.near(points, others, under_test.disc(distance))
-        away = np.linalg.norm(points[:, None] - others, axis=2).min(axis=1) / pitch
-        # Two roundings to cells and that of the disc.
-        assert found[away < distance - 2 * CELL].all()
-        assert not found[away > distance + 2 * CELL].any()
-        both += int(found.any() and not found.all())
-    assert both > 30
-
-
-def test_a_point_beyond_the_frame_counts_to_its_border() -> None:
-    near = NearPoints((150, 170), 24.0)
-    found = near.near(np.array([[-40.0, 60.0]]), np.array([[0.0, 60.0]]), near.disc(0.3))
-    assert found.tolist() == [True]

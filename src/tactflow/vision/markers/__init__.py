@@ -4,10 +4,9 @@ Once for each reference, `detection` finds them: `scale_space` looks for spots o
 tells which of them are marks by the `lattice` that they form and by how much they look like each other.
 
 In each frame, `mask` tells where markers cover the gel, and `inpaint` fills these places. `tracking` follows
-the markers: `template` aligns each one from where it was last, and `graph` tells whether neighbours move
-alike. Where a marker is missing or neighbours do not, `spots` finds spots of the markers' size, `jump` a
-motion that all of them share, `matching` chooses a spot for each marker, and `interpolation` places those
-that are not seen.
+the markers: `template` aligns each one from where it was last. Where a marker is missing or does not move
+like its neighbours, `spots` finds spots of the markers' size, `matching` chooses one for each marker, and
+`interpolation` places those that are not seen.
 """
 
 from tactflow.vision.markers.detection import Candidate, Detection, NoMarkersError, detect_markers

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Indices
+from tactflow.vision.markers.lattice import nearest
 
 NEIGHBOURS: Final = 24
 """Marks around a mark that a fit uses, at most: the two rings of a square grid, 8 + 16."""
@@ -73,17 +74,7 @@ class Interpolator:
 
 def _surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
     """For each mark up to 24 nearest others, and their weights: two (N, n) arrays."""
-    count = len(origin)
-    reach = min(NEIGHBOURS, count - 1)
-    if reach < 1:
-        return np.zeros((count, 0), np.int64), np.zeros((count, 0))
-    near = np.empty((count, reach), np.int64)
-    weight = np.empty((count, reach))
-    for mark in range(count):
-        squared = ((origin - origin[mark]) ** 2).sum(axis=1)
-        squared[mark] = np.inf
-        order = np.argsort(squared, kind="stable")[:reach]
-        near[mark] = order
-        weight[mark] = np.exp(-squared[order] / (2 * (WEIGHT_SIGMA * pitch) ** 2))
+    away, near = nearest(origin, NEIGHBOURS)
+    weight = np.exp(-(away**2) / (2 * (WEIGHT_SIGMA * pitch) ** 2))
     weight[weight < LEAST_WEIGHT] = 0.0
     return near, weight

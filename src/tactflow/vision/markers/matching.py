@@ -1,4 +1,4 @@
-"""Which spot of a frame is which mark: a joint choice by belief propagation, so that neighbours move alike.
+"""Which spot of a frame is which mark: neighbours move alike.
 
 All costs are in one unit: a link between neighbours whose displacements differ by half their distance costs
 0.5.
@@ -11,14 +11,17 @@ belief propagation for early vision", IJCV 70 (2006).
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from tactflow.vision.arrays import Flags, Floats, Indices
 
-ComplexArray = NDArray[np.complex128]
+LINKED_STRAIN: Final = 0.3
+"""Strain of a link below which its two marks move together. Chosen by hand."""
 
 MISSING_COST: Final = 1.0
 """Cost of a mark without a spot. Chosen by hand."""
@@ -29,42 +32,96 @@ MISSING_LINK_COST: Final = 0.25
 SURPRISE_COST: Final = 0.25
 """Cost of a mark one pitch away from where it was expected; grows with the square. Chosen by hand."""
 
-FAINT_COST: Final = 0.4
+FAINT_COST: Final = 1.0
 """Cost of a spot without any contrast; falls linearly to 0 at that of a typical mark. Chosen by hand."""
 
 STRAIN_COST: Final = 2.0
 """Cost of a link at a strain of 1; grows with the square. It defines the unit."""
 
-MOST_STRAIN_COST: Final = 1.2
-"""Bound of the cost of a link, so that a torn field is still possible. Chosen by hand."""
-
-FOLD_STRAIN: Final = -0.75
-"""Strain along a link below which it folds: at -1 one mark would lie on top of the other."""
-
-FOLD_COST: Final = 1.0
-"""Cost of a folded link. Chosen by hand."""
-
 SHARED_COST: Final = 4.0
-"""Cost of two neighbours that choose one spot. Chosen by hand."""
-
-FORBIDDEN_COST: Final = 1e3
-"""Cost of a spot that is too far away: more than all others together."""
+"""Cost of two neighbours that choose one spot: more than two marks without one."""
 
 LABELS: Final = 8
 """Spots among which a mark may choose: its nearest. Chosen by hand."""
 
-SMOOTH_STRAIN: Final = 0.35
-"""Strain of every link below which everybody's own best spot is taken for the joint best. Chosen by hand."""
+ROUNDS: Final = 24
+"""Rounds of propagation. Chosen by hand: messages pass over so many links."""
 
-STABLE_ROUNDS: Final = 3
-"""Propagation ends when the best labels did not change so many rounds in a row. Chosen by hand."""
+BIN: Final = 0.1
+"""Side of the bins of votes for a jump, pitches. Chosen by hand."""
 
-MOST_ROUNDS: Final = 24
-"""Propagation ends after so many rounds at the latest. Chosen by hand."""
+AGREEMENT: Final = 2
+"""Votes within so many bins of the peak agree with it: a fifth of a pitch for the scatter of the field."""
 
-DAMPING: Final = 0.3
-"""Fraction of the old message in the new one: keeps messages around loops from oscillating. Chosen by
-hand."""
+RIVAL: Final = 5
+"""Another peak is looked for from so many bins on, half a pitch: nearer ones belong to the same peak."""
+
+LEAST_VOTES: Final = 0.75
+"""Fraction of the marks that have to agree on a jump. Chosen by hand."""
+
+LEAST_LEAD: Final = 0.05
+"""Lead over the next peak, as a fraction of the marks. Chosen by hand."""
+
+
+class MarkerGraph:
+    """Marks and the links between neighbours.
+
+    The strain of a link is the difference of the displacements of its two marks over their distance.
+
+    Parameters
+    ----------
+    origin : (N, 2) float64, marks in the reference, px.
+    edges : (E, 2) int64, neighbours.
+
+    Raises
+    ------
+    ValueError : an edge names a mark that there is not.
+
+    Examples
+    --------
+    >>> origin = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]])
+    >>> graph = MarkerGraph(origin, np.array([[0, 1], [1, 2]]))
+    >>> strain = graph.strain(origin + [[1.0, 0.0], [1.0, 0.0], [6.0, 0.0]])
+    >>> strain
+    array([0. , 0.5])
+    >>> graph.largest_component(np.ones(3, bool), strain)
+    array([ True,  True, False])
+    """
+
+    def __init__(self, origin: Floats, edges: Indices) -> None:
+        count = len(origin)
+        self.edges = np.ascontiguousarray(edges, np.int64).reshape(-1, 2)
+        if len(self.edges) and not 0 <= self.edges.min() <= self.edges.max() < count:
+            raise ValueError(f"required edges between marks 0 to {count - 1}, got {self.edges.tolist()}")
+        self._origin = origin
+        self.length = np.linalg.norm(origin[self.edges[:, 0]] - origin[self.edges[:, 1]], axis=1)
+        degree = np.bincount(self.edges.ravel(), minlength=count)
+        self.border = degree < np.sort(degree)[count // 2]
+        """(N,) bool, marks with fewer neighbours than most."""
+        self._grid = self._components(np.ones(len(self.edges), bool))
+        self.grids = [np.flatnonzero(self._grid == grid) for grid in range(self._grid.max() + 1)]
+        """The marks of each grid without links to others."""
+
+    def strain(self, position: Floats) -> Floats:
+        """Strain of each link (E,), of positions (N, 2), px."""
+        moved = position - self._origin
+        x, y = (moved[self.edges[:, 0]] - moved[self.edges[:, 1]]).T
+        return np.asarray(np.sqrt(x * x + y * y) / self.length)
+
+    def largest_component(self, seen: Flags, strain: Floats) -> Flags:
+        """The seen marks (N,) of the largest component, in each grid, whose links have little strain (E,)."""
+        component = self._components((strain < LINKED_STRAIN) & seen[self.edges].all(axis=1))
+        # Of components of one size the first one.
+        rank = np.where(seen, np.bincount(component)[component] - component / len(seen), 0.0)
+        best = np.zeros(len(self.grids))
+        np.maximum.at(best, self._grid, rank)
+        return np.asarray(seen & (rank == best[self._grid]))
+
+    def _components(self, linked: Flags) -> Indices:
+        """(N,) number of the connected component of each mark, by the links (E,) that count."""
+        count = len(self._origin)
+        links = coo_array((np.ones(linked.sum(), bool), self.edges[linked].T), shape=(count, count))
+        return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
 def choose_spots(
@@ -83,8 +140,7 @@ def choose_spots(
     """Give each free mark one of the spots, or none.
 
     The choice minimises unary costs (distance from where a mark is expected, faint spots, marks without a
-    spot) and costs of links (squared strain, bounded, with a penalty for folding), also of links to inliers.
-    Where everybody's own best is not smooth already, min-sum belief propagation seeks the minimum.
+    spot) and costs of links (squared strain), also of links to inliers, by min-sum belief propagation.
 
     Parameters
     ----------
@@ -108,155 +164,113 @@ def choose_spots(
     count = len(free)
     if count == 0 or len(spots) == 0:
         return np.full(count, -1, np.int64)
-    named = np.concatenate([edges.ravel(), free])
-    if named.min() < 0 or named.max() >= len(origin):
-        raise IndexError(f"required marks 0 to {len(origin) - 1} in edges and free, got others")
+    away = np.linalg.norm(expected[:, :, None] - spots, axis=3).min(axis=0)
+    label = np.argsort(away, axis=1, kind="stable")[:, :LABELS]
+    away = np.take_along_axis(away, label, axis=1)
+    unary = np.full((count, label.shape[1] + 1), MISSING_COST)
+    cost = SURPRISE_COST * (away / pitch) ** 2 + FAINT_COST * np.maximum(1.0 - strength[label], 0.0)
+    unary[:, :-1] = np.where(away > farthest, np.inf, cost)
+    # With the displacement to each label of each mark; that of an inlier is the same for all.
+    moved = np.repeat(displacement[:, None], label.shape[1], axis=1)
+    moved[free] = spots[label] - origin[free][:, None]
     slot: Indices = np.full(len(origin), -1, np.int64)
     slot[free] = np.arange(count)
-    known = np.asarray(inliers, np.bool_)
-    links = _Links(_complex(origin), edges, free, slot, known, _complex(displacement))
-    places = _complex(spots)
-    label, unary = _near_spots(_complex(expected), places, strength, pitch, farthest)
-    chosen = _own_best(links, places, label, unary)
-    if chosen is None:
-        chosen = _assign(_beliefs(unary, *_link_costs(links, places, label)), label)
-    return chosen
+    for ends in (edges, edges[:, ::-1]):
+        mark, anchor = ends[(slot[ends[:, 0]] >= 0) & inliers[ends[:, 1]]].T
+        np.add.at(unary, slot[mark], _link_costs(origin, moved, mark, anchor)[:, :, 0])
+    inner = edges[(slot[edges] >= 0).all(axis=1)]
+    pair = _link_costs(origin, moved, *inner.T)
+    first, second = slot[inner].T
+    pair[:, :-1, :-1] += SHARED_COST * (label[first][:, :, None] == label[second][:, None, :])
+    return _assign(_beliefs(unary, first, second, pair), label)
 
 
-class _Links(NamedTuple):
-    """Marks and their links, where points and displacements are complex numbers x + i y.
+def _link_costs(origin: Floats, moved: Floats, first: Indices, second: Indices) -> Floats:
+    """(links, L + 1, L + 1) what the labels of two marks cost together; the last label is that of no spot.
 
-    rest : (N,) complex128, marks in the reference, px. slot : (N,), the number of each mark among the free
-    ones, or -1. The others as in `choose_spots`.
+    moved : (N, L, 2), displacement of each mark to each of its spots.
     """
-
-    rest: ComplexArray
-    edges: Indices
-    free: Indices
-    slot: Indices
-    inliers: Flags
-    displacement: ComplexArray
-
-
-def _complex(points: Floats) -> ComplexArray:
-    """x + i y, which makes lengths and inner products of many pairs cheap."""
-    return np.asarray(points[..., 0] + 1j * points[..., 1], np.complex128)
-
-
-def _near_spots(
-    expected: ComplexArray, spots: ComplexArray, strength: Floats, pitch: float, farthest: float
-) -> tuple[Indices, Floats]:
-    """The spots that each mark may choose, (n, L), the nearest first; and what they cost it, (n, L + 1), last
-    that of no spot. L is how many are in reach of a mark at most, no more than `LABELS`."""
-    away = np.abs(expected[:, :, None] - spots).min(axis=0)
-    nearest = np.argsort(away, axis=1, kind="stable")[:, :LABELS]
-    away = np.take_along_axis(away, nearest, axis=1)
-    labels = int((away <= farthest).sum(axis=1).max())
-    label, away = np.ascontiguousarray(nearest[:, :labels]), away[:, :labels]
-    unary = np.full((len(label), labels + 1), MISSING_COST)
-    cost = SURPRISE_COST * (away / pitch) ** 2 + FAINT_COST * np.maximum(1.0 - strength[label], 0.0)
-    unary[:, :labels] = np.where(away > farthest, FORBIDDEN_COST, cost)
-    return label, unary
-
-
-def _own_best(links: _Links, spots: ComplexArray, label: Indices, unary: Floats) -> Indices | None:
-    """What each mark chooses alone, if that is a smooth choice or there is none; else None.
-
-    label, unary : of `_near_spots`; the costs of links to inliers are added to `unary`.
-    """
-    count, labels = label.shape
-    if labels == 0:
-        return np.full(count, -1, np.int64)
-    moved = spots[label] - links.rest[links.free][:, None]
-    _add_links_to_inliers(links, moved, unary)
-    best, rows = np.argmin(unary, axis=1), np.arange(count)
-    if (best == labels).any():
-        return None
-    own: Indices = label[rows, best]
-    return own if len(np.unique(own)) == count and _is_smooth(links, moved[rows, best]) else None
-
-
-def _add_links_to_inliers(links: _Links, moved: ComplexArray, unary: Floats) -> None:
-    """Add to `unary`, (n, L + 1), what the links to inliers cost, whose displacement is not a matter of
-    choice. moved : (n, L), displacement of each mark to each of its spots."""
-    slot, inliers = links.slot, links.inliers
-    one, other = links.edges.T
-    there, back = (slot[one] >= 0) & inliers[other], (slot[other] >= 0) & inliers[one]
-    mark = np.concatenate([slot[one][there], slot[other][back]])
-    anchor = np.concatenate([other[there], one[back]])
-    span = links.rest[anchor] - links.rest[links.free[mark]]
-    change = (links.displacement[anchor][:, None] - moved[mark]) / span[:, None]
-    squared = change.real**2 + change.imag**2
-    costs = np.full((len(mark), unary.shape[1]), MISSING_LINK_COST)
-    costs[:, :-1] = np.minimum(STRAIN_COST * squared, MOST_STRAIN_COST)
-    costs[:, :-1] += FOLD_COST * (change.real < FOLD_STRAIN)
-    np.add.at(unary, mark, costs)
-
-
-def _is_smooth(links: _Links, moved: ComplexArray) -> bool:
-    """Whether no link is strained if the free marks have moved so, (n,)."""
-    slot, rest = links.slot, links.rest
-    now, known = links.displacement.copy(), links.inliers.copy()
-    now[links.free], known[links.free] = moved, True
-    one, other = links.edges.T
-    linked = known[one] & known[other] & ((slot[one] >= 0) | (slot[other] >= 0))
-    one, other = one[linked], other[linked]
-    return bool((np.abs(now[other] - now[one]) < SMOOTH_STRAIN * np.abs(rest[other] - rest[one])).all())
-
-
-def _link_costs(links: _Links, spots: ComplexArray, label: Indices) -> tuple[Indices, Indices, Floats]:
-    """First and second mark of each link between free marks; and what their labels, (n, L), cost together.
-
-    Returns (links,), (links,) and (links, L + 1, L + 1); the last label is that of no spot.
-    """
-    labels = label.shape[1]
-    inner = links.edges[(links.slot[links.edges] >= 0).all(axis=1)]
-    first, second = links.slot[inner].T
-    moved = spots[label] - links.rest[links.free][:, None]
-    span = (links.rest[inner[:, 1]] - links.rest[inner[:, 0]])[:, None, None]
-    change = (moved[second][:, None, :] - moved[first][:, :, None]) / span
-    squared = change.real**2 + change.imag**2
-    cost = np.minimum(STRAIN_COST * squared, MOST_STRAIN_COST) + FOLD_COST * (change.real < FOLD_STRAIN)
-    pair = np.full((len(inner), labels + 1, labels + 1), MISSING_LINK_COST)
-    pair[:, :labels, :labels] = cost + SHARED_COST * (label[first][:, :, None] == label[second][:, None, :])
-    return first, second, pair
+    labels = moved.shape[1]
+    length = np.linalg.norm(origin[second] - origin[first], axis=1)
+    change = moved[second][:, None, :] - moved[first][:, :, None]
+    cost = np.full((len(first), labels + 1, labels + 1), MISSING_LINK_COST)
+    cost[:, :-1, :-1] = STRAIN_COST * (change**2).sum(axis=3) / length[:, None, None] ** 2
+    return cost
 
 
 def _beliefs(unary: Floats, first: Indices, second: Indices, pair: Floats) -> Floats:
     """Costs of each mark's labels, (n, L + 1), by min-sum belief propagation; of all links at once.
 
-    unary : (n, L + 1). first, second, pair : of `_link_costs`.
+    unary : (n, L + 1). first, second : (links,), the marks of each link. pair : (links, L + 1, L + 1).
     """
     source, target = np.concatenate([first, second]), np.concatenate([second, first])
     cost = np.concatenate([pair, pair.transpose(0, 2, 1)])
     message = np.zeros((len(source), unary.shape[1]))
-    belief, choice, unchanged = unary, unary.argmin(axis=1), 0
-    for _ in range(MOST_ROUNDS if len(first) else 0):
+    belief = unary
+    for _ in range(ROUNDS if len(first) else 0):
         outgoing = belief[source] - np.roll(message, len(first), axis=0)
-        fresh = (outgoing[:, :, None] + cost).min(axis=1)
-        fresh -= fresh.min(axis=1, keepdims=True)
-        message = (1 - DAMPING) * fresh + DAMPING * message
+        message = (outgoing[:, :, None] + cost).min(axis=1)
+        message -= message.min(axis=1, keepdims=True)
         belief = unary.copy()
         np.add.at(belief, target, message)
-        latest = belief.argmin(axis=1)
-        unchanged = unchanged + 1 if (latest == choice).all() else 0
-        if unchanged == STABLE_ROUNDS:
-            break
-        choice = latest
     return belief
 
 
 def _assign(belief: Floats, label: Indices) -> Indices:
     """The cheapest spot of each mark, (n,), -1 for none; of two that want one spot, the surer one gets it."""
-    choice, labels = belief.argmin(axis=1), label.shape[1]
-    rows = np.arange(len(choice))
-    chosen: Indices = np.where(choice < labels, label[rows, np.minimum(choice, labels - 1)], -1)
-    surplus = belief[rows, choice] - belief[:, labels]
-    taken: set[int] = set()
-    for mark in np.argsort(surplus, kind="stable").tolist():
-        spot = int(chosen[mark])
-        if spot in taken:
-            chosen[mark] = -1
-        elif spot >= 0:
-            taken.add(spot)
-    return chosen
+    best = belief.argmin(axis=1)
+    rows = np.arange(len(best))
+    chosen: Indices = np.append(label, np.full((len(label), 1), -1), axis=1)[rows, best]
+    surest = np.argsort(belief[rows, best] - belief[:, -1], kind="stable")
+    _, first = np.unique(chosen[surest], return_index=True)
+    kept = np.zeros(len(chosen), bool)
+    kept[surest[first]] = True
+    return np.where(kept, chosen, -1)
+
+
+def common_displacement(position: Floats, spots: Floats, *, pitch: float, farthest: float) -> Floats | None:
+    """The displacement that nearly all marks share, if there is clearly one.
+
+    Every pair of a mark and a spot votes for its displacement. Only this tells a jump of the whole grid by
+    nearly a pitch from a small one the other way, which all marks but those of one side would agree with.
+
+    Parameters
+    ----------
+    position : (N, 2) float64, marks before, px.
+    spots : (M, 2) float64, spots now, px.
+    pitch : px. farthest : largest displacement, px.
+
+    Returns
+    -------
+    displacement : (2,) float64, px; None where fewer than three quarters of the marks agree, or nearly as
+        many agree with another.
+
+    References
+    ----------
+    Ballard, "Generalizing the Hough transform to detect arbitrary shapes", Pattern Recognition 13 (1981).
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.arange(0, 50, 10.0), np.arange(0, 50, 10.0))
+    >>> position = np.column_stack([x.ravel(), y.ravel()])
+    >>> common_displacement(position, position + [4.0, -3.0], pitch=10.0, farthest=13.0).round(6)
+    array([ 4., -3.])
+    """
+    if len(spots) == 0:
+        return None
+    reach = int(farthest / (BIN * pitch))
+    votes = (spots - position[:, None]).reshape(-1, 2)
+    bins = np.rint(votes / (BIN * pitch)).astype(np.int64)
+    near = (np.abs(bins) <= reach).all(axis=1)
+    votes, bins = votes[near], bins[near] + reach
+    counts = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
+    np.add.at(counts, (bins[:, 1], bins[:, 0]), 1)
+    side = 2 * AGREEMENT + 1
+    around = cv2.boxFilter(counts, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    row, column = np.unravel_index(int(np.argmax(around)), around.shape)
+    agree = (np.abs(bins - (column, row)) <= AGREEMENT).all(axis=1)
+    most, count = int(agree.sum()), len(position)
+    around[max(row - RIVAL, 0) : row + RIVAL + 1, max(column - RIVAL, 0) : column + RIVAL + 1] = 0
+    if most < LEAST_VOTES * count or most < float(around.max()) + LEAST_LEAD * count:
+        return None
+    return np.asarray(votes[agree].mean(axis=0), np.float64)

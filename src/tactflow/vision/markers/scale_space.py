@@ -112,7 +112,10 @@ def find_spots(
     narrow, wide = blurred(shrunk(gray, factor), fine)
     dark = polarity == "dark"
     response = np.asarray(wide - narrow if dark else narrow - wide, np.float32)
-    peaks, strength = _peaks(response, fine)
+    # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
+    peaks, strength = find_peaks(response, LEAST_STRENGTH, max(1, round(OVERLAP * RADIUS_PER_SIGMA * fine)))
+    strongest = np.argsort(-strength, kind="stable")[:MOST_PEAKS]
+    peaks, strength = peaks[strongest], strength[strongest]
     clear = _clearance(narrow if dark else -narrow, peaks, fine * RADIUS_PER_SIGMA)
     points = peaks * factor + (factor - 1) / 2
     spots = Spots(points, np.full(len(points), radius), strength, clear, fine**2 * _bend(response, peaks))
@@ -139,23 +142,24 @@ def blurred(gray: NDArray[np.float32], sigma: float) -> tuple[NDArray[np.float32
     return np.asarray(narrow, np.float32), np.asarray(wide, np.float32)
 
 
-def _peaks(response: NDArray[np.float32], sigma: float) -> tuple[Floats, Floats]:
-    """Local maxima, refined to sub-pixels by a parabola along each axis: positions (N, 2), strengths (N,)."""
-    # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
-    size = 2 * max(1, round(OVERLAP * RADIUS_PER_SIGMA * sigma)) + 1
-    highest = cv2.dilate(response, np.ones((size, size), np.uint8))
-    rows, columns = np.nonzero((response >= highest) & (response > LEAST_STRENGTH))
-    inside = (rows > 0) & (columns > 0) & (rows < response.shape[0] - 1) & (columns < response.shape[1] - 1)
-    rows, columns = rows[inside], columns[inside]
-    strongest = np.argsort(-response[rows, columns], kind="stable")[:MOST_PEAKS]
-    rows, columns = rows[strongest], columns[strongest]
+def find_peaks(response: NDArray[np.float32], least: float, reach: int) -> tuple[Floats, Floats]:
+    """Pixels above `least` that are the highest in a square of side 2 reach + 1.
+
+    Returns (M, 2) float64, each the vertex of a parabola along each axis, at most half a pixel away, and the
+    response (M,) float64.
+    """
+    highest = cv2.dilate(response, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    peak = (response >= highest) & (response > np.float32(least))
+    peak[[0, -1]] = False
+    peak[:, [0, -1]] = False
+    rows, columns = np.nonzero(peak)
     value = response[rows, columns].astype(np.float64)
     points = np.column_stack([columns, rows]).astype(np.float64)
     for axis, (step_y, step_x) in enumerate(((0, 1), (1, 0))):
         before = response[rows - step_y, columns - step_x]
         after = response[rows + step_y, columns + step_x]
-        bend = before + after - 2 * value
-        points[:, axis] += np.where(bend < -1e-6, 0.5 * (before - after) / np.minimum(bend, -1e-6), 0.0)
+        bend = np.minimum(before + after - 2 * value, -1e-6)
+        points[:, axis] += np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
     return points, value
 
 

@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
 from tactflow.vision.compiled import kernel
@@ -17,11 +18,9 @@ from tactflow.vision.markers.detection import (
     require_image,
     to_gray,
 )
-from tactflow.vision.markers.graph import MarkerGraph
 from tactflow.vision.markers.interpolation import Interpolator
-from tactflow.vision.markers.jump import common_displacement
-from tactflow.vision.markers.matching import choose_spots
-from tactflow.vision.markers.spots import NearPoints, SpotFinder
+from tactflow.vision.markers.matching import MarkerGraph, choose_spots, common_displacement
+from tactflow.vision.markers.spots import SpotFinder
 from tactflow.vision.markers.template import Alignment, MarkerTemplates, SizedTemplates
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -33,13 +32,6 @@ MOST_GAIN: Final = np.float32(3.0)
 
 LEAST_R_SQUARED: Final = np.float32(0.5)
 """Fraction of its contrast that the template of a mark that is seen explains, at least. Chosen by hand."""
-
-LEAST_SPOT_GAIN: Final = 0.3
-"""Least gain of a mark at a spot that was chosen for it, though its template no longer fits well. Chosen by
-hand."""
-
-LEAST_SPOT_R_SQUARED: Final = 0.33
-"""Least r_squared of such a mark. Chosen by hand: its neighbours' choice is evidence, too."""
 
 STEEP_STRAIN: Final = 0.4
 """Strain of a link below which it is beyond doubt. Chosen by hand."""
@@ -83,18 +75,8 @@ SPOT_STRENGTH: Final = 0.25
 JUMP_STRENGTH: Final = 0.4
 """Strength of a spot that votes for a jump of the whole grid, against a typical one. Chosen by hand."""
 
-OWN_STRENGTH: Final = 0.5
-"""Strength of a spot that is where a mark was found but is no peak. Chosen by hand."""
-
-SAME_SPOT: Final = 0.35
+SAME_SPOT: Final = 0.3
 """Distance within which a mark is at a spot, pitches. Chosen by hand."""
-
-CLAIMED_SPOT: Final = 0.3
-"""Distance within which a spot belongs to an inlier, pitches. Chosen by hand."""
-
-LEFT_OVER_SPOT: Final = 0.4
-"""Distance from where the field puts a mark within which an unused spot is taken for it, pitches. Chosen by
-hand."""
 
 SHARP_STEP: Final = 0.6
 """Distance from a spot, in radii, and 0.5 px more, within which alignment is trusted. Chosen by hand."""
@@ -141,7 +123,7 @@ class MarkerTracker:
 
     References
     ----------
-    The modules `template`, `spots`, `jump`, `matching` and `interpolation` name those of their methods.
+    The modules `template`, `spots` and `matching` name those of their methods.
 
     Examples
     --------
@@ -189,8 +171,6 @@ class MarkerTracker:
         )
         self._spots = SpotFinder(np.rint(mean).astype(np.uint8), detection)
         self._graph = MarkerGraph(self._origin, detection.edges)
-        self._nearness = NearPoints(self._shape, self._pitch)
-        self._same, self._claimed = map(self._nearness.disc, (SAME_SPOT, CLAIMED_SPOT))
         self._interpolator = Interpolator(self._origin, self._pitch)
         self.reset()
 
@@ -266,8 +246,11 @@ class MarkerTracker:
         if len(free) == 0:
             return _Result(found.position, seen, found.stderr)
         moved = found.position - self._origin
-        expected = np.stack([self._position[free], self._origin[free] + _median(moved[inliers])])
-        spots, strength = self._candidates(image, found.position, inliers, free[seen[free]], expected)
+        # Where they were, and where the marks around them are now.
+        around = found.position.copy()
+        self._infer(around, inliers)
+        expected = np.stack([self._position[free], around[free]])
+        spots, strength = self._candidates(image, found, inliers, seen & ~inliers, expected)
         chosen = choose_spots(
             self._origin, self._graph.edges, free, inliers, moved, expected, spots, strength,
             pitch=self._pitch, farthest=self._farthest,
@@ -275,10 +258,6 @@ class MarkerTracker:
         result = _Result(found.position.copy(), inliers.copy(), found.stderr.copy())
         given = chosen >= 0
         self._take(image, free[given], spots[chosen[given]], result)
-        unused = np.ones(len(spots), bool)
-        unused[chosen[given]] = False
-        if not result.found.all() and unused.any():
-            self._take_left_over(image, spots[unused], result)
         return result
 
     def _jumps(self, image: NDArray[np.uint8], seen: Flags) -> Floats | None:
@@ -314,25 +293,20 @@ class MarkerTracker:
         return there > int(np.count_nonzero(seen[grid])) and there > WHOLE * len(grid)
 
     def _candidates(
-        self,
-        image: NDArray[np.uint8],
-        position: Floats,
-        inliers: Flags,
-        outliers: Indices,
-        expected: Floats,
+        self, image: NDArray[np.uint8], found: Alignment, inliers: Flags, outliers: Flags, expected: Floats
     ) -> tuple[Floats, Floats]:
-        """Spots (M, 2), px, that no inlier is at, and their strengths (M,).
+        """Spots (M, 2), px, that no inlier is at, and their strengths (M,), 1 for a typical mark.
 
-        expected : (k, n, 2), px, around which spots are searched. outliers : marks that are seen without
-        being inliers; where they are is a spot like any other.
+        expected : (k, n, 2), px, around which spots are searched. outliers : (N,), marks that are seen
+        without being inliers; where they are is a spot like any other.
         """
         low, high = expected.min(axis=(0, 1)) - self._farthest, expected.max(axis=(0, 1)) + self._farthest
         spots, strength = self._spots.find(image, SPOT_STRENGTH, low, high)
-        own = position[outliers]
-        own = own[~self._nearness.near(own, spots, self._same)]
-        unclaimed = ~self._nearness.near(spots, position[inliers], self._claimed)
-        strengths = np.concatenate([strength[unclaimed], np.full(len(own), OWN_STRENGTH)])
-        return np.concatenate([spots[unclaimed], own]), strengths
+        own = np.flatnonzero(outliers)
+        own = own[_are_apart(found.position[own], spots, SAME_SPOT * self._pitch)]
+        spots, strength = np.concatenate([spots, found.position[own]]), np.append(strength, found.gain[own])
+        free = _are_apart(spots, found.position[inliers], SAME_SPOT * self._pitch)
+        return spots[free], strength[free]
 
     def _take(self, image: NDArray[np.uint8], marks: Indices, spots: Floats, result: _Result) -> None:
         """Align marks from their spots and enter what is found."""
@@ -341,24 +315,10 @@ class MarkerTracker:
         measured, gain, r_squared, error = self._templates.align(image, spots, marks)
         near = _lengths(measured - spots) < SHARP_STEP * self._radius + 0.5
         sharp = trusted(gain, r_squared) & near
-        # A spot that hardly looks like the mark any more is still its place, to a part of its radius.
+        # A spot that looks like the mark only from afar is still its place, to a part of its radius.
         result.position[marks] = np.where(sharp[:, None], measured, spots)
         result.stderr[marks] = np.where(sharp, error, SPOT_STDERR * self._radius)
-        faint = (gain > LEAST_SPOT_GAIN) & (gain < MOST_GAIN) & (r_squared > LEAST_SPOT_R_SQUARED)
-        result.found[marks] = sharp | faint
-
-    def _take_left_over(self, image: NDArray[np.uint8], spots: Floats, result: _Result) -> None:
-        """Give spots that nobody chose to missing marks that the field puts next to them.
-
-        Where the field is steep, a fit to the marks around predicts better than their motions do.
-        """
-        self._infer(result.position, result.found)
-        missing = np.flatnonzero(~result.found)
-        away = np.hypot(*(result.position[missing][:, None] - spots).transpose(2, 0, 1))
-        spot = away.argmin(axis=1)
-        mutual = away.argmin(axis=0)[spot] == np.arange(len(missing))
-        mutual &= away.min(axis=1) < LEFT_OVER_SPOT * self._pitch
-        self._take(image, missing[mutual], spots[spot[mutual]], result)
+        result.found[marks] = trusted(gain, r_squared)
 
     def _infer(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that were not found, in place, and return those; others stay where they were."""
@@ -380,6 +340,13 @@ def _median(vectors: Floats) -> Floats:
         return np.zeros(2)
     ordered = np.sort(vectors, axis=0)
     return np.asarray((ordered[(len(vectors) - 1) // 2] + ordered[len(vectors) // 2]) / 2, np.float64)
+
+
+def _are_apart(points: Floats, others: Floats, distance: float) -> Flags:
+    """(n,) which points (n, 2) are farther than a distance, px, from all others (m, 2)."""
+    if not (len(points) and len(others)):
+        return np.ones(len(points), bool)
+    return np.asarray(KDTree(others).query(points)[0] > distance)
 
 
 def _lengths(vectors: Floats) -> Floats:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactflow.vision.markers.graph import MarkerGraph
 from tactflow.vision.markers.lattice import neighbour_graph
+from tactflow.vision.markers.matching import MarkerGraph
 from tests.vision.dots import grid
 
 
