@@ -35,12 +35,14 @@ MOST_WORKERS = 4
 """Processes that run tests at most: many tests watch a run in real time and need a processor then."""
 
 LONG_FILES = (
+    "test_install.py",
     "bench/test_run.py",
     "browser/test_view_page.py",
-    "browser/test_start.py",
-    "fleet/test_fleet.py",
     "test_main_job.py",
-    "test_install.py",
+    "browser/test_start.py",
+    "cli/test_start.py",
+    "fleet/test_fleet.py",
+    "batch/test_workers.py",
     "cli/test_calibrate.py",
     "cli/test_record.py",
 )
