@@ -211,6 +211,7 @@ def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
     shoot(shown, "5-live")
     running.process.send_signal(signal.SIGINT)
     assert running.process.wait(PATIENCE / 1000) == 0, "".join(running.errors)
+    assert not [line for line in running.errors if "the server failed" in line]
     pipeline = yaml.safe_load(written.read_text())
     assert pipeline["stages"]["capture"]["source"] == gel.address
     assert pipeline["stages"]["preprocess"]["rotate"] == 90

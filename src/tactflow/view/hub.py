@@ -188,7 +188,8 @@ class Hub:
 
     def end(self) -> None:
         """Send every page the reason for the end of the run, and disconnect it."""
-        self._end = str(self._commands.snapshot()["end"])
+        # Without a run, as for questions, the page only ends.
+        self._end = str(self._commands.snapshot().get("end", "eos"))
         for page in self.pages:
             page.ended = True
         self.post_stats()
