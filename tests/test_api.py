@@ -290,6 +290,9 @@ def test_a_result_can_be_drawn() -> None:
     assert result.image is not None
     assert picture.shape == result.image.shape
     assert (picture != result.image).any()
+    sideways = np.zeros(result.image.shape, np.float32) + np.float32([1, 0, 0])
+    tilted = tactflow.draw(result.replace(normals=sideways), view="normals", text=False)
+    assert tilted[0, 0].tolist() == [128, 128, 255]
     with pytest.raises(ValueError, match="images=True"):
         tactflow.draw(next(tactflow.stream()))
 
