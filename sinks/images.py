@@ -44,7 +44,7 @@ class Images(Sink):
             "others are drawn all the same; max_rate avoids that",
         )
         overwrite: bool = Field(
-            False, description="write into a folder that holds frame-*.png or .jpg already"
+            False, description="write into a folder that already holds frame-*.png or .jpg"
         )
 
     def __init__(self, params: Params) -> None:
@@ -78,7 +78,7 @@ class Images(Sink):
         present = next(self._folder.glob("frame-*.[pj][np]g"), None)
         if present is not None and not self.params.overwrite:
             raise StageError(
-                f"{self._folder}: holds frames already ({present.name}, ...); set overwrite: true or give "
+                f"{self._folder}: already holds frames ({present.name}, ...); set overwrite: true or give "
                 "another folder"
             )
 

@@ -61,21 +61,21 @@ class Record(Recorder):
             None,
             gt=0,
             le=3600,
-            description="keep so many last seconds in memory, s; the button saves them, and a contact's "
+            description="seconds kept in memory; the button saves them, and a contact's "
             "recording begins with them",
         )
         memory: int = Field(
             2048,
             ge=16,
-            description="most that the ring may take, MB (30 s of 800 x 600 at 60 Hz take 1300); what does "
+            description="memory limit of the ring, MB (30 s of 800 x 600 at 60 Hz take 1300); what does "
             "not fit is left out, with a warning",
         )
-        after: float = Field(1.0, ge=0, description="a contact's recording ends so long after the contact, s")
+        after: float = Field(1.0, ge=0, description="seconds recorded after a contact has ended")
         rotate_size: int | None = Field(
-            None, ge=1, description="go on in another, numbered file when this one has so many MB"
+            None, ge=1, description="size at which another, numbered file continues, MB"
         )
         rotate_after: float | None = Field(
-            None, gt=0, description="go on in another, numbered file when this one is so long, s"
+            None, gt=0, description="time after which another, numbered file continues, s"
         )
         preview: float = Field(
             10.0, ge=0, le=240, description="rate of the JPEG pictures for people, Hz; 0 leaves them out"

@@ -195,7 +195,7 @@ def test_keys_that_are_missing_or_damaged_are_refused_with_a_hint(folders: tuple
         Publisher(ANY_PORT, 1, 32768, str(subscriber))
     key = publisher / "subscribers" / "laptop.key"
     for text, reason in (
-        ('public-key = "short"', "required keys of 40 letters"),
+        ('public-key = "short"', "required keys of 40 characters"),
         ("no key", "No public key"),
     ):
         key.write_text(text)

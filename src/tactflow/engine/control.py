@@ -19,11 +19,11 @@ class Control(Protocol):
         """End the run soon: no more frames are captured, those under way are finished."""
 
     def pause(self, paused: bool) -> None:
-        """Hold capturing, or go on. A recording waits; a live source's frames are let go."""
+        """Pause or resume capturing. A recording waits; a live source's frames are dropped."""
 
     @property
     def paused(self) -> bool:
-        """Whether capturing is held."""
+        """Whether capturing is paused."""
 
     @property
     def hurried(self) -> bool:

@@ -120,7 +120,7 @@ class _MarkersModel(_Strict):
 
 
 class _SlipModel(_Strict):
-    """Whether what touches the gel slips."""
+    """Whether the contact slips."""
 
     slipping: bool = Field(description="whether it slides over the gel")
     stick_ratio: float = Field(
@@ -151,7 +151,7 @@ class _ForceModel(_Strict):
 
 
 class _FeaturesModel(_Strict):
-    """What a network of the user says."""
+    """Output of a network of the user."""
 
     values: list[_Finite] = Field(description="as many numbers as the network gives")
     unit: str = Field(description="of the numbers")
@@ -167,7 +167,7 @@ class _FieldModel(_Strict):
 
 
 class _Message(_Strict):
-    """What tactflow says about one processed frame."""
+    """The results of one processed frame."""
 
     model_config = ConfigDict(title=SCHEMA)
 

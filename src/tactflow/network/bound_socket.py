@@ -94,7 +94,7 @@ def _refuse_taken_path(path: Path, endpoint: str, hint: str) -> None:
     if sys.platform == "win32" or not path.exists():
         return
     if not path.is_socket():
-        raise StageError(f"{endpoint}: {path} is a file; an address needs a path where nothing is yet")
+        raise StageError(f"{endpoint}: {path} is a file; an address needs an unused path")
     with system_socket.socket(system_socket.AF_UNIX) as probe:
         # Nobody answers at a socket that a killed run has left behind.
         if probe.connect_ex(str(path)) == 0:

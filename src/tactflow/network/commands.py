@@ -47,7 +47,7 @@ class Commands:
         return self._control
 
     def pause(self, paused: bool) -> Answer:
-        """Hold capturing, or go on."""
+        """Pause or resume capturing."""
         self._admitted("pause").pause(paused)
         return {"message": "paused" if paused else "running"}
 

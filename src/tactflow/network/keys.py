@@ -124,7 +124,7 @@ def _load(file: Path) -> tuple[bytes, bytes]:
         raise WrongKeysError(str(error)) from None
     # Keys of 32 bytes, as text in ZeroMQ's Z85.
     if len(public) != 40 or (is_secret and len(secret or b"") != 40):
-        raise WrongKeysError(f"{file}: required keys of 40 letters; {HINT}")
+        raise WrongKeysError(f"{file}: required keys of 40 characters; {HINT}")
     return public, secret or b""
 
 

@@ -193,5 +193,5 @@ def _check_lengths(data: bytes) -> None:
     while at < len(data):
         count += 1
         if data[at] == 0 or count > MOST_RECORDS:
-            raise ValueError("is no sequence of records")
+            raise ValueError("is not a sequence of records")
         at += RECORD_HEAD + int.from_bytes(data[at + 1 : at + RECORD_HEAD], "little")
