@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,7 +50,9 @@ class Programme:
     jumps : whether the gel is dragged to a new position every third frame. creep : drag of the gel, px per
     frame.
     dilation : outward displacement by a press, pitches. contacts : number spread over the recording; 0: as
-    many as fit. partial : whether slip starts at the edge of the contact; for balls.
+    many as fit. partial : whether slip starts at the edge of the contact; for balls. rolls : whether a ball
+    turns as it travels, without slip. tilts : rotation about the direction of motion and across it, from 0 to
+    this and back during a hold, degrees.
     """
 
     indenters: tuple[Callable[..., Shape], ...]
@@ -67,6 +70,8 @@ class Programme:
     dilation: float = 0.3
     contacts: int = 0
     partial: bool = False
+    rolls: bool = False
+    tilts: tuple[float, float] = (0.0, 0.0)
 
 
 def _smooth(value: float) -> float:
@@ -167,6 +172,27 @@ def _dragged(
     return drag, drag, None, False
 
 
+def _tilt(
+    programme: Programme,
+    shape: Shape,
+    depth: float,
+    angle: float,
+    timing: _Timing,
+    ahead: NDArray[np.float64],
+    travelled: NDArray[np.float64],
+    sink: float,
+) -> tuple[float, float]:
+    """`tilt` of `Press`."""
+    across = np.array([-ahead[1], ahead[0]])
+    if programme.rolls:
+        # Rolling without slip: the mean of the surface in contact does not move.
+        about = across * float(travelled @ ahead) / (shape.center - depth * (1 - sink) / 2)
+    else:
+        about = np.radians(programme.tilts) @ np.stack([ahead, across]) * timing.swing
+    cos, sin = np.cos(angle), np.sin(angle)
+    return float(about[0] * cos + about[1] * sin), float(about[1] * cos - about[0] * sin)
+
+
 def presses(
     programme: Programme,
     shapes: tuple[Shape, ...],
@@ -187,10 +213,17 @@ def presses(
     x, y, angle, ahead = _place(programme, settings.seed, timing.cycle, size)
     drag, travelled, stick, sliding = _dragged(programme, timing, ahead, settings, pitch)
     turn = float(np.radians(settings.twist)) * (-1.0 if timing.cycle % 2 else 1.0) * timing.swing
-    depth = timing.envelope * programme.depths[timing.cycle % len(programme.depths)] * settings.depth
+    full = programme.depths[timing.cycle % len(programme.depths)] * settings.depth
+    depth = timing.envelope * full
+    tilts = [
+        _tilt(programme, s, full * s.depth, angle + turn, timing, ahead, travelled, settings.sink)
+        for s in shapes
+    ]
     indenters = [
         Press(
-            shape,
+            shape.rotated(np.asarray(cv2.Rodrigues(np.array([*tilt, 0.0]))[0], np.float64))
+            if any(tilt)
+            else shape,
             x + offset_x + float(travelled[0]),
             y + offset_y + float(travelled[1]),
             angle + turn,
@@ -202,7 +235,8 @@ def presses(
             settings.rim,
             stick,
             sliding,
+            tilt,
         )
-        for shape, (offset_x, offset_y) in zip(shapes, programme.offsets, strict=True)
+        for shape, tilt, (offset_x, offset_y) in zip(shapes, tilts, programme.offsets, strict=True)
     ]
     return tuple(indenters), timing.cycle

@@ -48,8 +48,34 @@ SCENES: dict[str, Recipe] = {
     ),
     "roll": Recipe(
         "a ball rolls over the gel without dragging it",
-        Programme(_SPHERE, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7)),
+        Programme(
+            _SPHERE, wander=(210.0, 130.0), travel=320.0, hold=60, period=100, depths=(1.0, 0.7), rolls=True
+        ),
         {"shear": 0.0},
+    ),
+    "tumble": Recipe(
+        "a ball with bumps rolls over the gel without dragging it",
+        Programme(
+            (shapes.bumpy_ball,), wander=(210.0, 130.0), travel=320.0, hold=60, period=100,
+            depths=(1.0, 0.7), rolls=True, dilation=0.0,
+        ),
+        {"shear": 0.0},
+    ),
+    "rock": Recipe(
+        "a coin is pressed, dragged, turned and tilted to either side",
+        Programme(
+            (shapes.coin,), wander=(60.0, 40.0), angles=(-90.0, 90.0), hold=50, period=90,
+            depths=(1.0, 0.8), dilation=0.1, tilts=(2.0, 1.5),
+        ),
+        {"twist": 12.0, "shear": 0.4},
+    ),
+    "scrape": Recipe(
+        "a coin drags the gel along until it slips, and slides over it",
+        Programme(
+            (shapes.coin,), wander=(120.0, 80.0), angles=(-90.0, 90.0), travel=120.0, hold=50, period=90,
+            dilation=0.1, depths=(1.0, 0.8),
+        ),
+        {"shear": 0.4},
     ),
     "idle": Recipe("nothing touches the gel", None),
     "twist": Recipe(

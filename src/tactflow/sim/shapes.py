@@ -7,7 +7,7 @@ indenter reaches `d - gap` below the untouched surface of the gel.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -15,6 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+
+_ROUNDS = 4
+"""Fixed-point steps to the surface of a rotated shape: to 0.01 px."""
+_BUMPS = 25.0
+"""Waves of the bumps of a ball per circumference."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,8 @@ class Shape:
     px.
     sources : (K, 2) float64, px, points from which a press dilates the gel. spread : standard deviation of
     the dilation, px.
+    center : height of the point about which it is tilted or rolls above the lowest point, px. tilted : makes
+    the shape after a rotation (3, 3) about that point; None: see `tilt_surface`.
     """
 
     gap: Callable[[Array, Array], Array]
@@ -33,6 +40,12 @@ class Shape:
     depth: float
     sources: NDArray[np.float64]
     spread: float
+    center: float = 0.0
+    tilted: Callable[[NDArray[np.float64]], Shape] | None = None
+
+    def rotated(self, rotation: NDArray[np.float64]) -> Shape:
+        """The shape after a rotation (3, 3) about its centre; x right, y down, z towards the object."""
+        return tilt_surface(self, rotation) if self.tilted is None else self.tilted(rotation)
 
     @cached_property
     def _largest_push(self) -> float:
@@ -67,7 +80,8 @@ def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
         return np.asarray((x * x + y * y) * np.float32(0.5 / radius), dtype=np.float32)
 
     contact = float(np.sqrt(radius * depth))
-    return Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
+    plain = Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact, radius)
+    return replace(plain, tilted=lambda _: plain)
 
 
 def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
@@ -79,7 +93,51 @@ def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
         return np.asarray(round_part + np.hypot(x, y) - np.sqrt(squared), dtype=np.float32)
 
     contact = float(np.sqrt(radius * depth))
-    return Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact)
+    plain = Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact, radius)
+    return replace(plain, tilted=lambda _: plain)
+
+
+def bumpy_ball(radius: float = 95.0, depth: float = 26.0, relief: float = 2.5) -> Shape:
+    """A ball of `radius` px with bumps of up to `relief` px, 14 degrees apart, all over it."""
+    smooth = ball(radius, depth)
+
+    def rolled(rotation: NDArray[np.float64]) -> Shape:
+        axes = rotation.astype(np.float32)
+
+        def gap(x: Array, y: Array) -> Array:
+            squared = x * x + y * y
+            below = np.float32(radius) - smooth.gap(x, y)
+            inside = squared < np.float32((0.9 * radius) ** 2)
+            for _ in range(_ROUNDS):
+                scale = np.float32(_BUMPS) / np.sqrt(squared + below * below)
+                waves = [np.sin((x * axis[0] + y * axis[1] - below * axis[2]) * scale) for axis in axes.T]
+                outer = np.float32(radius) + np.float32(relief / 3) * sum(waves)
+                below = np.where(inside, np.sqrt(np.maximum(outer * outer - squared, 1)), below)
+            return np.asarray(np.float32(radius + relief) - below, np.float32)
+
+        return replace(smooth, gap=gap, center=radius + relief, tilted=rolled)
+
+    return rolled(np.eye(3))
+
+
+def tilt_surface(shape: Shape, rotation: NDArray[np.float64]) -> Shape:
+    """A shape after a rotation (3, 3) about its centre by so few degrees that no part hides another."""
+    turn = rotation.astype(np.float32)
+    center = np.float32(shape.center)
+
+    def gap(x: Array, y: Array) -> Array:
+        # Where the point of the untilted surface lies that is now above (x, y); z points out of the gel.
+        from_x, from_y = x, y
+        for _ in range(_ROUNDS):
+            height = shape.gap(from_x, from_y) - center
+            now_x = turn[0, 0] * from_x + turn[0, 1] * from_y + turn[0, 2] * height
+            now_y = turn[1, 0] * from_x + turn[1, 1] * from_y + turn[1, 2] * height
+            from_x, from_y = from_x + x - now_x, from_y + y - now_y
+        height = shape.gap(from_x, from_y) - center
+        now = turn[2, 0] * from_x + turn[2, 1] * from_y + turn[2, 2] * height + center
+        return np.asarray(now, np.float32)
+
+    return replace(shape, gap=gap, tilted=lambda more: tilt_surface(shape, more))
 
 
 def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0, bend: float = 0.0) -> Shape:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim.camera import Camera, Points
-from tactflow.sim.gel import Press, displacement, force, in_contact, reached, surface
+from tactflow.sim.gel import MM, Press, displacement, force, in_contact, reached, surface
 from tactflow.vision.geometry import PixelMapping
 
 FLOW_POINTS: Final = 1500
@@ -129,6 +129,27 @@ class Truth:
             if press.touching:
                 np.maximum(lowest, surface(press, reached(press, gel_x, gel_y)), out=lowest)
         return np.where(lit, lowest, np.float32(0))
+
+    @cached_property
+    def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Rotation (3, 3) and position (3,), mm, of the first indenter's centre; None without contact.
+
+        Axes as in `Scale`, from the centre of the processed frame and the untouched surface. Relative to an
+        earlier frame of the same contact, it is how the object has moved.
+        """
+        if not self.touching:
+            return None
+        press = self._presses[0]
+        here = np.array([press.x, press.y]) + np.array([[0, 0], [1, 0], [0, 1]])
+        center, *ends = self._mapping.to_processed(self._camera.to_raw(here))
+        axes = np.eye(3)
+        axes[:2, :2] = (np.array(ends) - center).T
+        scale = float(np.sqrt(np.linalg.det(axes)))
+        axes[:2, :2] /= scale
+        turn, _ = cv2.Rodrigues(np.array([0.0, 0.0, press.angle]))
+        tilt, _ = cv2.Rodrigues(np.array([*press.tilt, 0.0]))
+        across = (center - (np.array(self._mapping.size) - 1) / 2) * MM / scale
+        return axes @ turn @ tilt @ axes.T, np.array([*across, (press.shape.center - press.depth) * MM])
 
     @cached_property
     def force(self) -> tuple[float, float, float]:
