@@ -10,7 +10,7 @@ from tactflow.engine.frame import Tick
 from tactflow.message.result import Result
 from tactflow.ports import Image
 from tactflow.vision.flow.displacement_field import DisplacementField
-from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, Scale, Slip
+from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, Pose, Scale, Slip
 
 PROCESSED = np.zeros((400, 300, 3), np.uint8)
 CONTACT = Contact(
@@ -45,6 +45,7 @@ class Results(NamedTuple):
     field: DisplacementField | None = None
     slip: Slip | None = None
     force: Force | None = None
+    pose: Pose | None = None
 
 
 def result_of(tick: Tick, results: Results) -> Result:

@@ -15,7 +15,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import Result, encode_message
 from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
-from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, Scale
+from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Force, Markers, Pose, Scale
 from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, SHEAR, Results, build_message, result_of
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
@@ -110,6 +110,30 @@ def test_the_field_is_part_of_the_message_on_request() -> None:
     empty = json.loads(encode_message(result_of(TICK, Results(PROCESSED)), field=True))
     VALIDATOR.validate(empty)
     assert empty["field"] is None
+
+
+POSE = Pose(
+    "tracked", 12, (0.5, -1.0, -0.4), (0.1, 0.0, -0.2), (0.0, 1.5, 4.0), np.diag(np.arange(1.0, 7.0) ** 2)
+)
+
+
+def test_a_pose_has_its_errors_and_in_detail_their_covariance() -> None:
+    message = build_message(TICK, Results(PROCESSED, CONTACT, pose=POSE))
+    assert message["pose"] == {
+        "status": "tracked",
+        "since": 12,
+        "center": [0.5, -1.0, -0.4],
+        "translation": [0.1, 0.0, -0.2],
+        "rotation": [0.0, 1.5, 4.0],
+        "stderr": [1, 2, 3, 4, 5, 6],
+    }
+    detailed = build_message(TICK, Results(PROCESSED, CONTACT, pose=POSE), detail=True)
+    assert detailed["pose"]["covariance"][7] == 4
+    for sent in (message, detailed):
+        read = Result.from_message(sent).pose
+        assert read is not None
+        assert replace(read, covariance=POSE.covariance) == POSE
+        np.testing.assert_array_equal(read.covariance, POSE.covariance)
 
 
 def test_a_force_has_its_errors_and_null_where_a_component_is_unknown() -> None:

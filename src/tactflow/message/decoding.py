@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
 from tactflow.message.encoding import FLOW_DETAILS, STATUS_NAMES
-from tactflow.vision.types import Contact, Depth, Ellipse, Features, Flow, Force, Markers, Scale, Slip
+from tactflow.vision.types import Contact, Depth, Ellipse, Features, Flow, Force, Markers, Pose, Scale, Slip
 
 T = TypeVar("T")
 
@@ -32,6 +32,7 @@ def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str,
         "depth": _optional(_depth, message["contact"]),
         "slip": _optional(_slip, message.get("slip")),
         "force": _optional(_force, message.get("force")),
+        "pose": _optional(_pose, message.get("pose")),
         "features": _optional(_features, message.get("features")),
     }
     parts = tuple(map(_contact, message.get("contacts", ())))
@@ -112,6 +113,14 @@ def _slip(slip: Any) -> Slip:
 
 def _force(force: Any) -> Force:
     return Force(_numbers(force["value"]), _numbers(force["stderr"]), bool(force["in_range"]))
+
+
+def _pose(pose: Any) -> Pose:
+    """Without its covariance, the variances alone."""
+    variances = np.diag(np.square(np.array(pose["stderr"], np.float64)))
+    covariance = np.array(pose.get("covariance", variances), np.float64).reshape(6, 6)
+    center, translation, rotation = (_numbers(pose[key]) for key in ("center", "translation", "rotation"))
+    return Pose(pose["status"], int(pose["since"]), center, translation, rotation, covariance)
 
 
 def _features(features: Any) -> Features:

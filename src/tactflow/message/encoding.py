@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus, Scale
+from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus, Pose, Scale
 
 if TYPE_CHECKING:
     from tactflow.message.result import Result
@@ -52,6 +52,8 @@ def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
         message["slip"] = _attributes(result.slip, "slipping", "stick_ratio")
     if result.force is not None:
         message["force"] = _attributes(result.force, "value", "stderr", "in_range")
+    if result.pose is not None:
+        message["pose"] = _pose(result.pose, detail)
     if result.features is not None:
         message["features"] = _attributes(result.features, "values", "unit")
     if field:
@@ -97,6 +99,11 @@ def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
     if detail:
         message |= _attributes(flow, *FLOW_DETAILS)
     return message
+
+
+def _pose(pose: Pose, detail: bool) -> dict[str, Any]:
+    message = _attributes(pose, "status", "since", "center", "translation", "rotation", "stderr")
+    return message | {"covariance": pose.covariance.ravel()} if detail else message
 
 
 def _markers(markers: Markers, detail: bool) -> dict[str, Any]:

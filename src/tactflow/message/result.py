@@ -17,7 +17,7 @@ from tactflow.engine.frame import NO_PICTURE, Frame, Tick
 from tactflow.message.decoding import decode_values
 from tactflow.message.encoding import SCHEMA, encode
 from tactflow.ports import ContactMask, Image, Normals
-from tactflow.vision.types import Contact, Depth, Features, Flow, Force, Markers, Scale, Slip
+from tactflow.vision.types import Contact, Depth, Features, Flow, Force, Markers, Pose, Scale, Slip
 
 if TYPE_CHECKING:
     from tactflow.vision.flow.displacement_field import DisplacementField
@@ -38,6 +38,7 @@ class Result(Tick):
         calibration that knows it.
     field, slip, normals : displacement between the dots, whether the contact slips, and the normals of the
         gel's surface; only where a stage of that name stands in the pipeline.
+    pose : how the object has moved since it was touched; with the stage of that name and a calibration.
     features : of a stage `network` that gives some.
 
     >>> import tactflow
@@ -59,6 +60,7 @@ class Result(Tick):
     field: DisplacementField | None
     slip: Slip | None
     force: Force | None
+    pose: Pose | None
     features: Features | None
 
     def __init__(

@@ -14,6 +14,7 @@ from tactflow.vision.types import Evidence
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Point = tuple[_Finite, _Finite]
+_Vector = tuple[_Finite, _Finite, _Finite]
 _Angle = Annotated[float, Field(gt=-90, le=90, allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -150,6 +151,27 @@ class _ForceModel(_Strict):
     )
 
 
+class _PoseModel(_Strict):
+    """How what touches the gel has moved since it was touched."""
+
+    status: Literal["tracked", "lost"] = Field(
+        description="lost: what touches now cannot be matched; the values are those of the frame before, and "
+        "the next frame is a new start"
+    )
+    since: int = Field(ge=0, description="seq of the frame in which it was touched, or tracked anew")
+    center: _Vector = Field(
+        description="(x, y, z), middle of the contact then, mm: x right, y down, z out of the gel"
+    )
+    translation: _Vector = Field(description="(x, y, z) of this point of the object since then, mm")
+    rotation: _Vector = Field(description="rotation vector of the object about this point, degrees")
+    stderr: tuple[_NotNegative, _NotNegative, _NotNegative, _NotNegative, _NotNegative, _NotNegative] = Field(
+        description="standard errors of translation, mm, and rotation, degrees"
+    )
+    covariance: list[_Finite] = Field(
+        default_factory=list, description="of these six, (6, 6) row by row, mm and degrees (detail)"
+    )
+
+
 class _FeaturesModel(_Strict):
     """Output of a network of the user."""
 
@@ -193,6 +215,9 @@ class _Message(_Strict):
     scale: _ScaleModel | None = Field(None, description="makes mm of px (calibrated)")
     force: _ForceModel | None = Field(
         None, description="on the gel; only where something touches (calibrated)"
+    )
+    pose: _PoseModel | None = Field(
+        None, description="of the object (only where the pipeline has the stage pose; calibrated)"
     )
     features: _FeaturesModel | None = Field(
         None, description="of a network (only where a stage network gives features)"

@@ -57,7 +57,7 @@ SCENES: dict[str, Recipe] = {
         "a ball with bumps rolls over the gel without dragging it",
         Programme(
             (shapes.bumpy_ball,), wander=(210.0, 130.0), travel=320.0, hold=60, period=100,
-            depths=(1.0, 0.7), rolls=True, dilation=0.0,
+            depths=(1.0, 0.7), rolls=True, dilation=0.01,
         ),
         {"shear": 0.0},
     ),

@@ -247,6 +247,38 @@ class Force:
 
 
 @dataclass(frozen=True, slots=True)
+class Pose:
+    """How an object has moved since it was touched.
+
+    status : "tracked", or "lost" where what touches the gel now cannot be matched; then the motion is that of
+        the last frame before, and the next frame is a new start.
+    since : seq of the frame in which it started.
+    center : (x, y, z), mm, the middle of the contact in that frame, in the axes of `Scale`. The object's own
+        axes were parallel to these, from there.
+    translation : (x, y, z), mm, by how much this point of the object has moved since.
+    rotation : (x, y, z), degrees, rotation vector of the object about it.
+    covariance : (6, 6) float64, of translation (mm) and of a small rotation about the axes of the sensor
+        (degrees). What is not seen has large variances: 57 degrees, and as many mm as that
+        turns the object's surface by.
+
+    >>> Pose("tracked", 12, (0, 0, -0.3), (0.1, 0, 0), (0, 0, 5), np.eye(6)).stderr[0]
+    1.0
+    """
+
+    status: Literal["tracked", "lost"]
+    since: int
+    center: tuple[float, float, float]
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float]
+    covariance: NDArray[np.float64]
+
+    @property
+    def stderr(self) -> tuple[float, ...]:
+        """Standard errors of translation (mm) and rotation (degrees)."""
+        return tuple(np.sqrt(np.diag(self.covariance)).tolist())
+
+
+@dataclass(frozen=True, slots=True)
 class Features:
     """What a network says about a frame, in numbers of its own.
 

@@ -1,0 +1,142 @@
+"""What a frame shows of an object: normals and heights of the gel where it touches."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from tactflow.vision.arrays import Floats, Floats32, Indices, Mask
+from tactflow.vision.types import Scale
+
+STEP: Final = 2
+"""Processed px per cell: heights are computed at half resolution."""
+MARGIN: Final = 2
+"""Cells around a contact that gradients are computed from."""
+MOST: Final = 800
+"""Cells of a template at most: neighbours share their errors, and more of them cost time alone."""
+RIM: Final = 3.0
+"""Width of the rim of a contact, cells, in which the gel may have left the object: there, cells count less,
+and the first one, whose gradient has seen the crease outside, does not count. Otherwise a ball that rolls
+appears to slide by a part of its way, for its rim moves like that."""
+BLOCKS: Final = 5
+"""Patches along each side of a contact within which the errors of normals are taken for common."""
+PATCH: Final = 4
+"""Least side of such a patch, cells: contact masks and heights are smoothed over as much."""
+
+
+class Imprint(NamedTuple):
+    """The surface under a contact, in cells of `STEP` x `STEP` px.
+
+    planes : (h, w, 4) float32: x and y of the unit normal out of the gel, height above the untouched gel, mm
+        (<= 0), weight in [0, 1], 0 outside the contact.
+    first : (2,), x and y of the centre of the first cell, mm. cell : (2,), mm. area : cells with a weight.
+    error : relative standard error of heights and slopes.
+    """
+
+    planes: Floats32
+    first: Floats
+    cell: Floats
+    area: int
+    error: float
+
+    def at(self, points: Floats) -> Floats:
+        """(N, 4): the planes at points (N, 2), mm; weight 0 outside."""
+        places = ((points - self.first) / self.cell).astype(np.float32)
+        x, y = np.ascontiguousarray(places.T[:, :, None])
+        return cv2.remap(self.planes, x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
+
+
+def imprint_of(heights: Floats32, mask: Mask, scale: Scale, error: float) -> Imprint | None:
+    """The imprint in a frame; None without a cell in contact.
+
+    heights : (H, W) float32, how far the gel is pushed in, mm. mask : (H, W) uint8, 255 in contact. error :
+    relative standard error of the heights.
+    """
+    left, top, width, height = cv2.boundingRect(mask)
+    left, top = (max(side // STEP - MARGIN, 0) * STEP for side in (left, top))
+    columns = min(width // STEP + 2 * MARGIN + 1, (mask.shape[1] - left) // STEP)
+    rows = min(height // STEP + 2 * MARGIN + 1, (mask.shape[0] - top) // STEP)
+    if min(rows, columns) < 2 * MARGIN:
+        return None
+    part, size = (slice(top, top + rows * STEP), slice(left, left + columns * STEP)), (columns, rows)
+    inside = np.zeros((rows + 2, columns + 2), np.uint8)
+    inside[1:-1, 1:-1] = cv2.resize(mask[part], size, interpolation=cv2.INTER_AREA) == 255
+    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 3)[1:-1, 1:-1]
+    cell = np.array([scale.x, scale.y]) * STEP
+    depth = np.asarray(cv2.resize(heights[part], size, interpolation=cv2.INTER_AREA), np.float32)
+    slope = _gradient(depth, cell)
+    planes = np.empty((rows, columns, 4), np.float32)
+    planes[..., :2] = slope / np.sqrt(np.sum(slope * slope, axis=2, keepdims=True) + 1)
+    planes[..., 2] = -depth
+    planes[..., 3] = np.clip((distance - 1) / RIM, 0, 1) ** 2
+    area = int(np.count_nonzero(planes[..., 3]))
+    middle = (STEP - 1) / 2
+    first = np.array(scale.point((left + middle, top + middle)))
+    return Imprint(planes, first, cell, area, error) if area else None
+
+
+def _gradient(values: Floats32, cell: Floats) -> Floats32:
+    """(h, w, 2): change of values (h, w) to the right and down, per mm."""
+    scale = 1 / (8 * cell)
+    border = cv2.BORDER_REPLICATE
+    across = cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=scale[0], borderType=border)
+    down = cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=scale[1], borderType=border)
+    return np.asarray(np.stack([across, down], axis=2), np.float32)
+
+
+class Template(NamedTuple):
+    """An imprint that others are compared with; lengths in mm from `center`.
+
+    imprint : it. center : (3,), mean of its points. every : cells per point.
+    points : (N, 3). normals : (N, 3). weights : (N,). blocks : (N,), the patch of each point.
+    by_normal : (2, N, 6), by_height : (N, 6): by how much a small motion of the object changes what is seen
+        of each point: x and y of the normal, and the height.
+    levers : (6, 6), mean square of how far a small motion moves the points along the gel.
+    """
+
+    imprint: Imprint
+    center: Floats
+    every: int
+    points: Floats
+    normals: Floats
+    weights: Floats
+    blocks: Indices
+    by_normal: Floats
+    by_height: Floats
+    levers: Floats
+
+
+def template_of(imprint: Imprint) -> Template:
+    """Prepare an imprint."""
+    planes, cell = imprint.planes, imprint.cell
+    rows, columns = np.nonzero(planes[..., 3])
+    every = -(-len(rows) // MOST)
+    rows, columns = rows[::every], columns[::every]
+    nx, ny, height, weights = planes[rows, columns].T.astype(np.float64)
+    normals = np.column_stack([nx, ny, np.sqrt(1 - nx * nx - ny * ny)])
+    points = np.column_stack([imprint.first + cell * np.column_stack([columns, rows]), height])
+    center = points.mean(axis=0)
+    points -= center
+    moved = np.zeros((len(rows), 6, 3))
+    moved[:, :3] = np.eye(3)
+    moved[:, 3:] = np.cross(np.eye(3), points[:, None])
+    along = moved[..., :2]
+    by_normal = np.empty((2, len(rows), 6))
+    for axis in (0, 1):
+        gradient = _gradient(np.ascontiguousarray(planes[..., axis]), cell)[rows, columns]
+        by_normal[axis] = np.einsum("nk,nsk->ns", gradient, along)
+    by_normal[:, :, 3:] -= np.moveaxis(np.cross(np.eye(3), normals[:, None])[..., :2], -1, 0)
+    by_height = np.einsum("nk,nsk->ns", -normals[:, :2] / normals[:, 2:], along) - moved[..., 2]
+    levers = np.einsum("n,nik,njk->ij", weights / weights.sum(), along, along)
+    blocks = _part(rows) * BLOCKS + _part(columns)
+    return Template(
+        imprint, center, every, points, normals, weights, blocks, by_normal, by_height, levers
+    )  # fmt: skip
+
+
+def _part(places: Indices) -> Indices:
+    """In which of `BLOCKS` equal parts of their range each place lies."""
+    low = places.min()
+    return np.asarray(BLOCKS * (places - low) // (places.max() - low + 1))

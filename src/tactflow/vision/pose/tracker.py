@@ -1,0 +1,206 @@
+"""How an object has moved since it was touched, frame by frame."""
+
+from __future__ import annotations
+
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from tactflow.vision.arrays import Floats, Mask
+from tactflow.vision.flow.displacement_field import CELL, DisplacementField
+from tactflow.vision.pose.align import FREE, Alignment, Gel, align
+from tactflow.vision.pose.imprint import Imprint, Template, imprint_of, template_of
+from tactflow.vision.pose.rigid import adjoint, inverse, vector
+from tactflow.vision.types import Depth, Pose, Scale
+
+OVERLAP: Final = 0.7
+"""Share of the contact, on the side of the object or of the gel, below which the keyframe is replaced."""
+LEAST: Final = 60
+"""Cells inside the rim from which on an object is tracked: a contact of 22 px."""
+TOLERATED: Final = 82.0
+"""Misfit that errors of the expected size stay below: the mean of chi squared with 44 degrees of freedom (25
+patches, two components, six unknowns) and four standard deviations."""
+UNLIKE: Final = 0.6
+"""Residual of the normals, over their spread, from which on an imprint is of something else."""
+DEPTH_ERROR: Final = 0.1
+"""Relative error of heights whose own is not known."""
+BY_SLOPES: Final = np.array([0, 0, 1, 1, 1, 0])
+"""Parts of a small motion that are in error by as much as all slopes and heights are: height and tilts."""
+_TO_DEGREES: Final = np.array([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
+"""Degrees per radian of a small motion's last three parts."""
+
+
+class _Frame(NamedTuple):
+    """What a frame shows: the imprint; None or the field of the gel, the share (rows, columns) of it in
+    contact, and the standard error of its mean displacement, px."""
+
+    imprint: Imprint
+    gel: tuple[DisplacementField, Floats, float] | None
+
+
+class _Keyframe(NamedTuple):
+    """A frame that others are compared with. motion, covariance : from the start to it, mm and radians.
+    by_slopes : (6,), what of the motion is in proportion to the slopes."""
+
+    frame: _Frame
+    template: Template
+    motion: Floats
+    covariance: Floats
+    by_slopes: Floats
+
+
+class PoseTracker:
+    """Tracks what touches a gel.
+
+    Each frame is aligned with a keyframe, at first that in which the contact began. As the contact moves on,
+    the keyframe is replaced, and the errors of both add up; within one they do not grow. Where the gel slides
+    or the normals contradict it, they alone count, until the next keyframe.
+
+    scale : mm per px.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:100, :100]
+    >>> def ball(left):
+    ...     return np.maximum(0.8 - 0.002 * ((x - left) ** 2 + (y - 50) ** 2), 0).astype(np.float32)
+    >>> tracker = PoseTracker(Scale(0.05, 0.05, (0, 0), (49.5, 49.5)))
+    >>> for seq, left in enumerate((50, 53)):
+    ...     heights = ball(left)
+    ...     mask = np.where(heights > 0, 255, 0).astype(np.uint8)
+    ...     pose = tracker(seq, Depth(heights, 0.8, 0.01, 1.0, None), mask)
+    >>> [round(abs(part), 2) for part in pose.translation], pose.stderr[5] > 30
+    ([0.15, 0.0, 0.0], True)
+    """
+
+    def __init__(self, scale: Scale) -> None:
+        self._scale = scale
+        self._mm = np.array([scale.x, scale.y])
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing touches the gel: what comes is another object."""
+        self._key: _Keyframe | None = None
+        self._since, self._origin = 0, np.zeros(3)
+        self._last = self._before = np.eye(4)
+        self._slid = False
+
+    def __call__(
+        self,
+        seq: int,
+        depth: Depth,
+        mask: Mask,
+        field: DisplacementField | None = None,
+        slipping: bool = False,
+    ) -> Pose | None:
+        """The pose in the next frame; None where the contact is too small to tell.
+
+        seq : of the frame. mask : (H, W) uint8, 255 in contact. slipping : whether it slides over the gel.
+        """
+        frame = self._seen(depth, mask, field)
+        if frame is None or frame.imprint.area < LEAST:
+            self.reset()
+            return None
+        key = self._key
+        if key is None:
+            template = template_of(frame.imprint)
+            self._key = _Keyframe(frame, template, np.eye(4), np.zeros((6, 6)), np.zeros(6))
+            self._since, self._origin = seq, template.center
+            return self._pose("tracked", np.eye(4), np.zeros((6, 6)))
+        self._slid |= slipping
+        found, gel = self._aligned(key, frame)
+        if found is None:
+            lost = self._pose("lost", self._last, key.covariance + np.diag(FREE**2))
+            self.reset()
+            return lost
+        motion, covariance, by_slopes = self._since_start(key, found)
+        self._before, self._last = self._last, motion
+        overlap = found.overlap if gel is None else min(found.overlap, gel.overlap)
+        if overlap < OVERLAP or (self._slid and not slipping):
+            self._key = _Keyframe(frame, template_of(frame.imprint), motion, covariance, by_slopes)
+            self._slid = slipping
+        error = frame.imprint.error
+        return self._pose("tracked", motion, covariance + error**2 * np.outer(by_slopes, by_slopes))
+
+    def _seen(self, depth: Depth, mask: Mask, field: DisplacementField | None) -> _Frame | None:
+        error = DEPTH_ERROR
+        if depth.greatest_stderr is not None and depth.greatest > 0:
+            error = depth.greatest_stderr / depth.greatest
+        imprint = imprint_of(depth.heights, mask, self._scale, error)
+        motion = None if field is None else field.motion(mask)
+        if imprint is None or field is None or motion is None:
+            return None if imprint is None else _Frame(imprint, None)
+        return _Frame(imprint, (field, field.share(mask), motion.stderr))
+
+    def _aligned(self, key: _Keyframe, now: _Frame) -> tuple[Alignment | None, Gel | None]:
+        """The alignment, and the gel that it made use of."""
+        gel = None if self._slid else self._same_gel(key.frame, now)
+        found = self._matched(key, now, gel)
+        if gel is not None and (found is None or found.misfit > TOLERATED):
+            without = self._matched(key, now, None)
+            if without is not None and without.misfit <= TOLERATED:
+                # The object moves otherwise than the gel below it.
+                self._slid = True
+                return without, None
+        return found, gel
+
+    def _matched(self, key: _Keyframe, now: _Frame, gel: Gel | None) -> Alignment | None:
+        """From where it is if it moves on as before, or else from where it was; None if neither fits."""
+        to_center = self._to_center(key)
+        for guess in (self._last @ inverse(self._before) @ self._last, self._last):
+            start = inverse(to_center) @ guess @ inverse(key.motion) @ to_center
+            found = align(key.template, now.imprint, start, gel)
+            if found is not None and found.residual < UNLIKE * found.signal:
+                return found
+        return None
+
+    def _to_center(self, key: _Keyframe) -> Floats:
+        to_center = np.eye(4)
+        to_center[:3, 3] = key.template.center - self._origin
+        return to_center
+
+    def _since_start(self, key: _Keyframe, found: Alignment) -> tuple[Floats, Floats, Floats]:
+        """Motion, covariance and `by_slopes` from the start to now."""
+        to_center = self._to_center(key)
+        motion = to_center @ found.motion @ inverse(to_center) @ key.motion
+        carry = adjoint(inverse(key.motion) @ to_center)
+        covariance = key.covariance + carry @ found.covariance @ carry.T
+        return motion, covariance, key.by_slopes + carry @ (BY_SLOPES * vector(found.motion))
+
+    def _same_gel(self, before: _Frame, now: _Frame) -> Gel | None:
+        """The gel that is in contact in both frames."""
+        if before.gel is None or now.gel is None or before.gel[1].shape != now.gel[1].shape:
+            return None
+        (old_field, old_share, old_stderr), (field, new_share, stderr) = before.gel, now.gel
+        both = old_share * new_share
+        total = float(both.sum())
+        if not total:
+            return None
+        inside = both > 0
+        share = both[inside] / total
+        rest = field.grid.points[inside] - self._scale.origin
+        old, new = (self._mm * (rest + f.displacement[inside]) for f in (old_field, field))
+        variance = (old_stderr**2 + stderr**2) * float(self._mm.prod())
+        # Displacements a pitch apart are independent.
+        variance += _stretch(old, new, share) / max(total * CELL**2, 1.0)
+        return Gel(old, new, share, variance, total / float(max(old_share.sum(), new_share.sum())))
+
+    def _pose(self, status: Literal["tracked", "lost"], motion: Floats, covariance: Floats) -> Pose:
+        """For people: in the sensor's axes, in mm and degrees, with the error of the scale."""
+        axes = np.kron(np.eye(2), motion[:3, :3])
+        stated = axes @ covariance @ axes.T
+        relative = np.array(self._scale.stderr) / self._mm
+        stated[[0, 1], [0, 1]] += (relative * motion[:2, 3]) ** 2
+        stated *= np.outer(_TO_DEGREES, _TO_DEGREES)
+        cx, cy, cz = self._origin.tolist()
+        x, y, z, rx, ry, rz = (vector(motion) * _TO_DEGREES).tolist()
+        return Pose(status, self._since, (cx, cy, cz), (x, y, z), (rx, ry, rz), stated)
+
+
+def _stretch(before: Floats, now: Floats, share: Floats) -> float:
+    """Variance of each coordinate of displacements (M, 2) that no rigid motion explains, in the unit of
+    places (M, 2) squared: the gel stretches under the object."""
+    lever, moved = before - share @ before, now - before
+    moved = moved - share @ moved
+    across = np.column_stack([-lever[:, 1], lever[:, 0]])
+    turn = share @ (across * moved).sum(axis=1) / max(float(share @ (lever * lever).sum(axis=1)), 1e-12)
+    return float(share @ ((moved - turn * across) ** 2).sum(axis=1)) / 2
