@@ -6,7 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench.judge_dots import CHANGES, DOTS, compare, find, judge, main, spread_at_rest, without_dots
+from tactflow.bench.judge_dots import (
+    CHANGES,
+    DOTS,
+    compare,
+    find,
+    fit_probability,
+    judge,
+    main,
+    spread_at_rest,
+    without_dots,
+)
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
 from tests.vision.dots import grid, render
 
@@ -93,6 +103,22 @@ def test_the_command_prints_both_tables(data: Path, capsys: pytest.CaptureFixtur
     assert "simulated" in printed
     assert "100.0 %" in printed
     assert "cloth" in printed
+
+
+def test_the_probability_is_fitted_to_what_is_seen() -> None:
+    evidence = np.random.default_rng(0).normal(0, 1, (4000, 3))
+    odds = 1.5 + evidence @ np.array([-2.0, 1.0, 0.5])
+    is_dot = np.random.default_rng(1).random(4000) < 1 / (1 + np.exp(-odds))
+    np.testing.assert_allclose(fit_probability(evidence, is_dot), [1.5, -2.0, 1.0, 0.5], atol=0.2)
+
+
+def test_the_command_fits_the_probability_and_tells_how_true_it_is(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Called other than it is: the last dot is none.
+    save_labels(data / "labels.json", [label(TRUTH[:-1].tolist())])
+    assert main(["--data", str(data), "--labels", str(data / "labels.json"), "--fit"]) == 0
+    assert "constant and weights" in capsys.readouterr().out
 
 
 def test_a_folder_without_the_recordings_is_refused(

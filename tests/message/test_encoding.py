@@ -68,6 +68,19 @@ def test_detail_adds_what_is_documented_and_nothing_else() -> None:
     assert detailed == plain
 
 
+def test_the_probability_of_markers_is_a_detail_and_comes_back() -> None:
+    markers = replace(MARKERS, probability=np.array([0.999, 0.7, math.nan]))
+    detailed = build_message(TICK, Results(PROCESSED, CONTACT, FLOW, markers), detail=True)
+    VALIDATOR.validate(detailed)
+    assert detailed["markers"]["probability"] == [0.999, 0.7, None]
+    again = Result.from_message(
+        encode_message(result_of(TICK, Results(None, None, None, markers)), detail=True)
+    )
+    assert again.markers is not None
+    np.testing.assert_array_equal(again.markers.probability, markers.probability)
+    assert "probability" not in build_message(TICK, Results(PROCESSED, CONTACT, FLOW, markers))["markers"]
+
+
 @pytest.mark.parametrize("detail", [False, True])
 @pytest.mark.parametrize(
     ("contact", "flow", "markers"),

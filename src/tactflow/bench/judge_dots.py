@@ -1,6 +1,6 @@
 """How well the dots of a gel are found, and where none are.
 
-    python -m tactflow.bench.judge_dots --data RECORDINGS
+    python -m tactflow.bench.judge_dots --data RECORDINGS [--fit]
 
 Dots were marked by eye in frames of recordings of real sensors (as with `python -m tactflow.bench.label
 --dots`); `dots.json` beside this file has them, and frames of gels without dots. A dot that was marked in
@@ -15,20 +15,21 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import linear_sum_assignment, minimize
 from scipy.spatial import KDTree
 
 from tactflow.bench.label_file import FrameLabel, load_labels
 from tactflow.cli.terminal import say, table
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.sources import open_source
-from tactflow.vision.arrays import Floats
+from tactflow.vision.arrays import Flags, Floats, Indices
 from tactflow.vision.markers import MarkerTracker, NoMarkersError, detect_markers
 from tactflow.vision.markers.lattice import nearest
 
@@ -81,20 +82,31 @@ def compare(lab: str, found: Floats, dots: Floats, uncertain: Floats, size: tupl
     """
     if not len(dots):
         return FoundDots(lab, 0, 0, len(found))
-    marked = np.concatenate([dots, uncertain])
-    apart = nearest(dots, 1)[0][:, 0] if len(dots) > 1 else np.full(1, float(max(size)))
-    pitch = float(np.median(apart))
+    which, inner = assign(found, dots, uncertain, size)
+    required = _from_border(dots, size) > BORDER * _pitch(dots)
+    seen = np.isin(np.arange(len(dots)), which)
+    false = np.count_nonzero((which < 0) & inner)
+    return FoundDots(lab, int(required.sum()), int((required & seen).sum()), int(false))
+
+
+def assign(found: Floats, dots: Floats, uncertain: Floats, size: tuple[int, int]) -> tuple[Indices, Flags]:
+    """For each one found, (N,): the number of the marked dot that it is, uncertain ones last, or -1; and
+    whether it is far enough from the border to be judged. Arguments as of `compare`."""
+    marked, pitch = np.concatenate([dots, uncertain]), _pitch(dots)
+    apart = nearest(dots, 1)[0][:, 0] if len(dots) > 1 else np.full(1, pitch)
     reach = TOLERANCE * np.concatenate([apart, np.full(len(uncertain), pitch)])
-    inner = _from_border(marked, size) > BORDER * pitch
-    required = inner & (np.arange(len(marked)) < len(dots))
     away = np.linalg.norm(found[:, None] - marked, axis=2)
     # A pair beyond reach costs as much as no pair.
     rows, columns = linear_sum_assignment(np.minimum(away / reach, 1.0))
     paired = away[rows, columns] < reach[columns]
-    rows, columns = rows[paired], columns[paired]
-    others = np.delete(found, rows, axis=0)
-    false = np.count_nonzero(_from_border(others, size) > BORDER * pitch)
-    return FoundDots(lab, int(required.sum()), int(required[columns].sum()), int(false))
+    which = np.full(len(found), -1, np.int64)
+    which[rows[paired]] = columns[paired]
+    return which, np.asarray(_from_border(found, size) > BORDER * pitch)
+
+
+def _pitch(dots: Floats) -> float:
+    """Median distance of dots, (M, 2), to their nearest neighbours, px; 1000 for a single one."""
+    return float(np.median(nearest(dots, 1)[0])) if len(dots) > 1 else 1000.0
 
 
 def _from_border(points: Floats, size: tuple[int, int]) -> Floats:
@@ -117,7 +129,24 @@ def judge(
     ------
     SourceError : a recording cannot be read. ConfigError : it has no such frame.
     """
+    for lab, kind, picture, dots, uncertain in labelled(labels, data, report, kinds):
+        size = (picture.shape[1], picture.shape[0])
+        if len(dots):
+            yield replace(compare(lab, finder(picture), dots, uncertain, size), kind=kind)
+        else:
+            yield FoundDots(lab, 0, 0, len(finder(picture)), "real")
+
+
+def labelled(
+    labels: Sequence[FrameLabel],
+    data: Path,
+    report: Callable[[str], None] = say,
+    kinds: Iterable[str] | None = None,
+) -> Iterator[tuple[str, str, Picture, Floats, Floats]]:
+    """Lab, kind, picture, dots (M, 2) and uncertain dots (K, 2), px, of each labelled frame, as it is and
+    changed; of frames without dots only as they are. Arguments and errors as of `judge`."""
     second = {(label.recording, label.frame): label.dots for label in labels if label.round == 2}
+    kinds = list(CHANGES if kinds is None else kinds)
     for label in labels:
         if label.round != 1 or label.dots is None:
             continue
@@ -128,13 +157,53 @@ def judge(
         dots = _points(label.dots)
         again = second.get((label.recording, label.frame))
         sure, uncertain = (dots, dots[:0]) if again is None else _agreed(dots, _points(again))
-        for kind in (CHANGES if kinds is None else kinds) if len(dots) else ():
+        for kind in kinds if len(dots) else [""]:
             changed, matrix = CHANGES[kind](picture)
             required, possible = (points @ matrix[:, :2].T + matrix[:, 2] for points in (sure, uncertain))
-            size = (changed.shape[1], changed.shape[0])
-            yield replace(compare(label.lab, finder(changed), required, possible, size), kind=kind)
-        if not len(dots):
-            yield FoundDots(label.lab, 0, 0, len(finder(picture)), "real")
+            yield label.lab, kind, changed, required, possible
+
+
+def fit_probability(evidence: Floats, is_dot: Flags) -> Floats:
+    """Constant and weights, (4,), of the log odds of being a dot, of evidence (N, 3): logistic
+    regression with a ridge."""
+    design = np.column_stack([np.ones(len(is_dot)), evidence])
+    sign = np.where(is_dot, -1.0, 1.0)
+
+    def loss(weights: Floats) -> float:
+        return float(np.logaddexp(0, sign * (design @ weights)).sum() + (weights[1:] ** 2).sum() / 2)
+
+    return np.asarray(minimize(loss, np.zeros(design.shape[1])).x, np.float64)
+
+
+def fitted(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
+    """The weights of a dot's probability, fitted to all labs; and how many of those that are called so
+    probable by a fit to the other labs are dots."""
+    labs, evidences, are_dots = [], [], []
+    for name, _, picture, dots, uncertain in labelled(labels, data, kinds=("", "half size", "JPEG 30")):
+        try:
+            found = detect_markers(picture, least_probability=0.0)
+        except NoMarkersError:
+            continue
+        if len(dots) and found.evidence is not None:
+            which, inner = assign(found.centers, dots, uncertain, (picture.shape[1], picture.shape[0]))
+            judged = inner & (which < len(dots))
+            evidences.append(found.evidence[judged])
+            are_dots.append(which[judged] >= 0)
+            labs.append(np.full(judged.sum(), name))
+    lab, evidence, is_dot = map(np.concatenate, (labs, evidences, are_dots))
+    yield f"constant and weights: {fit_probability(evidence, is_dot).round(2).tolist()}"
+    odds = np.zeros(len(lab))
+    for left_out in np.unique(lab):
+        others = lab != left_out
+        weights = fit_probability(evidence[others], is_dot[others])
+        odds[~others] = weights[0] + evidence[~others] @ weights[1:]
+    probability = 1 / (1 + np.exp(-odds))
+    rows = [("called", "places", "are dots")]
+    for low, high in pairwise((0, 0.5, 0.8, 0.9, 0.95, 0.99, 1)):
+        those = (probability > low) & (probability <= high)
+        share = f"{100 * is_dot[those].mean():.1f} %" if those.any() else "-"
+        rows.append((f"{100 * low:.0f} to {100 * high:.0f} %", str(those.sum()), share))
+    yield from table(rows)
 
 
 def _index(label: FrameLabel) -> int:
@@ -317,8 +386,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="recordings that the labels name")
     add("--labels", type=Path, default=DOTS, metavar="FILE", help="default: those of the package")
+    add(
+        "--fit",
+        action="store_true",
+        help="fit the probability of a dot, and tell how true it is",
+    )
     options = parser.parse_args(arguments)
     try:
+        if options.fit:
+            print(*fitted(load_labels(options.labels), options.data), sep="\n")
+            return 0
         judged = list(judge(load_labels(options.labels), options.data))
         if not judged:
             raise ConfigError(f"--data {options.data}: has none of the recordings of {options.labels}")

@@ -93,13 +93,14 @@ def _flow(flow: Any) -> Flow:
 
 
 def _markers(markers: Any) -> Markers:
-    status = markers["status"]
+    status, probability = markers["status"], markers.get("probability")
     return Markers(
         origin=_points(markers["origin"]),
         position=_points(markers["position"]),
         status=np.array([STATUS_NAMES.index(name) for name in status], np.uint8),
         # None becomes NaN: unknown.
         stderr=np.array(markers.get("stderr", [None] * len(status)), np.float64),
+        probability=None if probability is None else np.array(probability, np.float64),
     )
 
 

@@ -109,7 +109,11 @@ def _pose(pose: Pose, detail: bool) -> dict[str, Any]:
 def _markers(markers: Markers, detail: bool) -> dict[str, Any]:
     message = _attributes(markers, "origin", "position")
     message["status"] = [STATUS_NAMES[value] for value in markers.status.tolist()]
-    return message | {"stderr": markers.stderr} if detail else message
+    if not detail:
+        return message
+    if markers.probability is not None:
+        message["probability"] = markers.probability
+    return message | {"stderr": markers.stderr}
 
 
 def _field(field: DisplacementField) -> dict[str, Any]:
@@ -117,7 +121,7 @@ def _field(field: DisplacementField) -> dict[str, Any]:
 
 
 def _finite(value: Any, name: str) -> Any:
-    """The value as the encoder takes it. Only standard errors may be NaN, which is written as null."""
+    """The value as the encoder takes it. Standard errors and probabilities may be NaN, written as null."""
     if isinstance(value, dict):
         return {key: _finite(part, f"{name}.{key}") for key, part in value.items()}
     if isinstance(value, tuple):
@@ -130,6 +134,6 @@ def _finite(value: Any, name: str) -> Any:
         value = total = float(value)
     else:
         return value
-    if math.isfinite(total) or (name.endswith("stderr") and not np.isinf(value).any()):
+    if math.isfinite(total) or (name.endswith(("stderr", "probability")) and not np.isinf(value).any()):
         return value
     raise ValueError(f"{name}: required finite numbers, got NaN or infinity")

@@ -18,6 +18,7 @@ _Vector = tuple[_Finite, _Finite, _Finite]
 _Angle = Annotated[float, Field(gt=-90, le=90, allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Strict(BaseModel):
@@ -117,6 +118,10 @@ class _MarkersModel(_Strict):
     status: list[Literal["tracked", "inferred", "lost"]] = Field(description="how each position is known")
     stderr: list[_NotNegative | None] = Field(
         default_factory=list, description="standard error of each position, px; null when unknown (detail)"
+    )
+    probability: list[_Share | None] = Field(
+        default_factory=list,
+        description="of each being a marker at all, from the reference frame; null when unknown (detail)",
     )
 
 

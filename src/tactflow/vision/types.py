@@ -90,6 +90,8 @@ class Markers:
     status : (N,) uint8, values of `MarkerStatus`.
     stderr : (N,) float64, standard error of each coordinate of `position`, px; NaN where unknown.
     radius : of a marker in the reference frame, px; None where the method does not know it.
+    probability : (N,) float64, of being a marker at all, 0 to 1, from the reference frame; NaN where unknown.
+        None where the method does not tell.
 
     >>> origin = np.array([[10.0, 20.0]])
     >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(1, np.uint8), np.array([0.01]))
@@ -102,6 +104,7 @@ class Markers:
     status: NDArray[np.uint8]
     stderr: NDArray[np.float64]
     radius: float | None = None
+    probability: NDArray[np.float64] | None = None
 
     @property
     def displacement(self) -> NDArray[np.float64]:

@@ -433,6 +433,35 @@ def test_spots_of_which_none_belongs_to_a_lattice_in_the_end_are_no_marks(
         detect_markers(render((160, 200), grid(5, 6, 30.0, corner=(20, 20)), 4.0))
 
 
+def test_a_spot_that_does_not_look_like_the_marks_is_improbable() -> None:
+    truth = grid(6, 8, 30.0, corner=(30, 30))
+    image = render((270, 210), truth, 4.0, noise=1.0)
+    # A smear in place of one of the dots.
+    x, y = truth[19].astype(int)
+    image[y - 9 : y + 10, x - 9 : x + 10] = image[5, 5]
+    cv2.ellipse(image, (int(x), int(y)), (6, 4), 45, 0, 360, (90, 90, 90), cv2.FILLED)
+    found = detect_markers(image, least_probability=0.0)
+    assert found.probability is not None
+    which, _ = match(found.centers, truth)
+    assert (which == 19).sum() == 1
+    assert found.probability[which == 19][0] < found.probability[which != 19].min()
+    assert np.median(found.probability) > 0.99
+
+
+def test_marks_that_are_less_probable_than_asked_for_are_left_out() -> None:
+    image = render((270, 210), grid(6, 8, 30.0, corner=(30, 30)), 4.0, noise=1.0)
+    found = detect_markers(image)
+    assert found.probability is not None
+    least = float(np.median(found.probability))
+    assert len(detect_markers(image, least_probability=least).centers) < len(found.centers)
+
+
+def test_a_mark_alone_has_no_probability() -> None:
+    alone = detect_markers(render((100, 100), np.array([[50.0, 50.0]]), 5.0), dot_radius=5.0)
+    assert alone.probability is not None
+    assert np.isnan(alone.probability).all()
+
+
 def test_a_picture_that_was_changed_in_place_is_searched_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     picture = render((300, 400), grid(10, 8, 34.0, corner=(25, 30)), 4.6, noise=1.0)
     before = detect_markers(picture)

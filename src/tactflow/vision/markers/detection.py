@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.lattice import LONGEST_LINK, corners, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
-from tactflow.vision.markers.selection import Group, Sign, groups, links, marks_of
+from tactflow.vision.markers.selection import Group, Sign, evidence, groups, links, marks_of, probability
 
 Polarity = Literal["auto", "dark", "bright"]
 
@@ -113,6 +113,7 @@ class Detection:
     edges : (E, 2) int64, pairs of neighbouring marks, each pair once, smaller index first.
     radii : (N,) float64, of each mark, px; None where all are of one size.
     chosen : the spots that the marks grew from. rival : the next best spots elsewhere, if there are any.
+    evidence : (N, 3) float64, what the probability of each mark rests on (see `selection.evidence`).
     """
 
     centers: Floats
@@ -123,6 +124,12 @@ class Detection:
     radii: Floats | None = None
     chosen: Candidate | None = None
     rival: Candidate | None = None
+    evidence: Floats | None = None
+
+    @property
+    def probability(self) -> Floats | None:
+        """(N,) float64, of each mark to be one, 0 to 1; NaN for one alone. None without evidence."""
+        return None if self.evidence is None else probability(self.evidence)
 
     @property
     def doubt(self) -> str | None:
@@ -163,6 +170,7 @@ def detect_markers(
     dot_radius: float | None = None,
     polarity: Polarity = "auto",
     valid: NDArray[np.uint8] | None = None,
+    least_probability: float = 0.5,
 ) -> Detection:
     """Find the marks of a gel: of one size or many, of any shape, in one lattice or several.
 
@@ -178,6 +186,7 @@ def detect_markers(
     polarity : "dark" or "bright" against the gel; "auto" takes the better lattice.
     valid : (H, W) uint8, not 0 where there is gel; no mark is looked for where most of what lies around is
         none. None: everywhere.
+    least_probability : of a mark, 0 to 1; only where `dot_radius` is None.
 
     Returns
     -------
@@ -203,10 +212,11 @@ def detect_markers(
     """
     gray = to_gray(image).astype(np.float32)
     _require_options(dot_radius, polarity, valid, gray.shape)
-    asked = image.shape, image.tobytes(), dot_radius, polarity, None if valid is None else valid.tobytes()
+    area = None if valid is None else valid.tobytes()
+    asked = image.shape, image.tobytes(), dot_radius, polarity, area, least_probability
     found = _LAST.get(asked)
     if found is None:
-        found = _found_in(gray, dot_radius, polarity, valid)
+        found = _found_in(gray, dot_radius, polarity, valid, least_probability)
         _LAST.clear()
         _LAST[asked] = found
     # Who gets it may write to it.
@@ -219,7 +229,11 @@ pictures costs a hundredth of a search."""
 
 
 def _found_in(
-    gray: NDArray[np.float32], dot_radius: float | None, polarity: Polarity, valid: NDArray[np.uint8] | None
+    gray: NDArray[np.float32],
+    dot_radius: float | None,
+    polarity: Polarity,
+    valid: NDArray[np.uint8] | None,
+    least_probability: float,
 ) -> Detection:
     """What `detect_markers` finds in a picture, (H, W) float32, grey levels."""
     shortest = min(gray.shape)
@@ -238,6 +252,8 @@ def _found_in(
         if not len(marks.points):
             raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(best))
         _require_gel_between(gray, best, marks)
+        # One alone has no probability.
+        marks = marks.at(~(probability(evidence(gray, marks)) < least_probability))
         return _detection(gray, best, marks, found[1:])
     return _detection(gray, best, best.spots, found[1:])
 
@@ -302,12 +318,14 @@ def _detection(gray: NDArray[np.float32], best: Group, marks: Spots, others: lis
     for size in np.unique(radii):
         centers[radii == size] = refine_centers(dark, centers[radii == size], size)
     order = _reading_order(centers, radius)
-    centers, radii = centers[order], radii[order]
+    centers, radii, marks = centers[order], radii[order], marks.at(order)
     pitch = pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
     edges = neighbour_graph(centers, LONGEST_LINK * pitch)
     rival = next((_candidate(other) for other in others if not _same(other, centers, radii)), None)
     sizes = radii if (radii != radius).any() else None
-    return Detection(centers, radius, best.polarity, pitch, edges, sizes, _candidate(best), rival)
+    return Detection(
+        centers, radius, best.polarity, pitch, edges, sizes, _candidate(best), rival, evidence(gray, marks)
+    )
 
 
 def _same(other: Group, centers: Floats, radii: Floats) -> bool:

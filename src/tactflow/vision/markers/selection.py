@@ -91,6 +91,11 @@ LEAST_CLUSTER: Final = 6
 MEMBER_SHARE: Final = 0.3
 """Share of closed parallelograms of a mark, at least. Chosen on sts_640."""
 
+PROBABILITY: Final = (-0.37, -4.72, 5.65, 2.42)
+"""Log odds of a mark: constant, and weights of its `evidence`. Fitted to 18 sensors by `python -m
+tactflow.bench.judge_dots --fit`, which also tells how often marks of a probability are marks on a sensor that
+was left out."""
+
 WINDOW: Final = 2.6
 """Radius of the discs that are compared, in radii of the marks: they hold the gaps to the neighbours, too.
 Chosen on sts_640 and sts_torque160, where glare correlates less with marks than with 1.9 radii."""
@@ -146,6 +151,36 @@ def marks_of(gray: NDArray[np.float32], group: Group, by_scale: Mapping[float, S
     either = joined(group.spots, larger.at(covers))
     marks = _grown(gray, _in_lattice(_apart(either, either.strength)), spots)
     return marks.at(marks.bend > LEAST_BEND * np.median(marks.bend)) if len(marks.points) else marks
+
+
+def evidence(gray: NDArray[np.float32], marks: Spots) -> Floats:
+    """What tells how probable it is that marks are marks, (N, 3); NaN for one alone.
+
+    How much its response differs from those around, as the absolute logarithm of their ratio; how much it
+    looks like them, -1 to 1; and the share of parallelograms that it is part of and that close, 0 to 1.
+    """
+    _, around = nearest(marks.points, MARKS_AROUND)
+    if not around.size:
+        return np.full((len(marks.points), 3), np.nan)
+    strength = np.log(marks.strength / np.median(marks.strength[around], axis=1))
+    alike = likeness(gray, marks.points, marks.points[around], np.median(marks.radius[around], axis=1))
+    share, _ = lattice.own_shares(marks.points, links(marks.points))
+    return np.column_stack([np.abs(strength), alike, share])
+
+
+def probability(evidence: Floats) -> Floats:
+    """Probability, (N,), of being a mark, of its evidence, (N, 3): logistic regression.
+
+    References
+    ----------
+    Cox, "The regression analysis of binary sequences", J. Royal Statistical Society B 20 (1958).
+
+    Examples
+    --------
+    >>> probability(np.array([[0.1, 0.9, 0.8], [1.0, 0.1, 0.0]])) > 0.5
+    array([ True, False])
+    """
+    return np.asarray(1 / (1 + np.exp(-PROBABILITY[0] - evidence @ PROBABILITY[1:])), np.float64)
 
 
 def links(points: Floats) -> NDArray[np.int64]:

@@ -94,7 +94,7 @@ _LOST: Final = np.uint8(MarkerStatus.LOST)
 
 
 class MarkerTracker:
-    """Follows the marks of a reference frame: position, status and standard error of each.
+    """Follows the marks of a reference frame: position, status, standard error and probability of each.
 
     Each mark is first aligned with its template, from where it was last. Where all are found and their
     displacements form a smooth field, this is the answer. Otherwise spots are searched, and the marks outside
@@ -156,6 +156,7 @@ class MarkerTracker:
         self._shape = grays[0].shape
         self._shapes = (self._shape, (*self._shape, 3))
         self._pitch, self._radius = detection.pitch, detection.dot_radius
+        self._probability = detection.probability
         # Nothing that is seen goes farther than across the frame; the votes for a jump take memory.
         across = float(np.hypot(*self._shape))
         self._farthest = min(max_displacement or MAX_DISPLACEMENT * self._pitch, across)
@@ -210,7 +211,8 @@ class MarkerTracker:
             status[~seen] = _LOST
             status[self._infer(position, seen)] = _INFERRED
         self._position, self._seen = position, seen
-        return Markers(self._origin.copy(), position.copy(), status, errors, self._radius)
+        probability = None if self._probability is None else self._probability.copy()
+        return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
 
     def _check(self, found: Alignment) -> tuple[Flags, Floats, int]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
