@@ -18,6 +18,8 @@ there. Measured with reference and contact exchanged, on 166 outlined contacts o
 noticed; not exchanged, one is mistaken."""
 ROUGHER: Final = 1.25
 """The same, from which the reference counts as untouched from then on."""
+ENOUGH: Final = 30
+"""Frames with a contact that is not smoother, after which it does, too: a second of them."""
 
 
 class ReferenceCheck:
@@ -35,9 +37,10 @@ class ReferenceCheck:
 
     def __init__(self, reference: NDArray[np.uint8]) -> None:
         self._size = grid_size(reference.shape)
-        self._light = to_planes(reference, self._size)
+        self._slopes = _squared_slopes(reference, self._size)
+        self._passed = 0
         self.confirmed = False
-        """Whether a contact has shown that the reference was untouched."""
+        """Whether contacts have shown that the reference was untouched."""
 
     def was_touched(self, image: NDArray[np.uint8], changed: Mask) -> bool:
         """Whether the gel is smoother than in the reference where it has changed.
@@ -49,17 +52,17 @@ class ReferenceCheck:
         region = to_cells(changed, self._size) > HALF
         if not region.any():
             return False
-        now, before = (
-            float(_squared_slopes(light)[:, region].sum())
-            for light in (to_planes(image, self._size), self._light)
-        )
+        now = float(_squared_slopes(image, self._size)[:, region].sum())
+        before = float(self._slopes[:, region].sum())
         ratio = now / before if before > 0 else math.inf
-        self.confirmed = ratio > ROUGHER
+        self._passed += ratio >= SMOOTHER
+        self.confirmed = ratio > ROUGHER or self._passed == ENOUGH
         return ratio < SMOOTHER
 
 
-def _squared_slopes(light: Floats32) -> Floats32:
+def _squared_slopes(image: NDArray[np.uint8], size: tuple[int, int]) -> Floats32:
     """Of the logarithm of the light (channels, h, w), blurred by a cell against noise, per cell squared."""
-    smooth = [cv2.GaussianBlur(plane, (0, 0), 1.0) for plane in np.log(light + 1)]
+    planes = np.log(to_planes(image, size) + 1)
+    smooth = [cv2.GaussianBlur(plane, (0, 0), 1.0) for plane in planes]
     slopes = [cv2.Sobel(p, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(p, cv2.CV_32F, 0, 1) ** 2 for p in smooth]
     return np.asarray(slopes, np.float32)
