@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats32, Mask
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.contact.filling import SQUARE
 
 STRAY: Final = 0.04
 """Separate changes with less of the summed squared deviation than this part of the strongest one's are no
@@ -79,34 +79,29 @@ def wide_change(colour: Floats32, extent: float) -> Flags | None:
 
 
 def contact_components(
-    squared: Floats32, weak: float, largest: float, start: float, stay: float, before: Flags | None
+    squared: Floats32, weak: float, start: float, stay: float, before: Flags | None
 ) -> list[Component]:
     """Connected changes that are contact, the strongest first if there are several.
 
     squared : (h, w) float32, squared deviations. weak : a cell above belongs to a contact if connected to it.
-    largest : of `squared`. start : a peak that makes a new contact. stay : a peak that keeps one. before :
-    (h, w) bool, the cells in contact in the previous frame.
+    start : a peak that makes a new contact. stay : a peak that keeps one. before : (h, w) bool, the cells in
+    contact in the previous frame.
 
     >>> import numpy as np
     >>> squared = np.zeros((9, 9), np.float32)
     >>> squared[2:6, 2:6] = 20
-    >>> [(found.rows, found.columns) for found in contact_components(squared, 5, 20, 10, 10, None)]
+    >>> [(found.rows, found.columns) for found in contact_components(squared, 5, 10, 10, None)]
     [(slice(1, 7, None), slice(1, 7, None))]
     """
-    changed = np.empty(squared.shape, np.uint8)
-    *bounds, cells = close_changes(squared, weak, changed)
+    changed = np.asarray(cv2.morphologyEx((squared > weak).view(np.uint8), cv2.MORPH_CLOSE, SQUARE), np.uint8)
     least = min(MIN_CELLS, squared.size // 4)
-    if cells:
-        window = _window(bounds, squared.shape)
-        parts = [Component(*window, changed[window].copy().view(np.bool_), cells, largest)]
-    else:
-        parts = _several_parts(changed, squared, least)
+    parts = _parts(changed, squared, least)
     large = [part for part in parts if part.cells >= least]
     found = [part for part in large if part.peak >= start or (part.peak >= stay and _overlaps(part, before))]
     return _strongest(found, squared)
 
 
-def _several_parts(changed: Mask, squared: Floats32, least: int) -> list[Component]:
+def _parts(changed: Mask, squared: Floats32, least: int) -> list[Component]:
     """Each connected part of what has changed.
 
     least : cells of a part's bounding box, below which it is left out.
@@ -147,60 +142,3 @@ def _strongest(components: list[Component], squared: Floats32) -> list[Component
     sums = [float(squared[part.rows, part.columns][part.inside].sum()) for part in components]
     order = sorted(range(len(components)), key=lambda index: -sums[index])
     return [components[index] for index in order[:MAX_COMPONENTS] if sums[index] >= STRAY * sums[order[0]]]
-
-
-@kernel("UniTuple(int64, 5)(float32[:, ::1], float32, uint8[:, ::1])")
-def close_changes(squared: Floats32, weak: float, closed: Mask) -> tuple[int, int, int, int, int]:
-    """1 where `squared` is above `weak`, after closing by 3 x 3, else 0; `closed` is filled.
-
-    Returns the left and upper end, width, height and number of these cells if they are one piece without a
-    gap in any row, as most contacts are; else 0.
-    """
-    high, wide = squared.shape
-    # A border of one cell for each step: what is outside neither grows nor erodes.
-    grown, above = np.empty((high + 2, wide + 2), np.uint8), np.empty((high + 2, wide + 2), np.uint8)
-    grown[:], above[:] = 1, 0
-    line = np.empty(wide + 2, np.uint8)
-    for y in range(high):
-        row = above[y + 1, 1:]
-        for x in range(wide):
-            row[x] = np.uint8(squared[y, x] > weak)
-    for y in range(high):
-        upper, here, lower, row = above[y], above[y + 1], above[y + 2], grown[y + 1, 1:]
-        for x in range(wide + 2):
-            line[x] = upper[x] | here[x] | lower[x]
-        for x in range(wide):
-            row[x] = line[x] | line[x + 1] | line[x + 2]
-    for y in range(high):
-        upper, here, lower, row = grown[y], grown[y + 1], grown[y + 2], closed[y]
-        for x in range(wide + 2):
-            line[x] = upper[x] & here[x] & lower[x]
-        for x in range(wide):
-            row[x] = line[x] & line[x + 1] & line[x + 2]
-    return _bound_one_piece(closed)
-
-
-@helper
-def _bound_one_piece(closed: Mask) -> tuple[int, int, int, int, int]:
-    """What `close_changes` returns."""
-    high, wide = closed.shape
-    top, left = high, wide
-    bottom = right = cells = before = before_end = 0
-    for y in range(high):
-        row, count, first = closed[y], 0, 0
-        for x in range(wide):
-            count += row[x]
-        if count == 0:
-            continue
-        while not row[first]:
-            first += 1
-        end = first + count
-        for x in range(first, min(end, wide)):
-            count -= row[x]
-        # Also cells that touch at a corner are connected.
-        if count or (bottom and (bottom < y or first > before_end or end < before)):
-            return 0, 0, 0, 0, 0
-        top, bottom, cells = min(top, y), y + 1, cells + end - first
-        before, before_end = first, end
-        left, right = min(left, first), max(right, end)
-    return (left, top, right - left, bottom - top, cells) if cells else (0, 0, 0, 0, 0)

@@ -13,7 +13,7 @@ picture of coloured light, show slopes as well: one flank brightens, the opposit
 Light is never even, so every change is measured by the largest one nearby (`nearby`), not in the whole
 contact.
 
-`contact_level` takes mirror images of lamps out of a window's change (`cut_gloss`), tells which of the two it
+`contact_level` takes mirror images of lamps out of a window's change (`_level`), tells which of the two it
 is, and has `_level_of_brightness` or `_level_of_slopes` find the level set, positive inside. Where slopes
 show, what is clear beside the largest change nearby, closed by `filling`, is a region; `border` tells how far
 inside the region the contact ends. Small separate parts, specks, are left out.
@@ -30,7 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32, Mask
-from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.border import depth_of, inside_border
 from tactflow.vision.contact.components import STRAY
 from tactflow.vision.contact.filling import (
@@ -126,53 +125,20 @@ def _level(change: WindowChange, bridge: float, pixels: Mask | None) -> tuple[Fl
 
     pixels : of a `Hidden`; None where nothing is hidden.
     """
-    shape = change.strength.shape
-    strength, beside = np.empty(shape, np.float32), np.empty(shape, np.uint8)
-    none = np.zeros(shape, np.uint8) if pixels is None else pixels
-    cap, squares, common = cut_gloss(change.strength, change.brightness, none, beside, strength)
-    hidden, even = None if pixels is None else Hidden(pixels, beside), squares / COLOURED
+    hidden, seen = None, change.strength
+    if pixels is not None:
+        hidden = Hidden(pixels, np.asarray(cv2.dilate(pixels, SQUARE), np.uint8))
+        seen = np.where(hidden.beside > 0, np.float32(0), seen)
+    cap = GLOSS * _typical(seen)
+    strength = np.minimum(change.strength, np.float32(cap))
+    even = cv2.norm(strength, cv2.NORM_L2SQR) / COLOURED
     # What is cut is no larger than before: where it is too little then, there is no need to cut it.
-    if common > even:
+    if cv2.norm(change.brightness, cv2.NORM_L2SQR) > even:
         tone = np.float32(cap / 3**0.5)
         brightness = np.clip(change.brightness, -tone, tone)
         if cv2.norm(brightness, cv2.NORM_L2SQR) > even and _sidedness(brightness) < TWO_SIDED:
             return _without_specks(_level_of_brightness(brightness, hidden), strength), None
     return _level_of_slopes(strength, bridge, hidden)
-
-
-@kernel(
-    "UniTuple(float64, 3)(float32[:, ::1], float32[:, ::1], uint8[:, ::1], uint8[:, ::1], float32[:, ::1])",
-)
-def cut_gloss(
-    strength: Floats32, brightness: Floats32, hidden: Mask, beside: Mask, cut: Floats32
-) -> tuple[float, float, float]:
-    """Cut what is a mirror image of a lamp; returns the cap, and sums of squares of `cut` and `brightness`.
-
-    strength, brightness : of a `WindowChange`. hidden : (h, w), 1 where a marker was removed. beside : as of
-    `Hidden`, filled; what is typical is told by the others. cut : (h, w), filled with the strength, but no
-    more than the cap.
-    """
-    high, wide = strength.shape
-    near = np.empty(wide + 2, np.uint8)
-    near[0] = near[wide + 1] = 0
-    total = squares = common = 0.0
-    for y in range(high):
-        above, here, below, row = hidden[max(y - 1, 0)], hidden[y], hidden[min(y + 1, high - 1)], beside[y]
-        for x in range(wide):
-            near[x + 1] = above[x] | here[x] | below[x]
-        for x in range(wide):
-            row[x] = near[x] | near[x + 1] | near[x + 2]
-        for x in range(wide):
-            value = np.float64(strength[y, x] if row[x] == 0 else np.float32(0))
-            tone = np.float64(brightness[y, x])
-            total, squares, common = total + value, squares + value * value, common + tone * tone
-    most = GLOSS * max(squares / max(total, 1e-9), 1e-9)
-    cap, squares = np.float32(most), 0.0
-    for y in range(high):
-        for x in range(wide):
-            cut[y, x] = strength[y, x] if strength[y, x] < cap else cap
-            squares += np.float64(cut[y, x]) * np.float64(cut[y, x])
-    return most, squares, common
 
 
 def _sidedness(brightness: Floats32) -> float:

@@ -295,7 +295,7 @@ class ContactDetector:
             stay = max(stay, remembered)
         if change.largest < (start if before is None else stay):
             return []
-        return contact_components(change.squared, CONNECTED * limit, change.largest, start, stay, before)
+        return contact_components(change.squared, CONNECTED * limit, start, stay, before)
 
     def _faint(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the extent of a change of colour, in two frames; or one that fades while it is lifted.
@@ -321,8 +321,7 @@ class ContactDetector:
             belongs = before if belongs is None else before | belongs
         if belongs is None:
             return []
-        largest = max(change.largest, change.largest_colour)
-        return contact_components(change.evidence, CONNECTED * limit, largest, math.inf, 0.0, belongs)
+        return contact_components(change.evidence, CONNECTED * limit, math.inf, 0.0, belongs)
 
     def _extent(self, cells: int) -> float:
         """Cells that a change of colour covers which is contact for its extent."""

@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Mask
-from tactflow.vision.compiled import helper, kernel
 
 BAY: Final = 2.5
 """A region with a bay that is deeper, pixels of the window, may be a ring with a gap. A gap that is
@@ -30,20 +28,6 @@ region; and of a bay that has changed, or is enclosed by what has, if the bay do
 
 SQUARE: Final = np.ones((3, 3), np.uint8)
 """A pixel and its neighbours."""
-
-PIXEL: Final = 1
-PASSED: Final = 2
-RIGHT: Final = 4
-BESIDE: Final = 8
-"""Marks of a pixel where outlines are traced: it belongs to the region; an outline passes it; one that has
-what is outside to its right does; it is hidden, or next to what is."""
-
-EIGHT_PIXELS: Final = np.uint64(0x0101010101010101)
-"""`PIXEL`, of eight pixels side by side."""
-
-ACROSS: Final = np.array([1, 1, 0, -1, -1, -1, 0, 1])
-DOWN: Final = np.array([0, -1, -1, -1, 0, 1, 1, 1])
-"""Steps to the eight neighbours of a pixel, counterclockwise from the right, y down."""
 
 _GAP: Final = re.compile(b"\0+")
 """Pixels of the frame's border that do not belong to a region."""
@@ -74,8 +58,11 @@ class Region(NamedTuple):
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
-    nothing = np.zeros(filled.shape, np.uint8)
-    return Region(filled, *_outlines(filled, Hidden(nothing, nothing)))
+    outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    # From one corner to the next, and back to the first, along rows, columns and diagonals.
+    steps = [np.abs(np.diff(outline[:, 0], axis=0, append=outline[:1, 0])) for outline in outlines]
+    lengths = [max(int(step.max(axis=1).sum()), 1) for step in steps]
+    return Region(filled, [np.asarray(outline, np.int32) for outline in outlines], lengths)
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:
@@ -100,94 +87,13 @@ def outlined(mask: Mask, hidden: Hidden | None) -> Mask:
     """
     if hidden is None:
         return _without_holes(mask.copy())
+    outlines, _ = cv2.findContours(mask | hidden.pixels, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    seen = [outline[hidden.beside[outline[:, 0, 1], outline[:, 0, 0]] == 0] for outline in outlines]
     filled = np.zeros(mask.shape, np.uint8)
-    parts, _ = _outlines(mask, hidden)
-    if parts:
-        cv2.fillPoly(filled, parts, (1.0,))
+    for outline in seen:
+        if len(outline):
+            cv2.fillPoly(filled, [outline], (1.0,))
     return filled
-
-
-def _outlines(mask: Mask, hidden: Hidden) -> tuple[list[NDArray[np.int32]], list[int]]:
-    """Outlines as `trace_outlines` finds them, the last one first, as OpenCV has it; and their lengths."""
-    high, wide = mask.shape
-    marks = np.zeros((high + 2, (wide + 9) & ~7), np.uint8)
-    # A pixel is passed at most once for each of its four neighbours that is outside.
-    points = np.empty((2 * (high + 1) * (wide + 1), 1, 2), np.int32)
-    ends = np.empty(((high + 1) * (wide + 1) // 2, 2), np.int32)
-    found = trace_outlines(mask, *hidden, marks, points, ends)
-    spans, lengths = ends[found::-1].T.tolist()
-    return [points[start:end] for end, start in pairwise(spans)], lengths[:-1]
-
-
-@kernel("int64(uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], uint8[:, ::1], int32[:, :, ::1], int32[:, ::1])")
-def trace_outlines(
-    mask: Mask,
-    hidden: Mask,
-    beside: Mask,
-    marks: Mask,
-    points: NDArray[np.int32],
-    ends: NDArray[np.int32],
-) -> int:
-    """Outer borders of a region's parts, counterclockwise, as far as they are seen; returns how many.
-
-    Border following after S. Suzuki and K. Abe, "Topological structural analysis of digitized binary images
-    by border following", CVGIP 30 (1985); parts within holes are left out.
-
-    mask : (h, w), 0 or 1. hidden, beside : of a `Hidden`; what is hidden is traced as if it belonged to the
-    region, and what is beside it left out. marks : (h + 2, n), 0, changed; n a multiple of eight >= w + 2.
-    points : (n, 1, 2), filled: x and y of the pixels where outlines turn or come out of what is hidden, one
-    outline after another. ends : (outlines + 1, 2), filled: where the points of each outline end, and how
-    many pixels it passes, after a 0.
-    """
-    (high, wide), eights = mask.shape, marks.view(np.uint64)
-    for y in range(high):
-        for x in range(wide):
-            marks[y + 1, x + 1] = mask[y, x] | hidden[y, x] | beside[y, x] * BESIDE
-    found = ends[0, 0] = ends[0, 1] = 0
-    # Not simply 1: for a constant, numba would compile `_follow` a second time.
-    first: Any = np.int64(1)
-    for y in range(1, high + 1):
-        x, outside = first, True
-        while x <= wide:
-            if marks[y, x] & PIXEL == 0:
-                x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == 0 else 1
-                continue
-            if outside and marks[y, x] & PASSED == 0:
-                end, length = _follow(marks, x, y, points, ends[found, 0])
-                if end > ends[found, 0]:
-                    found += 1
-                    ends[found, 0], ends[found, 1] = end, length
-            while marks[y, x] & PIXEL:
-                x += 8 if x & 7 == 0 and eights[y, x >> 3] & EIGHT_PIXELS == EIGHT_PIXELS else 1
-            # To the right of a part lies a hole of it, or what is outside.
-            outside = marks[y, x - 1] & RIGHT != 0
-    return found
-
-
-@helper
-def _follow(marks: Mask, x: int, y: int, points: NDArray[np.int32], end: int) -> tuple[int, int]:
-    """Follow one outline of `trace_outlines` from its first pixel; returns its end, and its length.
-
-    marks : (h + 2, w + 2) uint8, changed. end : where the points before end.
-    """
-    back, length = 3, 0
-    while back != 4 and marks[y + DOWN[back], x + ACROSS[back]] & PIXEL == 0:
-        back = (back - 1) & 7
-    alone, first_x, first_y, first_back = back == 4, x, y, back
-    while True:
-        turn = (back + 1) & 7
-        while marks[y + DOWN[turn], x + ACROSS[turn]] & PIXEL == 0 and not alone:
-            turn = (turn + 1) & 7
-        near = marks[y + DOWN[back], x + ACROSS[back]] | marks[y + DOWN[turn], x + ACROSS[turn]]
-        straight = turn == back ^ 4 and near & BESIDE == 0
-        if not straight and marks[y, x] & BESIDE == 0:
-            points[end, 0, 0], points[end, 0, 1] = x - 1, y - 1
-            end += 1
-        # What lies to the right has been looked at, and is outside.
-        marks[y, x] |= PASSED | RIGHT if alone or 0 < turn <= back else PASSED
-        x, y, back, length = x + ACROSS[turn], y + DOWN[turn], turn ^ 4, length + 1
-        if alone or (x == first_x and y == first_y and back == first_back):
-            return end, length
 
 
 def _without_holes(mask: Mask) -> Mask:
