@@ -8,10 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.background_kernels import (
-    BESIDE,
-    MIDDLE,
-)
+from tactflow.vision.contact.background_kernels import BESIDE, MIDDLE
 
 Float = NDArray[np.float32]
 
@@ -68,54 +65,36 @@ def plain_scaled_change(
     mean: Float,
     scale: Float,
     pattern: Float,
-    inside: NDArray[np.uint8],
-    blurred: Float,
-    spans: NDArray[np.int64],
-    peaks: Float,
+    change: Float,
 ) -> None:
     """The change less that of light and pattern, in standard deviations, smoothed along x."""
-    high, wide = len(blurred), blurred.shape[1] // 3
+    high, wide = len(change), change.shape[1] // 3
     rows, columns = slice(top, top + high), slice(left, left + wide)
     planes, usual, unit, toward = (
         array.reshape(len(array), -1, 3)[rows, columns].transpose(2, 0, 1)
         for array in (picture, mean, scale, pattern)
     )
-    change = _change(planes, usual, coefficients, across[columns], down[rows]) * unit
-    change -= toward * (toward * change).sum(axis=0)
+    scaled = _change(planes, usual, coefficients, across[columns], down[rows]) * unit
+    scaled -= toward * (toward * scaled).sum(axis=0)
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
-    smooth = cv2.sepFilter2D(np.stack(list(change), axis=2), cv2.CV_32F, weights, np.ones(1))
-    wanted, filled = smooth.reshape(high, wide, 3), np.zeros((high, wide, 3), np.float32)
-    side = high // len(inside)
-    padded = np.pad(inside > 0, ((1, 1), (0, 0)))
-    for row in range(len(inside)):
-        counts = np.flatnonzero(inside[row])
-        spans[row] = (side * counts[0], side * (counts[-1] + 1)) if counts.size else 0
-        near = np.flatnonzero(padded[row : row + 3].any(axis=0))
-        if near.size:
-            part = slice(side * row, side * row + side), slice(side * near[0], side * (near[-1] + 1))
-            blurred.reshape(high, wide, 3)[part] = filled[part] = wanted[part]
-    parts = filled[0], filled[-1], filled[:, 0], filled[:, -1], filled
-    peaks[:] = [np.abs(part).max() for part in parts]
+    smooth = cv2.sepFilter2D(np.stack(list(scaled), axis=2), cv2.CV_32F, weights, np.ones(1))
+    change[:] = smooth.reshape(change.shape)
 
 
 def plain_change_strength(
-    blurred: Float,
+    change: Float,
     inside: NDArray[np.uint8],
-    spans: NDArray[np.int64],
     gain: np.float32,
     strongest: Float,
     strength: Float,
     common: Float,
 ) -> None:
     """Smoothed along y, weighed length and mean over the channels, 0 outside."""
-    del spans  # They follow from `inside`.
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
     side = len(strength) // len(inside)
     counts = (inside != 0).repeat(side, axis=0).repeat(side, axis=1)
-    # What is not filled may hold anything.
-    known = np.nan_to_num(blurred).reshape(*strength.shape, 3)
-    smooth = cv2.sepFilter2D(known, cv2.CV_32F, np.ones(1), weights).reshape(known.shape)
-    change = np.where(counts[..., None], smooth, np.float32(0))
-    square = gain * (change**2).sum(axis=2) - (change @ strongest) ** 2
+    smooth = cv2.sepFilter2D(change.reshape(*strength.shape, 3), cv2.CV_32F, np.ones(1), weights)
+    pixels = smooth.reshape(*strength.shape, 3) * counts[..., None]
+    square = gain * (pixels**2).sum(axis=2) - (pixels @ strongest) ** 2
     strength[:] = np.sqrt(np.maximum(square, 0))
-    common[:] = change.mean(axis=2)
+    common[:] = pixels.mean(axis=2)

@@ -16,7 +16,6 @@ from tactflow.vision.contact import (
     background,
     border,
     illumination,
-    response,
 )
 from tactflow.vision.contact.background import BackgroundModel, Change
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
@@ -28,7 +27,6 @@ from tests.oracles.background import (
 )
 from tests.oracles.border import plain_border_level
 from tests.oracles.illumination import plain_compare_blocks, plain_fit_robustly
-from tests.oracles.response import plain_weigh_colours
 
 Image = NDArray[np.uint8]
 
@@ -40,7 +38,6 @@ ORACLES = (
     (background, "scaled_change", plain_scaled_change),
     (background, "change_strength", plain_change_strength),
     (background, "smooth_cells", plain_smooth_cells),
-    (response, "weigh_colours", plain_weigh_colours),
     (illumination, "compare_blocks", plain_compare_blocks),
     (illumination, "fit_robustly", plain_fit_robustly),
     (border, "border_level", plain_border_level),

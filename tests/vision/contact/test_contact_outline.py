@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.contact import ContactDetector
+from tactflow.vision.contact.border import depth_of
 from tactflow.vision.contact.contact_outline import WindowChange, contact_level
 from tactflow.vision.contact.filling import enclosed, outlined, traced
 from tactflow.vision.contact.nearby import FAINT, largest_nearby
@@ -192,8 +193,10 @@ def test_an_outline_is_as_long_as_the_pixels_that_it_passes(seed: int) -> None:
     # From white noise to blobs, some of them within holes of others, and at the border.
     noise = cv2.GaussianBlur(random.random(size), (0, 0), 0.2 + 0.2 * seed)
     mask = (noise > np.quantile(noise, random.random())).astype(np.uint8)
+    mask[0, 0] = 0
     passed = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-    assert traced(mask).lengths == [len(outline) for outline in passed]
+    ends = depth_of(traced(mask)).outlines[:, 2].tolist() if passed else [0]
+    assert ends == [0, *(len(outline) for outline in passed)]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (8, 2), (31, 40), (40, 33)])

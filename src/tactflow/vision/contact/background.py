@@ -44,6 +44,7 @@ CUT: Final = 0.5
 """Change at the picture's border, over the largest one of a contact, from which on the border cuts it. Chosen
 by hand, near the part at which `contact_outline` takes a change for the contact's."""
 
+
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
 """What `weigh_change` takes where nothing was in contact in the previous frame."""
@@ -210,10 +211,8 @@ class BackgroundModel:
         """
         untouched = self._untouched[side]
         picture, each = (change.half if side == 2 else change.whole), CELL // side
-        high, wide = inside.shape
-        blurred = np.empty((each * high, 3 * each * wide), np.float32)
-        spans, peaks = np.empty((high, 2), np.int64), np.empty(5, np.float32)
-        belongs = inside.view(np.uint8)
+        high, wide = each * inside.shape[0], each * inside.shape[1]
+        scaled = np.empty((high, 3 * wide), np.float32)
         scaled_change(
             picture.reshape(len(picture), -1),
             each * rows.start,
@@ -224,15 +223,12 @@ class BackgroundModel:
             untouched.mean,
             untouched.scale,
             untouched.pattern,
-            belongs,
-            blurred,
-            spans,
-            peaks,
+            scaled,
         )
-        cut = _cut_by_border(peaks, rows, columns, change.squared.shape)
-        response = EVEN if cut else light_response(blurred, inside)
-        strength, brightness = np.empty((2, each * high, each * wide), np.float32)
-        change_strength(blurred, belongs, spans, *response, strength, brightness)
+        cut = _cut_by_border(scaled, inside, rows, columns, change.squared.shape)
+        response = EVEN if cut else light_response(scaled, inside)
+        strength, brightness = np.empty((2, high, wide), np.float32)
+        change_strength(scaled, inside.view(np.uint8), *response, strength, brightness)
         return WindowChange(strength, brightness)
 
     def _derived(self) -> _Derived:
@@ -288,18 +284,23 @@ def _interleaved(planes: Floats32) -> Floats32:
     return np.ascontiguousarray(planes.transpose(1, 2, 0), np.float32).reshape(planes.shape[1], -1)
 
 
-def _cut_by_border(peaks: Floats32, rows: slice, columns: slice, shape: tuple[int, ...]) -> bool:
+def _cut_by_border(
+    change: Floats32, inside: NDArray[np.bool_], rows: slice, columns: slice, shape: tuple[int, ...]
+) -> bool:
     """Whether a contact, not only what is left of its change further out, reaches the picture's border.
 
-    peaks : (5,), of the window's change, from `scaled_change`. rows, columns : the window, cells. shape : of
-    the picture, cells.
+    change : (n h, 3 n w), of the window. inside : (h, w), which of its cells count. rows, columns : the
+    window, cells. shape : of the picture, cells.
     """
-    above, below, before, after, largest = peaks.tolist()
-    enough = CUT * largest
-    by_row = (above > enough and rows.start == 0) or (below > enough and rows.stop == shape[0])
-    return bool(
-        by_row or (before > enough and columns.start == 0) or (after > enough and columns.stop == shape[1])
-    )
+    each, pixels = len(change) // len(inside), change.reshape(len(change), -1, 3)
+    enough = CUT * cv2.norm(change, cv2.NORM_INF)
+    ends = (rows.start == 0, 0, 0), (rows.stop == shape[0], 0, -1)
+    ends += (columns.start == 0, 1, 0), (columns.stop == shape[1], 1, -1)
+    for reached, axis, end in ends:
+        line = np.abs(pixels.take(end, axis)).max(axis=1)
+        if reached and line[inside.take(end, axis).repeat(each)].max(initial=0) > enough:
+            return True
+    return False
 
 
 def _planes(picture: NDArray[np.uint8]) -> Floats32:

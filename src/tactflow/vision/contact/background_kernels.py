@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32, Indices
+from tactflow.vision.arrays import Floats32
 from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.contact.illumination import WHITE
 
@@ -130,8 +130,7 @@ def weigh_change(
 
 @kernel(
     "void(Array(uint8, 2, 'C', readonly=True), int64, int64, float32[:, ::1], float32[::1], float32[::1],"
-    " float32[:, ::1],"
-    " float32[:, ::1], float32[:, ::1], uint8[:, ::1], float32[:, ::1], int64[:, ::1], float32[::1])",
+    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
 )
 def scaled_change(
     picture: Byte,
@@ -143,77 +142,30 @@ def scaled_change(
     mean: Floats32,
     scale: Floats32,
     pattern: Floats32,
-    inside: Byte,
-    blurred: Floats32,
-    spans: Indices,
-    peaks: Floats32,
+    change: Floats32,
 ) -> None:
-    """How a window has changed where it counts, in standard deviations, smoothed along x.
+    """How a window has changed, in standard deviations, smoothed along x.
 
-    picture : (H, 3 W), the frame at the window's resolution. top, left : of the window. coefficients, across,
-    down : as for `weigh_change`, at this resolution. mean, scale : (H, 3 W). pattern : (H, 3 W), direction
-    p in which the channels change where the gel's pattern moves: of a change v, (p . v) p is left out.
-    inside : (r, s), not 0 where a block of the window counts. blurred : (h, 3 w), filled in each row of
-    blocks where it, the one above or the one below count, and between; elsewhere left as it is. spans :
-    (r, 2), filled for each row of blocks with the first pixel that counts and that after the last. peaks :
-    (5,), filled with the largest changes of a channel in there: of the first row, of the last, of the first
-    column, of the last, of all.
+    picture : (H, 3 W), the frame at the window's resolution. top, left : of the window. coefficients :
+    (3, 4), of `IlluminationModel.fit`. across, down : positions, (W,) and (H,). mean, scale : (H, 3 W).
+    pattern : (H, 3 W), direction p in which the channels change where the gel's pattern moves: of a change
+    v, (p . v) p is left out. change : (h, 3 w), filled.
     """
-    high, wide = len(blurred), blurred.shape[1] // 3
-    side = high // len(inside)
-    _find_spans(inside, side, spans)
-    light = _light_along(coefficients, across[left : left + wide])
+    high, wide = change.shape
+    light = _light_along(coefficients, across[left : left + wide // 3])
+    first, last = 3 * left, 3 * left + wide
     # With a pixel more on both sides.
-    line, most = np.empty(3 * wide + 6, np.float32), np.empty(3 * wide, np.float32)
-    begin, end = 0, 0
-    most[:] = peaks[:] = 0
+    line = np.empty(wide + 6, np.float32)
     for y in range(high):
-        if y % side == 0:
-            begin, end = _neighbours(spans, y // side, wide)
-        if begin >= end:
-            continue
-        first, last, count = max(begin - 1, 0), min(end + 1, wide), 3 * (end - begin)
-        row, start, shift = top + y, 3 * (left + first), 3 * (first - begin + 1)
-        values, usual = picture[row, start : 3 * (left + last)], mean[row, start:]
-        unit, toward = scale[row, start:], pattern[row, start:]
-        _scale_line(values, usual, unit, toward, light, first, down[row], line[shift:])
+        row = top + y
+        values, usual = picture[row, first:last], mean[row, first:last]
+        unit, toward = scale[row, first:last], pattern[row, first:last]
+        _scale_line(values, usual, unit, toward, light, down[row], line[3:])
         for c in range(3):
-            if begin == 0:
-                line[c] = line[3 * min(2, wide) + c]
-            if end == wide:
-                line[count + 3 + c] = line[max(count - 3, 3) + c]
-        smooth, largest = blurred[y, 3 * begin :], most[3 * begin :]
-        for i in range(count):
+            line[c], line[wide + 3 + c] = line[3 * min(2, wide // 3) + c], line[max(wide - 3, 3) + c]
+        smooth = change[y]
+        for i in range(wide):
             smooth[i] = (line[i] + line[i + 6]) * BESIDE + line[i + 3] * MIDDLE
-            size = abs(smooth[i])
-            largest[i] = largest[i] if largest[i] > size else size
-        if y == 0:
-            for i in range(count):
-                peaks[0] = max(peaks[0], largest[i])
-    for i in range(3 * begin, 3 * end):
-        peaks[1] = max(peaks[1], abs(blurred[high - 1, i]))
-    _note_peaks(most, peaks)
-
-
-@helper
-def _note_peaks(most: Floats32, peaks: Floats32) -> None:
-    """The first and the last column's peaks and that of all, of the largest change in each column, (3 w,)."""
-    for c in range(3):
-        peaks[2], peaks[3] = max(peaks[2], most[c]), max(peaks[3], most[most.size - 3 + c])
-    for i in range(most.size):
-        peaks[4] = max(peaks[4], most[i])
-
-
-@helper
-def _find_spans(inside: Byte, side: int, spans: Indices) -> None:
-    """Fill `spans` as `scaled_change` does; both 0 where nothing in a row of blocks counts."""
-    for row in range(len(inside)):
-        first, end = 0, inside.shape[1]
-        while end > 0 and not inside[row, end - 1]:
-            end -= 1
-        while first < end and not inside[row, first]:
-            first += 1
-        spans[row, 0], spans[row, 1] = side * first, side * end
 
 
 @helper
@@ -234,12 +186,11 @@ def _scale_line(
     scale: Floats32,
     pattern: Floats32,
     light: Floats32,
-    first: int,
     place: np.float32,
     changes: Floats32,
 ) -> None:
-    """Fill `changes` with the change of a line from pixel `first` of the window on, standard deviations."""
-    gain, slope, offset = light[0, 3 * first :], light[1, 3 * first :], light[2, 3 * first :]
+    """Fill `changes` with the change of a line, standard deviations; light : of `_light_along`."""
+    gain, slope, offset = light
     for i in range(values.size):
         value, usual = np.float32(values[i]), mean[i]
         change = value - usual - (usual * (gain[i] + slope[i] * place) + offset[i])
@@ -253,24 +204,10 @@ def _scale_line(
         changes[3 * x + 2] = red - along * pattern[3 * x + 2]
 
 
-@helper
-def _neighbours(spans: Indices, row: int, wide: int) -> tuple[int, int]:
-    """The first pixel in the spans of a row and of those above and below, and that after the last."""
-    begin, end = wide, 0
-    for near in range(max(row - 1, 0), min(row + 2, len(spans))):
-        if spans[near, 1]:
-            begin, end = min(begin, spans[near, 0]), max(end, spans[near, 1])
-    return begin, end
-
-
-@kernel(
-    "void(float32[:, ::1], uint8[:, ::1], int64[:, ::1], float32, float32[::1], float32[:, ::1],"
-    " float32[:, ::1])",
-)
+@kernel("void(float32[:, ::1], uint8[:, ::1], float32, float32[::1], float32[:, ::1], float32[:, ::1])")
 def change_strength(
-    blurred: Floats32,
+    change: Floats32,
     inside: Byte,
-    spans: Indices,
     gain: np.float32,
     strongest: Floats32,
     strength: Floats32,
@@ -278,31 +215,25 @@ def change_strength(
 ) -> None:
     """Smooth a change along y, and reduce its channels to one.
 
-    blurred, inside, spans : from `scaled_change`. gain, strongest : a `Response`. strength : (h, w), filled
-    with the length of the change over the channels, so weighed. common : (h, w), filled with their mean. Both
-    0 where nothing counts.
+    change : (h, 3 w), of `scaled_change`. inside : (r, s), not 0 where a block of the window counts. gain,
+    strongest : a `Response`. strength : (h, w), filled with the length of the change over the channels, so
+    weighed. common : (h, w), filled with their mean. Both 0 where nothing counts.
     """
     high, wide = strength.shape
-    side = high // len(inside)
-    smooth = np.empty(3 * wide, np.float32)
+    side, line = high // len(inside), np.empty(3 * wide, np.float32)
     for y in range(high):
-        row = y // side
-        first, count = spans[row, 0], spans[row, 1] - spans[row, 0]
-        above = min(1, high - 1) if y == 0 else y - 1
-        below = max(high - 2, 0) if y == high - 1 else y + 1
-        upper, here, lower = blurred[above, 3 * first :], blurred[y, 3 * first :], blurred[below, 3 * first :]
-        for i in range(3 * count):
-            smooth[i] = (upper[i] + lower[i]) * BESIDE + here[i] * MIDDLE
-        strength[y], common[y] = 0, 0
-        length, tone = strength[y, first:], common[y, first:]
-        for x in range(count):
-            blue, green, red = smooth[3 * x], smooth[3 * x + 1], smooth[3 * x + 2]
+        length, tone, cells = strength[y], common[y], inside[y // side]
+        upper = change[min(1, high - 1) if y == 0 else y - 1]
+        here, lower = change[y], change[max(high - 2, 0) if y == high - 1 else y + 1]
+        for i in range(3 * wide):
+            line[i] = (upper[i] + lower[i]) * BESIDE + here[i] * MIDDLE
+        for x in range(wide):
+            blue, green, red = line[3 * x], line[3 * x + 1], line[3 * x + 2]
             along = blue * strongest[0] + green * strongest[1] + red * strongest[2]
             square = gain * (blue * blue + green * green + red * red) - along * along
             length[x] = np.sqrt(square if square > 0 else np.float32(0))
             tone[x] = (blue + green + red) * np.float32(1 / 3)
-        cells = inside[row, first // side :]
-        for cell in range(count // side):
+        for cell in range(cells.size):
             if not cells[cell]:
                 length[side * cell : side * cell + side] = 0
                 tone[side * cell : side * cell + side] = 0

@@ -108,7 +108,10 @@ def depth_of(region: Region) -> RegionDepth:
     )
     middle, outlines, ends = cv2.minMaxLoc(depth)[1], region.outlines, [(0, 0, 0)]
     corners = np.concatenate(outlines) if len(outlines) > 1 else outlines[0]
-    for outline, length in zip(outlines, region.lengths, strict=True):
+    for outline in outlines:
+        # From one corner to the next, and back to the first, along rows, columns and diagonals.
+        steps = np.abs(np.diff(outline[:, 0], axis=0, append=outline[:1, 0]))
+        length = max(int(steps.max(axis=1).sum()), 1)
         arcs = min(max(round(length / max(middle, 1.0)), FEWEST_ARCS), MOST_ARCS)
         ends.append((ends[-1][0] + len(outline), ends[-1][1] + STEPS * arcs, length))
     return RegionDepth(

@@ -48,21 +48,17 @@ class Region(NamedTuple):
     """A region without holes, and its border.
 
     filled : (h, w) uint8, 0 or 1. outlines : of each part of it, (n, 1, 2) int32, x and y of the pixels where
-    it turns, px. lengths : how many pixels each of them passes.
+    it turns, px.
     """
 
     filled: Mask
     outlines: Sequence[NDArray[np.int32]]
-    lengths: Sequence[int]
 
 
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
     outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    # From one corner to the next, and back to the first, along rows, columns and diagonals.
-    steps = [np.abs(np.diff(outline[:, 0], axis=0, append=outline[:1, 0])) for outline in outlines]
-    lengths = [max(int(step.max(axis=1).sum()), 1) for step in steps]
-    return Region(filled, [np.asarray(outline, np.int32) for outline in outlines], lengths)
+    return Region(filled, outlines)
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:
@@ -140,7 +136,7 @@ def fill_bay(region: Region, faint: Mask) -> Region:
     >>> int(fill_bay(traced(ring), faint).filled.sum())
     81
     """
-    filled, outlines, _ = region
+    filled, outlines = region
     if len(outlines) != 1:
         return region
     bays = np.asarray(cv2.bitwise_xor(_hull(region), filled), np.uint8)

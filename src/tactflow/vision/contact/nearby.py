@@ -35,10 +35,10 @@ def largest_nearby(values: Floats32, part: float = 1.0) -> Floats32:
     # At half the resolution, which is enough for what is smoothed.
     reach = round(part * math.sqrt(count / math.pi) / 2)
     side = 2 * reach + 1
-    half = cv2.resize(smooth, ((wide + 1) // 2, (high + 1) // 2), interpolation=cv2.INTER_AREA)
+    coarse = cv2.resize(smooth, (-(-wide // 2), -(-high // 2)), interpolation=cv2.INTER_AREA)
     # Beyond the window, nothing has changed.
-    padded = cv2.copyMakeBorder(half, *[2 * reach] * 4, cv2.BORDER_CONSTANT, value=(0.0,))
+    padded = cv2.copyMakeBorder(coarse, *[reach] * 4, cv2.BORDER_CONSTANT, value=(0.0,))
     around = cv2.blur(cv2.dilate(padded, np.ones((side, side), np.uint8)), (side, side))
-    around = around[2 * reach :, 2 * reach :][: half.shape[0], : half.shape[1]]
+    around = around[reach:, reach:][: coarse.shape[0], : coarse.shape[1]]
     nearby = cv2.resize(np.maximum(around, np.float32(FAINT * peak)), (wide, high))
     return np.asarray(nearby, np.float32)

@@ -23,15 +23,15 @@ def window_mask(mask: Mask, top: int, left: int, inside: NDArray[np.bool_], side
     array([[0, 1],
            [0, 0]], dtype=uint8)
     """
-    each = 4 // side
-    inside = inside.repeat(each, axis=0).repeat(each, axis=1)
-    seen = (mask[top:, left:][: side * inside.shape[0], : side * inside.shape[1]] != 0).view(np.uint8)
+    high, wide = 4 // side * inside.shape[0], 4 // side * inside.shape[1]
+    seen = np.zeros((side * high, side * wide), np.uint8)
+    part = mask[top:, left:][: side * high, : side * wide]
+    seen[: part.shape[0], : part.shape[1]] = part
     if side == 2:
-        seen = np.pad(seen, [(0, length % 2) for length in seen.shape])
-        seen = seen[::2, ::2] | seen[::2, 1::2] | seen[1::2, ::2] | seen[1::2, 1::2]
-    window = np.zeros(inside.shape, np.uint8)
-    window[: seen.shape[0], : seen.shape[1]] = seen
-    return window & inside
+        seen = seen[::2] | seen[1::2]
+        seen = seen[:, ::2] | seen[:, 1::2]
+    cells = cv2.resize(inside.view(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(np.minimum(seen, cells), np.uint8)
 
 
 def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) -> bool:
@@ -53,6 +53,6 @@ def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) 
     if side == 2:
         level = cv2.resize(level, None, fx=2, fy=2)
     part = mask[top:, left:][: level.shape[0], : level.shape[1]]
-    positive = level[: part.shape[0], : part.shape[1]] > 0
-    part[positive] = 255
-    return bool(positive.any())
+    positive = (level[: part.shape[0], : part.shape[1]] > 0).view(np.uint8)
+    np.maximum(part, positive * np.uint8(255), out=part)
+    return cv2.countNonZero(positive) > 0

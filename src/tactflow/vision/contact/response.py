@@ -12,11 +12,12 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.arrays import Floats, Floats32
+from tactflow.vision.compiled import kernel
 
 LARGEST_GAIN: Final = 2.0
 """By how much a weak answer is raised at most, since noise is raised with it. Chosen by hand; 3 gives the
@@ -66,17 +67,37 @@ def light_response(change: Floats32, inside: NDArray[np.bool_]) -> Response:
     >>> bool(weighed[25, 16] > 0.8 * weighed[16, 25])
     True
     """
-    response = np.empty(4, np.float32)
-    weigh_colours(change, inside.view(np.uint8), response)
-    return Response(response[0], response[1:])
+    moments, colours = np.zeros(6), np.zeros((3, 3))
+    add_moments(change, inside.view(np.uint8), moments, colours)
+    mass, sum_x, sum_y, sum_xx, sum_xy, sum_yy = moments.tolist()
+    if not mass > 0:
+        return EVEN
+    along_x, along_y = sum_xx - sum_x * sum_x / mass, sum_yy - sum_y * sum_y / mass
+    total, spread = along_x + along_y, math.hypot(along_x - along_y, 2 * (sum_xy - sum_x * sum_y / mass))
+    if not LEAST * mass < total + spread < LONG * (total - spread):
+        return EVEN
+    elongation = (total + spread) / (total - spread)
+    _, powers, directions = cv2.eigen(colours)
+    first, second, _ = powers.ravel().tolist()
+    if second * elongation >= first:
+        return EVEN
+    raised = first / max(second * elongation, 1e-6 * first)
+    gain = min(raised, LARGEST_GAIN**2) ** min((LONG - elongation) / (LONG - ROUND), 1.0)
+    # So that the sum over the contact stays as it was.
+    whole = float(powers.sum())
+    scale = whole / (gain * whole - (gain - 1) * first)
+    strongest = directions[0] * math.copysign(math.sqrt((gain - 1) * scale), directions[0, 2])
+    return Response(np.float32(gain * scale), np.asarray(strongest, np.float32))
 
 
-@kernel("void(float32[:, ::1], uint8[:, ::1], float32[::1])")
-def weigh_colours(change: Floats32, inside: NDArray[np.uint8], response: Floats32) -> None:
-    """What `light_response` does; response : (4,), filled with the gain and the strongest colour."""
+@kernel("void(float32[:, ::1], uint8[:, ::1], float64[::1], float64[:, ::1])")
+def add_moments(change: Floats32, inside: NDArray[np.uint8], moments: Floats, colours: Floats) -> None:
+    """Add up, over every second pixel that counts, the places and the channels.
+
+    change, inside : of `light_response`. moments : (6,), sums of the change's length times 1, x, y, x^2, x y,
+    y^2, in two pixels. colours : (3, 3), sums of the products of channels.
+    """
     each, zero = len(change) // (2 * len(inside)), np.float32(0)
-    # Over every second pixel: moments of the change's length, in two pixels, and products of the channels.
-    mass = sum_x = sum_y = sum_xx = sum_xy = sum_yy = np.float64(1e-9)
     bb = bg = br = gg = gr = rr = np.float64(0)
     for y in range(each * len(inside)):
         cells, line = inside[y // each], change[2 * y]
@@ -88,60 +109,13 @@ def weigh_colours(change: Floats32, inside: NDArray[np.uint8], response: Floats3
                     bb, gg, rr = bb + b * b, gg + g * g, rr + r * r
                     bg, br, gr = bg + b * g, br + b * r, gr + g * r
                     length = np.sqrt(b * b + g * g + r * r)
-                    size, size_x, size_xx = (
-                        size + length,
-                        size_x + length * along,
-                        size_xx + length * along * along,
-                    )
-        mass, sum_x, sum_y = mass + size, sum_x + size_x, sum_y + size * y
-        sum_xx, sum_xy, sum_yy = sum_xx + size_xx, sum_xy + size_x * y, sum_yy + size * y * y
-    response[0] = 1
-    response[1] = response[2] = response[3] = 0
-    along_x, along_y = sum_xx - sum_x * sum_x / mass, sum_yy - sum_y * sum_y / mass
-    total, mixed = along_x + along_y, sum_xy - sum_x * sum_y / mass
-    spread = math.sqrt((along_x - along_y) * (along_x - along_y) + 4 * mixed * mixed)
-    if not LEAST * mass < total + spread < LONG * (total - spread):
-        return
-    elongation, whole = (total + spread) / (total - spread), bb + gg + rr
-    first, second, blue, green, red = _principal(bb, bg, br, gg, gr, rr)
-    if second * elongation >= first:
-        return
-    raised = first / max(second * elongation, 1e-6 * first)
-    gain = min(raised, LARGEST_GAIN * LARGEST_GAIN) ** min((LONG - elongation) / (LONG - ROUND), 1.0)
-    scale = whole / (gain * whole - (gain - 1) * first)
-    length = math.sqrt((gain - 1) * scale)
-    response[0] = gain * scale
-    response[1], response[2], response[3] = length * blue, length * green, length * red
-
-
-@helper
-def _principal(
-    bb: float, bg: float, br: float, gg: float, gr: float, rr: float
-) -> tuple[float, float, float, float, float]:
-    """The two largest eigenvalues of a symmetric matrix; and the first's eigenvector, of length 1, red >= 0.
-
-    The matrix is given by what is on its diagonal and above; it is positive semidefinite and not 0.
-
-    References
-    ----------
-    O. K. Smith, "Eigenvalues of a symmetric 3 x 3 matrix", Communications of the ACM 4 (1961).
-    """
-    middle = (bb + gg + rr) / 3
-    b, g, r = bb - middle, gg - middle, rr - middle
-    radius = math.sqrt((b * b + g * g + r * r + 2 * (bg * bg + br * br + gr * gr)) / 6) + 1e-12 * middle
-    half = (b * (g * r - gr * gr) - bg * (bg * r - gr * br) + br * (bg * gr - g * br)) / 2
-    cosine = half / (radius * radius * radius)
-    turn = math.acos(min(max(cosine, -1.0), 1.0)) / 3
-    first, second = 2 * radius * math.cos(turn), 2 * radius * math.cos(turn - 2 * math.pi / 3)
-    # Across two rows of the matrix less the eigenvalue; those that span most tell it best.
-    b, g, r = b - first, g - first, r - first
-    x, y, z = bg * gr - br * g, br * bg - b * gr, b * g - bg * bg
-    square = x * x + y * y + z * z
-    for turned in range(2):
-        u, v, w = g * r - gr * gr, gr * br - bg * r, bg * gr - g * br
-        if turned:
-            u, v, w = bg * r - gr * br, br * br - b * r, b * gr - br * bg
-        if u * u + v * v + w * w > square:
-            x, y, z, square = u, v, w, u * u + v * v + w * w
-    length = math.copysign(math.sqrt(square) + 1e-300, z)
-    return middle + first, middle + second, x / length, y / length, z / length
+                    size, size_x = size + length, size_x + length * along
+                    size_xx += length * along * along
+        moments[0] += size
+        moments[1], moments[2] = moments[1] + size_x, moments[2] + size * y
+        moments[3], moments[4] = moments[3] + size_xx, moments[4] + size_x * y
+        moments[5] += size * y * y
+    colours[0, 0], colours[1, 1], colours[2, 2] = bb, gg, rr
+    colours[0, 1] = colours[1, 0] = bg
+    colours[0, 2] = colours[2, 0] = br
+    colours[1, 2] = colours[2, 1] = gr
