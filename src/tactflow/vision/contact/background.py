@@ -294,8 +294,8 @@ def _cut_by_border(
     """
     each, pixels = len(change) // len(inside), change.reshape(len(change), -1, 3)
     enough = CUT * cv2.norm(change, cv2.NORM_INF)
-    ends = (rows.start == 0, 0, 0), (rows.stop == shape[0], 0, -1)
-    ends += (columns.start == 0, 1, 0), (columns.stop == shape[1], 1, -1)
+    ends = [(rows.start == 0, 0, 0), (rows.stop == shape[0], 0, -1)]
+    ends += [(columns.start == 0, 1, 0), (columns.stop == shape[1], 1, -1)]
     for reached, axis, end in ends:
         line = np.abs(pixels.take(end, axis)).max(axis=1)
         if reached and line[inside.take(end, axis).repeat(each)].max(initial=0) > enough:

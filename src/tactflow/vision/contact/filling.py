@@ -58,7 +58,7 @@ class Region(NamedTuple):
 def traced(filled: Mask) -> Region:
     """The region of a mask without holes, (h, w) uint8, 0 or 1."""
     outlines, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return Region(filled, outlines)
+    return Region(filled, [np.asarray(outline, np.int32) for outline in outlines])
 
 
 def enclosed(mask: Mask, hidden: Hidden | None = None) -> Region:

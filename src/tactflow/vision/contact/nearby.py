@@ -37,7 +37,7 @@ def largest_nearby(values: Floats32, part: float = 1.0) -> Floats32:
     side = 2 * reach + 1
     coarse = cv2.resize(smooth, (-(-wide // 2), -(-high // 2)), interpolation=cv2.INTER_AREA)
     # Beyond the window, nothing has changed.
-    padded = cv2.copyMakeBorder(coarse, *[reach] * 4, cv2.BORDER_CONSTANT, value=(0.0,))
+    padded = np.pad(coarse, reach)
     around = cv2.blur(cv2.dilate(padded, np.ones((side, side), np.uint8)), (side, side))
     around = around[reach:, reach:][: coarse.shape[0], : coarse.shape[1]]
     nearby = cv2.resize(np.maximum(around, np.float32(FAINT * peak)), (wide, high))

@@ -51,7 +51,7 @@ def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) 
            [255, 255,   0,   0]], dtype=uint8)
     """
     if side == 2:
-        level = cv2.resize(level, None, fx=2, fy=2)
+        level = np.asarray(cv2.resize(level, None, fx=2, fy=2), np.float32)
     part = mask[top:, left:][: level.shape[0], : level.shape[1]]
     positive = (level[: part.shape[0], : part.shape[1]] > 0).view(np.uint8)
     np.maximum(part, positive * np.uint8(255), out=part)
