@@ -365,8 +365,10 @@ def test_mypy_is_content_with_a_users_program(tmp_path: Path) -> None:
     (tmp_path / "bright.py").write_text(readme[1])
     (tmp_path / "wrong.py").write_text('import tactflow\n\ntactflow.stage("hull").proces\n')
     files = ("script.py", "bright.py", "wrong.py")
+    # What it has learned of the packages is kept for the next time.
+    cache = ("--cache-dir", str(REPOSITORY / ".mypy_cache" / "users"))
     done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", *files],
+        [*(sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent"), *cache, *files],
         cwd=tmp_path,
         env=os.environ | {"MYPYPATH": str(REPOSITORY / "src")},
         capture_output=True,
