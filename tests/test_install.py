@@ -53,7 +53,10 @@ def modules() -> set[str]:
 @pytest.mark.timeout(3600)
 def test_the_wheel_runs_in_a_fresh_environment_and_compiles_nothing_after_warmup(tmp_path: Path) -> None:
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input", "--quiet")
-    command(*pip, "wheel", "--no-deps", "--wheel-dir", tmp_path, REPOSITORY, cwd=tmp_path)
+    command(
+        *(*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", tmp_path, REPOSITORY),
+        cwd=tmp_path,
+    )
     (wheel,) = tmp_path.glob("tactflow-*.whl")
     assert modules() <= set(zipfile.ZipFile(wheel).namelist())
     venv.create(tmp_path / "venv")
