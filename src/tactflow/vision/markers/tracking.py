@@ -33,22 +33,8 @@ MOST_GAIN: Final = np.float32(3.0)
 LEAST_R_SQUARED: Final = np.float32(0.5)
 """Fraction of its contrast that the template of a mark that is seen explains, at least. Chosen by hand."""
 
-STEEP_STRAIN: Final = 0.4
-"""Strain of a link below which it is beyond doubt. Chosen by hand."""
-
-STRAIN_MARGIN: Final = 0.15
-"""What a strain has to grow beyond what the last search has left before it calls for another. Chosen by
-hand."""
-
-MOST_STRAIN: Final = 0.7
-"""Strain of a link that always calls for a search. Chosen by hand."""
-
-LONGEST_STEP: Final = 0.8
-"""Step since the last frame of a mark that is found without a search, at most, in its radii. Chosen by
-hand."""
-
-RESTLESS_STEP: Final = 0.1
-"""Step that calls for a search at once where a mark is missing, pitches. Chosen by hand."""
+STEEP_STRAIN: Final = 0.7
+"""Strain of a link that calls for a search. Chosen by hand."""
 
 SEARCH_INTERVAL: Final = 10
 """Frames between two searches for marks that stay missing. Chosen by hand."""
@@ -72,21 +58,8 @@ WHOLE: Final = 0.95
 SPOT_STRENGTH: Final = 0.25
 """Strength of a spot that may be a mark, against a typical one. Chosen by hand."""
 
-JUMP_STRENGTH: Final = 0.4
-"""Strength of a spot that votes for a jump of the whole grid, against a typical one. Chosen by hand."""
-
 SAME_SPOT: Final = 0.3
 """Distance within which a mark is at a spot, pitches. Chosen by hand."""
-
-SHARP_STEP: Final = 0.6
-"""Distance from a spot, in radii, and 0.5 px more, within which alignment is trusted. Chosen by hand."""
-
-SPOT_STDERR: Final = 0.15
-"""Standard error of a mark whose spot is all that is known of it, in radii. Chosen by hand."""
-
-SURE, INCOMPLETE, DOUBTFUL = 0, 1, 2
-"""What `check_marks` says of a frame: nothing is missing or strained; something is, but nothing moves; a mark
-may have been missed or mistaken."""
 
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 _INFERRED: Final = np.uint8(MarkerStatus.INFERRED)
@@ -179,7 +152,6 @@ class MarkerTracker:
         """Forget what was tracked; the reference stays."""
         self._position = self._origin.copy()
         self._seen = np.ones(self._count, bool)
-        self._steepest = np.full(len(self._graph.edges), STEEP_STRAIN)
         self._age = 0
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
@@ -197,16 +169,13 @@ class MarkerTracker:
         seen, strain, doubt = self._check(found)
         self._age += 1
         # Where something stays missing, look again now and then.
-        if doubt == DOUBTFUL or (doubt == INCOMPLETE and self._age >= SEARCH_INTERVAL):
+        if doubt or (self._age >= SEARCH_INTERVAL and not seen.all()):
             position, seen, stderr = self._search(image, found, seen, strain)
-            # What this search has left strained is no reason for another, within bounds.
-            left = self._graph.strain(position) + STRAIN_MARGIN
-            self._steepest = np.minimum(np.maximum(STEEP_STRAIN, left), MOST_STRAIN)
             self._age = 0
         # All tracked, which is 0; `np.full` takes three times as long.
         status = np.zeros(self._count, np.uint8)
         errors = stderr.astype(np.float64)
-        if doubt and not seen.all():
+        if not seen.all():
             errors[~seen] = np.nan
             status[~seen] = _LOST
             status[self._infer(position, seen)] = _INFERRED
@@ -214,34 +183,20 @@ class MarkerTracker:
         probability = None if self._probability is None else self._probability.copy()
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
 
-    def _check(self, found: Alignment) -> tuple[Flags, Floats, int]:
+    def _check(self, found: Alignment) -> tuple[Flags, Floats, bool]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
         may have missed or mistaken one."""
         seen, strain = np.empty(self._count, np.bool_), np.empty(len(self._graph.edges))
-        doubt = check_marks(
-            found.position,
-            self._position,
-            self._origin,
-            found.gain,
-            found.r_squared,
-            self._graph.edges,
-            self._graph.length,
-            self._steepest,
-            self._seen,
-            LONGEST_STEP * self._radius,
-            RESTLESS_STEP * self._pitch,
-            seen,
-            strain,
-        )
-        return seen, strain, doubt
+        edges, length = self._graph.edges, self._graph.length
+        fit = found.position, self._origin, found.gain, found.r_squared
+        return seen, strain, check_marks(*fit, edges, length, self._seen, seen, strain)
 
     def _search(self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats) -> _Result:
         """Joint choice among the spots, for marks outside the largest smooth component."""
         jumped = self._jumps(image, seen)
         if jumped is not None:
             found = self._templates.align(image, jumped)
-            short = _lengths(found.position - jumped) < LONGEST_STEP * self._radius
-            seen = trusted(found.gain, found.r_squared) & short
+            seen = trusted(found.gain, found.r_squared)
             strain = self._graph.strain(found.position)
         inliers = self._graph.largest_component(seen, strain)
         free = np.flatnonzero(~inliers)
@@ -259,7 +214,11 @@ class MarkerTracker:
         )  # fmt: skip
         result = _Result(found.position.copy(), inliers.copy(), found.stderr.copy())
         given = chosen >= 0
-        self._take(image, free[given], spots[chosen[given]], result)
+        taken = free[given]
+        if len(taken):
+            aligned = self._templates.align(image, spots[chosen[given]], taken)
+            result.position[taken], result.stderr[taken] = aligned.position, aligned.stderr
+            result.found[taken] = trusted(aligned.gain, aligned.r_squared)
         return result
 
     def _jumps(self, image: NDArray[np.uint8], seen: Flags) -> Floats | None:
@@ -277,7 +236,7 @@ class MarkerTracker:
             elif np.count_nonzero((border & seen)[grid]) < BORDER_SEEN * np.count_nonzero(border[grid]):
                 if spots is None:
                     corner = np.array(self._shape[::-1], float)
-                    spots, _ = self._spots.find(image, JUMP_STRENGTH, np.zeros(2), corner)
+                    spots, _ = self._spots.find(image, SPOT_STRENGTH, np.zeros(2), corner)
                 start = self._position[grid]
                 jump = common_displacement(start, spots, pitch=self._pitch, farthest=self._farthest)
                 if jump is not None:
@@ -309,18 +268,6 @@ class MarkerTracker:
         spots, strength = np.concatenate([spots, found.position[own]]), np.append(strength, found.gain[own])
         free = _are_apart(spots, found.position[inliers], SAME_SPOT * self._pitch)
         return spots[free], strength[free]
-
-    def _take(self, image: NDArray[np.uint8], marks: Indices, spots: Floats, result: _Result) -> None:
-        """Align marks from their spots and enter what is found."""
-        if len(marks) == 0:
-            return
-        measured, gain, r_squared, error = self._templates.align(image, spots, marks)
-        near = _lengths(measured - spots) < SHARP_STEP * self._radius + 0.5
-        sharp = trusted(gain, r_squared) & near
-        # A spot that looks like the mark only from afar is still its place, to a part of its radius.
-        result.position[marks] = np.where(sharp[:, None], measured, spots)
-        result.stderr[marks] = np.where(sharp, error, SPOT_STDERR * self._radius)
-        result.found[marks] = trusted(gain, r_squared)
 
     def _infer(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that were not found, in place, and return those; others stay where they were."""
@@ -361,47 +308,30 @@ def trusted(gain: Any, r_squared: Any) -> Any:
 
 
 @kernel(
-    "int64(float64[:, ::1], float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1],"
-    "float64[::1], float64[::1], boolean[::1], float64, float64, boolean[::1], float64[::1])"
+    "boolean(float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1], float64[::1],"
+    "boolean[::1], boolean[::1], float64[::1])"
 )
 def check_marks(
     position: Floats,
-    before: Floats,
     origin: Floats,
     gain: NDArray[np.float32],
     r_squared: NDArray[np.float32],
     edges: Indices,
     length: Floats,
-    steepest: Floats,
     seen_before: Flags,
-    longest: float,
-    restless: float,
     seen: Flags,
     strain: Floats,
-) -> int:
-    """Fill `seen`, (N,), and `strain`, (E,), of each link; returns SURE, INCOMPLETE or DOUBTFUL.
-
-    longest : step of a mark that is seen, px. restless : step that calls for a search where something is
-    missing, px. steepest : (E,), strain of each link beyond which there is doubt.
-    """
-    missing = lost = rough = False
-    farthest = most = 0.0
+) -> bool:
+    """Fill `seen`, (N,), and `strain`, (E,), of each link; returns whether a mark was lost or a link between
+    marks that are seen is too steep."""
+    doubt = False
     for n in range(len(position)):
-        move_x, move_y = position[n, 0] - before[n, 0], position[n, 1] - before[n, 1]
-        move = np.sqrt(move_x * move_x + move_y * move_y)
-        fits = gain[n] > LEAST_GAIN and gain[n] < MOST_GAIN and r_squared[n] > LEAST_R_SQUARED
-        seen[n] = fits and move < longest
-        missing, lost = missing or not seen[n], lost or (seen_before[n] and not seen[n])
-        farthest = max(farthest, move if seen[n] else 0.0)
+        seen[n] = gain[n] > LEAST_GAIN and gain[n] < MOST_GAIN and r_squared[n] > LEAST_R_SQUARED
+        doubt = doubt or (seen_before[n] and not seen[n])
     for e in range(len(edges)):
         one, other = edges[e, 0], edges[e, 1]
         x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
         y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
         strain[e] = np.sqrt(x * x + y * y) / length[e]
-        most = max(most, strain[e])
-        rough = rough or (strain[e] > steepest[e] and seen[one] and seen[other])
-    if lost or rough:
-        return DOUBTFUL
-    if not missing and most < STEEP_STRAIN:
-        return SURE
-    return DOUBTFUL if farthest > restless else INCOMPLETE
+        doubt = doubt or (strain[e] > STEEP_STRAIN and seen[one] and seen[other])
+    return doubt
