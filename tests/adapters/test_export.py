@@ -20,7 +20,7 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import Result
 from tactflow.sources import open_source
-from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
+from tactflow.vision.types import Contact, Depth, Flow, Force, Pose, Scale
 from tests.adapters.lerobot_env import needs_datasets, run_with_lerobot
 from tests.messages import Results, result_of
 
@@ -76,6 +76,11 @@ def test_statistics_are_those_of_the_numbers(dataset: Path) -> None:
     assert np.shape(stats[KEY]["mean"]) == (3, 1, 1)
 
 
+POSE_NAMES = ["known", "x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg"]
+POSE = Pose("tracked", 0, (0.0, 0.0, 0.0), (0.1, 0.2, -0.3), (0.0, 5.0, -10.0), np.eye(6))
+LOST = replace(POSE, status="lost")
+
+
 def touched(scale: Scale | None, depth: Depth | None = None, force: Force | None = None) -> Result:
     """A frame with a contact whose centre is 10 px right of the middle, 5 px below it."""
     contact = Contact(400.0, (41.5, 28.5), 90.0, None, np.zeros((0, 2)), None)
@@ -89,8 +94,8 @@ def test_a_calibrated_recording_has_millimetres_and_newtons(tmp_path: Path) -> N
     scale = Scale(0.1, 0.2, (0.001, 0.001), (31.5, 23.5))
     depth = Depth(np.zeros((48, 64), np.float32), 0.75, None, 3.5, None)
     results = [
-        touched(scale, depth, Force((0.5, -0.25, 2.5), (0.1, 0.1, 0.1), in_range=True)),
-        touched(scale, depth, Force((None, None, 4.5), (None, None, 0.1), in_range=False)),
+        touched(scale, depth, Force((0.5, -0.25, 2.5), (0.1, 0.1, 0.1), in_range=True)).replace(pose=POSE),
+        touched(scale, depth, Force((None, None, 4.5), (None, None, 0.1), in_range=False)).replace(pose=LOST),
         touched(scale),
         touched(scale).replace(contact=None, flow=None),
     ]
@@ -111,6 +116,7 @@ def test_a_calibrated_recording_has_millimetres_and_newtons(tmp_path: Path) -> N
         ("depth", ["known", "depth_mm", "volume_mm3"], [[1, 0.75, 3.5]] * 2 + [[0, 0, 0]] * 2),
         ("force", ["known", "z_N", "in_range"], [[1, 2.5, 1], [1, 4.5, 0], [0, 0, 0], [0, 0, 0]]),
         ("drag", ["known", "x_N", "y_N"], [[1, 0.5, -0.25]] + [[0, 0, 0]] * 3),
+        ("pose", POSE_NAMES, [[1, 0.1, 0.2, -0.3, 0, 5, -10]] + [[0] * 7] * 3),
     ):
         feature = f"observation.tactile.{name}"
         assert np.allclose(table[feature], values), name

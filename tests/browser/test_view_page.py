@@ -444,6 +444,13 @@ def calibrated(number: int, *, slipping: bool = False, height: float = 0.5, in_r
     message["flow"] |= {"stderr": [0.3, 0.4], "mean_mm": [0.4, -0.2], "mean_mm_stderr": [0.03, 0.04]}
     message["slip"] = {"slipping": slipping, "stick_ratio": 0.0 if slipping else 0.8}
     message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": in_range}
+    message["pose"] = {
+        "status": "tracked",
+        "since": 1,
+        "center": [0.1, -0.2, -0.4],
+        "translation": [0.3, 0, 0.4],
+    }
+    message["pose"] |= {"rotation": [0, 3, 4], "stderr": [0.01, 0.02, 0.01, 0.2, 0.3, 57.0]}
     y, x = np.mgrid[-1:1:16j, -1:1:20j]
     heights = np.rint(np.maximum(0, 1 - x**2 - y**2) * 65535).astype("<u2").tobytes()
     surface = {"box": [20, 10, 20, 16], "size": [20, 16], "step": height / 65535, "bytes": len(heights)}
@@ -536,7 +543,15 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
     stage = staged(hello("main"), state("main"), frame("main", 1, 120, contact=True, directed=True))
     page = open_page(stage.url)
     watch(page)
-    for absent in ("unit", "layer-field", "layer-surface", "tile-depth", "tile-force", "tile-slip"):
+    for absent in (
+        "unit",
+        "layer-field",
+        "layer-surface",
+        "tile-depth",
+        "tile-force",
+        "tile-slip",
+        "tile-pose",
+    ):
         assert page.is_hidden(f"#{absent}"), absent
     page.keyboard.press("u")
     assert page.inner_text("#value-area") == "300"
@@ -544,6 +559,8 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
     until(page, "() => document.getElementById('unit-area').textContent === 'mm² at 0.1, −0.2 mm'")
     texts = {name: page.inner_text(f"#value-{name}") for name in ("area", "flow", "depth", "force", "slip")}
     assert texts == {"area": "3.00", "flow": "0.447", "depth": "0.500", "force": "2.50", "slip": "holds"}
+    assert page.inner_text("#value-pose") == "0.50"
+    assert page.inner_text("#unit-pose") == "mm ± 0.02, turned 5.0 ± 57.0°"
     assert page.inner_text("#unit-flow").startswith("mm ± 0.032, 3 markers")
     assert page.inner_text("#unit-force") == "N ± 0.20"
     stage.send(calibrated(3, height=0.4, in_range=False))

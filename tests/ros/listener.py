@@ -37,6 +37,7 @@ TOPICS = {
     "markers": PointCloud2,
     "markers_pixels": PointCloud2,
     "wrench": WrenchStamped,
+    "object_pose": PoseStamped,
     "depth": Image,
     "image/compressed": CompressedImage,
     "/tactile": Point,
@@ -113,6 +114,11 @@ def main() -> None:
             from tactflow_ros.messages import stamp, transform
 
             tell(transform=plain(transform("gel", "finger", *order["place"], stamp(1.7e9 + 0.125))))
+        elif order["do"] == "object":
+            from tactflow_ros.messages import header, object_transform
+
+            found = object_transform(order["message"], header(order["message"], "gel"), "object")
+            tell(transform=plain(found))
         elif order["do"] == "configure":
             configure(order["parameters"])
     rclpy.shutdown()

@@ -16,7 +16,7 @@ import pytest
 from tactflow.engine.frame import Frame, Tick
 from tactflow.network.keys import make_keys
 from tactflow.sinks.zmq import Zmq
-from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Scale, Slip
+from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Pose, Scale, Slip
 from tests.clock import PATIENCE, until
 from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
@@ -41,6 +41,7 @@ RESULTS = Results(
     Depth(HEIGHTS, 1.0, None, 3.0, None),
     slip=Slip(True, 0.0),
     force=Force((None, None, 2.5), (None, None, 0.2), True),
+    pose=Pose("tracked", 0, (1.0, 2.0, -0.5), (0.5, 0.0, 0.25), (0.0, 0.0, 90.0), np.eye(6)),
 )
 T = 12.123456789
 """Capture time of the first frame, s: a recording's."""
@@ -174,6 +175,9 @@ def test_touch_slip_force_depth_and_picture_arrive(pair: Pair) -> None:
     force = pair.receive("wrench")["wrench"]["force"]
     assert math.isnan(force["x"])
     assert force["z"] == -2.5
+    pose = pair.receive("object_pose")["pose"]
+    assert list(pose["position"].values()) == pytest.approx([1.5e-3, 2e-3, -0.25e-3])
+    assert list(pose["orientation"].values()) == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
     tactile = pair.receive("/tactile")
     assert (tactile["x"], tactile["y"], tactile["z"]) == (1.5, -2.0, -0.577)
     depth = pair.receive("depth")
@@ -280,6 +284,7 @@ def test_a_subscriber_that_asks_for_more_is_told_why_it_receives_nothing(pair: P
     [
         ({"reliability": "perhaps"}, "configured", "required best_effort or reliable, got 'perhaps'"),
         ({"parent_frame": "finger"}, "configured", "parent_frame needs tf2_msgs"),
+        ({"object_frame": "object"}, "configured", "object_frame needs tf2_msgs"),
         ({"parent_frame": "finger", "rotation": [0.0] * 4}, "configured", "required a quaternion x, y, z, w"),
         ({"parent_frame": "finger", "translation": [1.0]}, "configured", "required 3 finite numbers"),
         ({"endpoint": "nowhere"}, "activated", "required an address such as tcp://127.0.0.1:5556"),
@@ -327,6 +332,18 @@ def test_the_transform_says_where_the_sensor_is(pair: Pair) -> None:
     assert told["child_frame_id"] == "gel"
     assert told["transform"]["translation"] == {"x": 0.1, "y": 0.2, "z": 0.3}
     assert told["transform"]["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+
+
+@needs_rclpy
+def test_the_transform_of_an_object_is_its_pose_and_none_while_it_is_lost(pair: Pair) -> None:
+    pose = {"status": "tracked", "center": [1, 2, -0.5], "translation": [0.5, 0, 0], "rotation": [0, 0, 0]}
+    pair.listener.order(do="object", message={"t": 2.0, "pose": pose})
+    told = pair.listener.told(lambda told: "transform" in told)["transform"]
+    assert (told["header"]["frame_id"], told["child_frame_id"]) == ("gel", "object")
+    assert list(told["transform"]["translation"].values()) == pytest.approx([1.5e-3, 2e-3, -0.5e-3])
+    assert told["transform"]["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    pair.listener.order(do="object", message={"t": 2.0, "pose": pose | {"status": "lost"}})
+    assert pair.listener.told(lambda told: "transform" in told)["transform"] is None
 
 
 @needs_rclpy

@@ -50,6 +50,7 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "parent_frame": ("", "parent of frame_id; empty for no transform"),
     "translation": ([0.0, 0.0, 0.0], "of frame_id in parent_frame: x, y, z, m"),
     "rotation": ([0.0, 0.0, 0.0, 1.0], "quaternion x, y, z, w"),
+    "object_frame": ("", "frame of the object on /tf, a child of frame_id; empty for no transform"),
     "reliability": ("best_effort", "of the topics: best_effort or reliable"),
     "timeout": (2.0, "time without a message before /diagnostics reports it, s"),
     "tactile": (False, "also publish /tactile: mean flow x, y in pixels, and slope"),
@@ -71,12 +72,22 @@ UNITLESS = {
     "touching": Bool,
     "slipping": Bool,
     "wrench": WrenchStamped,
+    "object_pose": PoseStamped,
     "depth": Image,
     "image/compressed": CompressedImage,
 }
 """Topic -> type, for topics in a single unit."""
 ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
 """Message sent by tactflow only on subscription -> topic."""
+
+
+def _tf_message(parameter: str) -> Any:
+    """`TFMessage`. Raises ImportError, saying what to install for a parameter."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        raise ImportError(f"{parameter} needs tf2_msgs: apt install ros-$ROS_DISTRO-tf2-msgs") from None
+    return TFMessage
 
 
 class Counts:
@@ -213,6 +224,8 @@ class Bridge(LifecycleNode):
             self._topics["/tactile"] = self._publisher(Point, "/tactile", qos)
         if self.value("publish_clock"):
             self._topics["/clock"] = self._publisher(Clock, "/clock", qos)
+        if self.value("object_frame"):
+            self._topics["/tf"] = self._publisher(_tf_message("object_frame"), "/tf", QoSProfile(depth=DEPTH))
         self._topics["/diagnostics"] = self.create_publisher(DiagnosticArray, "/diagnostics", DEPTH)
 
     def _publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
@@ -234,13 +247,10 @@ class Bridge(LifecycleNode):
             self.value("rotation"),
             self.get_clock().now().to_msg(),
         )
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError:
-            raise ImportError("parent_frame needs tf2_msgs: apt install ros-$ROS_DISTRO-tf2-msgs") from None
+        kind = _tf_message("parent_frame")
         qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-        self._topics["/tf_static"] = self.create_publisher(TFMessage, "/tf_static", qos)
-        self._topics["/tf_static"].publish(TFMessage(transforms=[place]))
+        self._topics["/tf_static"] = self.create_publisher(kind, "/tf_static", qos)
+        self._topics["/tf_static"].publish(kind(transforms=[place]))
 
     # -- messages -----------------------------------------------------------------------------------------
 
@@ -267,7 +277,13 @@ class Bridge(LifecycleNode):
             for name, (_, make) in GEOMETRY.items():
                 self._offer(name + unit.suffix, lambda make=make, unit=unit: make(message, head, unit))
         self._offer("wrench", lambda: messages.wrench(message, head))
+        self._offer("object_pose", lambda: messages.object_pose(message, head))
+        self._offer("/tf", lambda: self._object_transform(message, head))
         self._offer("/tactile", lambda: messages.tactile(message))
+
+    def _object_transform(self, message: messages.Message, head: Any) -> Any:
+        place = messages.object_transform(message, head, self.value("object_frame"))
+        return None if place is None else _tf_message("object_frame")(transforms=[place])
 
     def _offer(self, topic: str, make: Callable[[], Any]) -> None:
         """Create and publish a message, unless the topic has no subscribers or there is nothing to

@@ -121,6 +121,35 @@ def pose(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
     return result
 
 
+def object_pose(message: Message, head: Header) -> PoseStamped | None:
+    """The object that touches the gel; its axes were those of the frame when it was touched. None if lost."""
+    found = message.get("pose")
+    if found is None or found["status"] != "tracked":
+        return None
+    result = PoseStamped(header=head)
+    place, turn = result.pose.position, result.pose.orientation
+    moved = zip(found["center"], found["translation"], strict=True)
+    place.x, place.y, place.z = ((start + way) * MM for start, way in moved)
+    angle = math.radians(math.hypot(*found["rotation"]))
+    # The sine of half of the angle over the angle in degrees, which has a limit at 0.
+    part = math.sin(angle / 2) / math.degrees(angle) if angle else math.radians(0.5)
+    turn.x, turn.y, turn.z = (part * axis for axis in found["rotation"])
+    turn.w = math.cos(angle / 2)
+    return result
+
+
+def object_transform(message: Message, head: Header, child: str) -> TransformStamped | None:
+    """The same as `object_pose` for /tf. child : frame of the object."""
+    found = object_pose(message, head)
+    if found is None:
+        return None
+    result = TransformStamped(header=head, child_frame_id=child)
+    result.transform.rotation = found.pose.orientation
+    to, place = result.transform.translation, found.pose.position
+    to.x, to.y, to.z = place.x, place.y, place.z
+    return result
+
+
 def flow(message: Message, head: Header, unit: Unit) -> Vector3Stamped | None:
     """Mean displacement of the gel in contact."""
     mean = message["flow"] and message["flow"]["mean"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from pydantic import Field, model_validator
@@ -39,7 +40,8 @@ class _ServerLog(logging.Handler):
 
 
 class Foxglove(Sink):
-    """Serves the channels of a recording live: `/main/image`, `/main/annotations`, `/main/results`.
+    """Serves the channels of a recording live: `/main/image`, `/main/annotations`, `/main/results`, and
+    `/main/pose`, the pose of the object for the 3D panel, in metres.
 
     In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. Channels that nobody looks at
     are not encoded, and a slow viewer loses messages; the run never waits.
@@ -98,12 +100,13 @@ class Foxglove(Sink):
         if problem is not None:
             raise StageError(problem)
         import foxglove
+        from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
-        from tactflow.recording.schemas import channel_types
+        from tactflow.recording.schemas import channel_type, channel_types
 
         # Kept, as channels end with it.
         self._context = context = foxglove.Context()
-        for name, kind in channel_types().items():
+        for name, kind in (channel_types() | {"pose": channel_type(PoseInFrame)}).items():
             encoding, data = kind.schema
             schema = foxglove.Schema(name=kind.name, encoding=encoding, data=data)
             topic = f"/{self._sensor}/{name}"
@@ -141,14 +144,16 @@ class Foxglove(Sink):
 
         time = nanoseconds(result.frame.t)
         image = result.frame.image if result.image is None else result.image
-        encoders = {
+        encoders: dict[str, Callable[[], bytes | None]] = {
             "image": lambda: encode_picture(encode_jpeg(image, self.params.quality), self._sensor, time),
             "annotations": lambda: encode_annotations(result, time),
             "results": lambda: encode_message(result, detail=True),
+            "pose": lambda: _encode_pose(result, self._sensor, time),
         }
         for name, channel in self._channels.items():
-            if channel.has_sinks():
-                channel.log(encoders[name](), log_time=time)
+            message = encoders[name]() if channel.has_sinks() else None
+            if message is not None:
+                channel.log(message, log_time=time)
                 self._sent += 1
 
     def close(self) -> None:
@@ -161,3 +166,24 @@ class Foxglove(Sink):
         self._channels = {}
         self._context = None
         logging.getLogger("foxglove").removeHandler(self._log)
+
+
+def _encode_pose(result: Result, sensor: str, nanoseconds: int) -> bytes | None:
+    """One `foxglove.PoseInFrame`, m; None where no object is tracked."""
+    pose = result.pose
+    if pose is None or pose.status == "lost":
+        return None
+    from foxglove_schemas_protobuf.Pose_pb2 import Pose
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+    from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+    from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+    from scipy.spatial.transform import Rotation
+
+    from tactflow.recording.frames import timestamp
+
+    moved = zip(pose.center, pose.translation, strict=True)
+    x, y, z = ((start + way) / 1000 for start, way in moved)
+    qx, qy, qz, qw = Rotation.from_rotvec(pose.rotation, degrees=True).as_quat().tolist()
+    place = Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    whole = PoseInFrame(timestamp=timestamp(nanoseconds), frame_id=sensor, pose=place)
+    return bytes(whole.SerializeToString())

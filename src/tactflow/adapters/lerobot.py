@@ -47,6 +47,7 @@ NAMES = {
     "depth": ["known", "depth_mm", "volume_mm3"],
     "force": ["known", "z_N", "in_range"],
     "drag": ["known", "x_N", "y_N"],
+    "pose": ["known", "x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg"],
 }
 """Features and the names of their numbers: the first two in px, the others only with a calibration, whatever
 parts it has. All numbers are 0 where the first is 0."""
@@ -408,6 +409,8 @@ def _numbers(result: Result) -> dict[str, Sequence[float] | None]:
         x, y, z = force.value
         found["force"] = [z, force.in_range]
         found["drag"] = None if x is None or y is None else [x, y]
+    if result.pose is not None and result.pose.status == "tracked":
+        found["pose"] = [*result.pose.translation, *result.pose.rotation]
     return found
 
 

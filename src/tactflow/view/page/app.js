@@ -9,7 +9,7 @@ const $ = (id) => document.getElementById(id);
 const STALL_SECONDS = 2;
 // Magnifications of arrows and of the surface.
 const FACTORS = [1, 3, 5, 10];
-const PLOTS = ["area", "angle", "flow", "latency", "depth", "force", "slip"].map((name) => `plot-${name}`);
+const PLOTS = ["area", "angle", "flow", "latency", "depth", "force", "slip", "pose"].map((name) => `plot-${name}`);
 const CANVASES = ["picture", "surface", ...PLOTS];
 const COLOURS = ["tracked", "inferred", "lost", "field", "hull", "axis", "ellipse", "mean", "series-a", "series-b", "series-c", "grid", "quiet", "panel", "well"];
 const LAYERS = [
@@ -23,7 +23,7 @@ const LAYERS = [
   { id: "surface", label: "Surface", key: "8", colour: `linear-gradient(90deg, ${RAMP})`, off: true, offer: "surface" },
 ];
 // Optional tiles and buttons, and the part of a frame that they need.
-const OFFERED = { "tile-guide": "guide", unit: "scale", "layer-field": "field", "layer-surface": "surface", "tile-depth": "surface", "tile-force": "force", "tile-slip": "slip" };
+const OFFERED = { "tile-guide": "guide", unit: "scale", "layer-field": "field", "layer-surface": "surface", "tile-depth": "surface", "tile-force": "force", "tile-slip": "slip", "tile-pose": "pose" };
 
 const sensors = new Map();
 const layers = Object.fromEntries(LAYERS.map((layer) => [layer.id, !layer.off]));
@@ -128,7 +128,7 @@ function drawValues(s) {
   const message = s?.last;
   put(document.body.dataset, "asks", String(Boolean(message?.guide?.choices)));
   drawOffers(message?.offers ?? []);
-  for (const name of ["area", "angle", "flow", "depth", "force", "slip"]) {
+  for (const name of ["area", "angle", "flow", "depth", "force", "slip", "pose"]) {
     const [value, rest] = message ? words[name](message, unit()) : ["–", ""];
     set(`value-${name}`, value);
     set(`unit-${name}`, rest);

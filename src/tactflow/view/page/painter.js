@@ -49,6 +49,7 @@ const orders = {
       plot("plot-depth", { series: [(p) => p.depth], range: "positive", minimum: 0.1 }),
       plot("plot-force", { series: [0, 1, 2].map((axis) => (p) => p.force[axis]), range: "signed", minimum: 0.1 }),
       plot("plot-slip", { series: [(p) => p.stick], range: [0, 1] }),
+      plot("plot-pose", { series: [0, 1, 2].map((axis) => (p) => p.pose[axis]), range: "signed", minimum: 0.1 }),
     ]);
     tell("turns", { turns: surface.turns });
     orders.hide({ hidden });
@@ -147,7 +148,7 @@ async function frame(header, blob, heights) {
 
 function addFrame(s, header, heights) {
   const { message } = header;
-  const { contact, flow, force, slip } = message;
+  const { contact, flow, force, slip, pose } = message;
   const last = s.points[s.points.length - 1];
   if (last && message.t < last.t) s.points.length = 0;
   s.points.push({
@@ -159,11 +160,12 @@ function addFrame(s, header, heights) {
     depth: contact?.depth_mm ?? null,
     force: force?.value ?? [null, null, null],
     stick: slip?.stick_ratio ?? null,
+    pose: pose?.translation ?? [null, null, null],
   });
   const first = s.points.findIndex((point) => point.t >= message.t - SECONDS);
   if (first > 0) s.points.splice(0, first);
   if (s.header && header.epoch !== s.header.epoch) tell("note", { text: `new reference taken at frame ${message.seq}` });
-  const available = { scale: header.scale, field: header.field, surface: header.surface, guide: header.guide, force, slip };
+  const available = { scale: header.scale, field: header.field, surface: header.surface, guide: header.guide, force, slip, pose };
   for (const [name, value] of Object.entries(available)) if (value) s.offers.add(name);
   Object.assign(s, { header, heights });
   const now = performance.now();
@@ -190,12 +192,12 @@ function summarise(s) {
   clearTimeout(s.timer);
   s.timer = 0;
   s.summarised = performance.now();
-  const { message: { seq, t, size, contact, flow, force, slip }, markers, latency_ms, guide } = s.header;
+  const { message: { seq, t, size, contact, flow, force, slip, pose }, markers, latency_ms, guide } = s.header;
   const count = (letter) => markers.status.split(letter).length - 1;
   tell("frames", {
     sensor: s.name,
     summary: {
-      seq, t, flow, force, slip, guide,
+      seq, t, flow, force, slip, pose, guide,
       counts: markers && { tracked: count("t"), inferred: count("i"), lost: count("l") },
       aspect: size[0] / size[1],
       contact: contact && { ...contact, hull: undefined },

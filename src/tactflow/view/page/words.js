@@ -48,6 +48,16 @@ export function slip({ slip }) {
   return [slip.slipping ? "slips" : "holds", `${Math.round(100 * slip.stick_ratio)}\u202f% of the contact sticks`];
 }
 
+// Its length and largest error along the gel and out of it, and its turn.
+export function pose({ pose }) {
+  if (!pose) return NONE;
+  const { status, translation, rotation, stderr } = pose;
+  if (status === "lost") return ["lost", ""];
+  const way = `mm${error(Math.max(...stderr.slice(0, 3)), 2)}`;
+  const turn = `turned ${fixed(Math.hypot(...rotation), 1)}${error(Math.max(...stderr.slice(3)), 1)}°`;
+  return [fixed(Math.hypot(...translation), 2), `${way}, ${turn}`];
+}
+
 // Progress of a session: [count, fraction, result of the last press, whether it is good].
 export function guide({ done, good, wanted, presses, lasts }) {
   const count = `${done} of ${wanted} presses${good < done ? `, ${good} good` : ""}`;
