@@ -156,20 +156,21 @@ def own_shares(centers: Floats, edges: Indices) -> tuple[Floats, Indices]:
     for part in cells.T:
         own += np.bincount(part, minlength=count)
     tests += np.bincount(closing[closed], minlength=count)
-    return own / np.maximum(tests, 1), _cluster_sizes(cells, count)
+    cluster = components(cells, count)
+    return own / np.maximum(tests, 1), np.bincount(cluster, minlength=count)[cluster]
 
 
-def _cluster_sizes(cells: Indices, count: int) -> Indices:
-    """For each mark (count,) the number of marks that cells (C, 4), one after another, lead to."""
+def components(groups: Indices, count: int) -> Indices:
+    """For each mark (count,) the first mark that groups of marks (C, k), one after another, lead to."""
     name = np.arange(count)
     while True:
-        least = name.copy()
-        np.minimum.at(least, cells.ravel(), np.repeat(name[cells].min(axis=1), 4))
+        first = name.copy()
+        np.minimum.at(first, groups.ravel(), np.repeat(name[groups].min(axis=1), groups.shape[1]))
         # A name of a name is as good: so it takes few rounds.
-        least = least[least]
-        if (least == name).all():
-            return np.bincount(name, minlength=count)[name]
-        name = least
+        first = first[first]
+        if (first == name).all():
+            return name
+        name = first
 
 
 def support(points: Floats, expected: Corners) -> Indices:

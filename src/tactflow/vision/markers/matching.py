@@ -15,10 +15,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tactflow.vision.arrays import Flags, Floats, Indices
+from tactflow.vision.markers.lattice import components
 
 LINKED_STRAIN: Final = 0.3
 """Strain of a link below which its two marks move together. Chosen by hand."""
@@ -45,7 +44,10 @@ LABELS: Final = 8
 """Spots among which a mark may choose: its nearest. Chosen by hand."""
 
 ROUNDS: Final = 24
-"""Rounds of propagation. Chosen by hand: messages pass over so many links."""
+"""Rounds of propagation, at most. Chosen by hand: messages pass over so many links."""
+
+STABLE_ROUNDS: Final = 3
+"""Propagation ends when the best labels did not change so many rounds in a row. Chosen by hand."""
 
 BIN: Final = 0.1
 """Side of the bins of votes for a jump, pitches. Chosen by hand."""
@@ -98,8 +100,8 @@ class MarkerGraph:
         degree = np.bincount(self.edges.ravel(), minlength=count)
         self.border = degree < np.sort(degree)[count // 2]
         """(N,) bool, marks with fewer neighbours than most."""
-        self._grid = self._components(np.ones(len(self.edges), bool))
-        self.grids = [np.flatnonzero(self._grid == grid) for grid in range(self._grid.max() + 1)]
+        self._grid = components(self.edges, count)
+        self.grids = [np.flatnonzero(self._grid == grid) for grid in np.unique(self._grid)]
         """The marks of each grid without links to others."""
 
     def strain(self, position: Floats) -> Floats:
@@ -110,18 +112,13 @@ class MarkerGraph:
 
     def largest_component(self, seen: Flags, strain: Floats) -> Flags:
         """The seen marks (N,) of the largest component, in each grid, whose links have little strain (E,)."""
-        component = self._components((strain < LINKED_STRAIN) & seen[self.edges].all(axis=1))
+        linked = (strain < LINKED_STRAIN) & seen[self.edges].all(axis=1)
+        component = components(self.edges[linked], len(seen))
         # Of components of one size the first one.
         rank = np.where(seen, np.bincount(component)[component] - component / len(seen), 0.0)
-        best = np.zeros(len(self.grids))
+        best = np.zeros(len(seen))
         np.maximum.at(best, self._grid, rank)
         return np.asarray(seen & (rank == best[self._grid]))
-
-    def _components(self, linked: Flags) -> Indices:
-        """(N,) number of the connected component of each mark, by the links (E,) that count."""
-        count = len(self._origin)
-        links = coo_array((np.ones(linked.sum(), bool), self.edges[linked].T), shape=(count, count))
-        return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
 def choose_spots(
@@ -206,13 +203,18 @@ def _beliefs(unary: Floats, first: Indices, second: Indices, pair: Floats) -> Fl
     source, target = np.concatenate([first, second]), np.concatenate([second, first])
     cost = np.concatenate([pair, pair.transpose(0, 2, 1)])
     message = np.zeros((len(source), unary.shape[1]))
-    belief = unary
+    belief, choice, unchanged = unary, unary.argmin(axis=1), 0
     for _ in range(ROUNDS if len(first) else 0):
-        outgoing = belief[source] - np.roll(message, len(first), axis=0)
-        message = (outgoing[:, :, None] + cost).min(axis=1)
+        back = np.concatenate([message[len(first) :], message[: len(first)]])
+        message = ((belief[source] - back)[:, :, None] + cost).min(axis=1)
         message -= message.min(axis=1, keepdims=True)
         belief = unary.copy()
         np.add.at(belief, target, message)
+        latest = belief.argmin(axis=1)
+        unchanged = unchanged + 1 if (latest == choice).all() else 0
+        if unchanged == STABLE_ROUNDS:
+            break
+        choice = latest
     return belief
 
 
