@@ -99,7 +99,7 @@ def test_of_a_smooth_ball_normals_see_where_it_is_and_say_that_they_do_not_see_h
     moved, stderr = ball_moved(pose)
     np.testing.assert_allclose(moved, [0.15, 0], atol=0.01)
     # Across the motion, a turn about the normal adds to it: the ball is not where it was.
-    assert stderr[0] < 0.02
+    assert stderr[0] < 0.05
     assert stderr[1] < 0.15
     assert pose.translation[2] == pytest.approx(0, abs=0.01)
     assert pose.stderr[2] < 0.1

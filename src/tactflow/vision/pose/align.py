@@ -32,8 +32,6 @@ NORMAL_NOISE: Final = 0.02
 are known. Normals on other sensors of a kind err by 1 to 4 degrees, most of it alike in both imprints."""
 HEIGHT_NOISE: Final = 0.005
 """Standard deviation of the change of mean height, mm, beside that from the scale of heights."""
-MOST_EFFICIENT: Final = 4.0
-"""How much more than expected normals may count, by their residuals: those of half the noise."""
 FEWEST: Final = 12
 """Points of the template that both imprints must show."""
 
@@ -42,7 +40,7 @@ class Gel(NamedTuple):
     """Where the same bits of gel are in two frames.
 
     before, now : (M, 2), mm. share : (M,), how they count; the sum is 1. variance : of each coordinate of
-    their mean displacement, mm^2. overlap : share of the larger contact's gel that both touch.
+    their mean displacement, mm^2. overlap : share of the gel in contact now that was before.
     """
 
     before: Floats
@@ -56,7 +54,7 @@ class Alignment(NamedTuple):
     """A motion from a template to an imprint.
 
     motion : (4, 4), about the template's centre, mm. covariance : (6, 6), see `rigid`. overlap : share of the
-    larger contact that both show. misfit : sum of squares of the normals' differences, in units of their
+    present contact that both show. misfit : sum of squares of the normals' differences, in units of their
     expected variances. residual : RMS difference of a normal's component. signal : standard deviation of the
     same over the template.
     """
@@ -99,13 +97,12 @@ def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> A
             break
     misfit = float(normals.weight @ normals.error**2)
     naive = (normals.by.T * normals.weight) @ normals.by
-    noise = max(misfit, float(normals.weight.sum()) * NORMAL_NOISE**2 / MOST_EFFICIENT)
+    noise = max(misfit, float(normals.weight.sum()) * NORMAL_NOISE**2)
     honest = _efficiency(normals, template.blocks[shown]) * _without_noise(naive, noise, template)
-    larger = max(template.imprint.area, now.area) / template.every
     return Alignment(
         motion,
         np.asarray(np.linalg.inv(information - naive + honest), np.float64),
-        np.count_nonzero(shown) / larger,
+        np.count_nonzero(shown) * template.every / now.area,
         misfit,
         math.sqrt(misfit / normals.weight.sum()),
         math.sqrt(template.normals[:, :2].var(axis=0).mean()),
@@ -157,11 +154,12 @@ def _gel_part(gel: Gel, points: tuple[Floats, Floats], motion: Floats) -> _Part:
 
 
 def _efficiency(normals: _Part, blocks: Indices) -> float:
-    """Information of the normals over what their weights say, from how far the sums over patches scatter."""
+    """Information of the normals over what their weights say, at most 1, from how far the sums over patches
+    scatter."""
     weighted = (normals.weight * normals.error).reshape(2, -1)
     sums = np.stack([np.bincount(blocks, axis) for axis in weighted])
     expected = float(normals.weight.sum())
-    return expected / max(float((sums**2).sum()), expected / MOST_EFFICIENT)
+    return expected / max(float((sums**2).sum()), expected)
 
 
 def _without_noise(information: Floats, misfit: float, template: Template) -> Floats:

@@ -22,8 +22,8 @@ and the first one, whose gradient has seen the crease outside, does not count. O
 appears to slide by a part of its way, for its rim moves like that."""
 BLOCKS: Final = 5
 """Patches along each side of a contact within which the errors of normals are taken for common."""
-PATCH: Final = 4
-"""Least side of such a patch, cells: contact masks and heights are smoothed over as much."""
+PATCH: Final = 2.5
+"""Least side of such a patch, cells: the gradients of heights and normals are means over as much."""
 
 
 class Imprint(NamedTuple):

@@ -14,7 +14,7 @@ from tactflow.vision.pose.rigid import adjoint, inverse, vector
 from tactflow.vision.types import Depth, Pose, Scale
 
 OVERLAP: Final = 0.7
-"""Share of the contact, on the side of the object or of the gel, below which the keyframe is replaced."""
+"""Share of the present contact, of object or gel, that the keyframe shows, below which it is replaced."""
 LEAST: Final = 60
 """Cells inside the rim from which on an object is tracked: a contact of 22 px."""
 TOLERATED: Final = 82.0
@@ -182,7 +182,7 @@ class PoseTracker:
         variance = (old_stderr**2 + stderr**2) * float(self._mm.prod())
         # Displacements a pitch apart are independent.
         variance += _stretch(old, new, share) / max(total * CELL**2, 1.0)
-        return Gel(old, new, share, variance, total / float(max(old_share.sum(), new_share.sum())))
+        return Gel(old, new, share, variance, total / float(new_share.sum()))
 
     def _pose(self, status: Literal["tracked", "lost"], motion: Floats, covariance: Floats) -> Pose:
         """For people: in the sensor's axes, in mm and degrees, with the error of the scale."""
