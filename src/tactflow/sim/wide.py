@@ -44,7 +44,8 @@ class WideScene:
 
     reference, picture : (H, W, 3) uint8, BGR. reference_dots, dots : (H, W) uint8, 255 where a detector might
     say that dots are, wrongly here and there. contact : (H, W) bool, the truth. origin, position : (N, 2)
-    float32, true centres of the dots in both pictures, px.
+    float32, true centres of the dots in both pictures, px. shift : (H, W, 2) float32, how far the gel has
+    moved that was at each pixel, x and y, px.
     """
 
     reference: NDArray[np.uint8]
@@ -54,6 +55,7 @@ class WideScene:
     contact: NDArray[np.bool_]
     origin: Plane
     position: Plane
+    shift: Plane
 
 
 @dataclass(frozen=True, slots=True)
@@ -515,6 +517,7 @@ def _photographs(rng: Generator, x: Plane, y: Plane, rest: _Imprint, pressed: _I
         contact,
         origin,
         np.asarray(position, np.float32),
+        np.asarray(long * pressed.shift, np.float32),
     )
 
 

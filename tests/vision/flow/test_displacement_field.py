@@ -140,6 +140,22 @@ def test_a_part_that_moves_as_a_whole_is_told_so(mask: np.ndarray) -> None:
     assert flow.mean == pytest.approx(tuple(np.array([152, 199]) - was), abs=3 * min(flow.stderr))
 
 
+def test_the_stated_error_of_the_mean_covers_an_outline_off_by_a_third_of_its_radius() -> None:
+    away = np.maximum(np.hypot(*(GRID - (150, 200)).T) - 60, 0)
+    dragged = np.exp(-away / 20)[:, None] * (4.0, 0.0)
+    field = field_of(markers(dragged))
+    true = field.motion(disc((150, 200), 60))
+    assert true is not None
+    ratios = []
+    for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False):
+        center = (150 + 20 * math.cos(angle), 200 + 20 * math.sin(angle))
+        flow = flow_of_field(field, markers(dragged), disc(center, 60))
+        assert flow.mean is not None
+        assert flow.stderr is not None
+        ratios.append((flow.mean[0] - true.mean[0]) / flow.stderr[0])
+    assert np.sqrt(np.mean(np.square(ratios))) < 0.5
+
+
 def test_the_mean_is_the_integral_of_the_field_over_the_gel_in_contact() -> None:
     field = field_of(markers(waves(GRID)))
     mask = disc((140, 180), 45)
