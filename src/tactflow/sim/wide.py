@@ -474,12 +474,8 @@ def _photographs(rng: Generator, x: Plane, y: Plane, rest: _Imprint, pressed: _I
     plain *= grain[..., None]
     if rng.random() < 0.7:
         grid = np.stack([x, y], axis=-1) * long + np.array([shape[1] / 2, shape[0] / 2], np.float32)
-        carried = np.asarray(grid - pressed.shift * long, np.float32)
-        grain = np.asarray(
-            cv2.remap(
-                grain, carried[..., 0], carried[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-            )
-        )
+        across, down = cv2.split(np.asarray(grid - pressed.shift * long, np.float32))
+        grain = np.asarray(cv2.remap(grain, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
     touched *= grain[..., None]
     origin = position = np.zeros((0, 2), np.float32)
     masks = [np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)]
