@@ -89,9 +89,13 @@ def test_its_attributes_say_what_is_in_it(name: str, exported: tuple[Path, list[
 
 
 def test_every_length_angle_and_force_has_its_unit() -> None:
-    bare = {c.name for c in frame_columns() if c.kind in FILL and not UNIT.search(c.description)}
-    assert bare == {
-        *("seq", "contact_slope", "contact_confidence", "flow_count", "features_values"),
+    units = {c.name: set(UNIT.findall(c.description)) for c in frame_columns() if c.kind in FILL}
+    assert {name for name, found in units.items() if len(found) > 1} == {
+        *(f"pose_stderr_{part}" for part in "xyz456"),
+        "pose_covariance",
+    }
+    assert {name for name, found in units.items() if not found} == {
+        *("seq", "pose_since", "contact_slope", "contact_confidence", "flow_count", "features_values"),
         *("contact_normal_x", "contact_normal_y", "contact_normal_z"),
         *("flow_divergence", "flow_divergence_stderr", "flow_shear_1", "flow_shear_2", "flow_shear_stderr"),
         *("slip_slipping", "slip_stick_ratio", "force_in_range"),

@@ -46,8 +46,8 @@ FILL: Final[Mapping[str, tuple[str, float]]] = {
     "byte": ("u1", 255),
 }
 """Kind of a column -> data type, and the value that stands for a missing one."""
-UNIT: Final = re.compile(r"(?:^|, )(mm per px|mm\^[23]|px\^2|mm|px|degrees|N|s)(?=[ ;:,]|$)")
-"""The unit in the description of a column."""
+UNIT: Final = re.compile(r"(?:^|, | and )(mm per px|mm\^[23]|px\^2|mm|px|degrees|N|s)(?=[ ;:,]|$)")
+"""A unit in the description of a column."""
 MARKERS: Final = {
     "markers_origin": ("points", "(N, M, 2): (x, y) of each marker in the reference frame, px"),
     "markers_position": ("points", "(N, M, 2): (x, y) of each marker now, px"),
@@ -147,16 +147,17 @@ class Array:
 
     Values may differ in length; shorter ones are padded with the value for what is missing.
 
-    kind : a key of `FILL`. description : an attribute of the array, as are the unit in it and, where it is
-    not NaN, the value for what is missing.
+    kind : a key of `FILL`. description : an attribute of the array, as are its unit and, where it is not NaN,
+    the value for what is missing.
     """
 
     def __init__(self, file: Hdf5 | Zarr, name: str, kind: str, description: str) -> None:
         self._file, self._name = file, name
         self._dtype, self._fill = FILL[kind]
         self._about: dict[str, Any] = {"description": description}
-        if unit := UNIT.search(description):
-            self._about["units"] = unit[1]
+        # Where there are several, the description says which is whose.
+        if len(units := set(UNIT.findall(description))) == 1:
+            self._about["units"] = units.pop()
         if kind in ("integer", "boolean") or name == "markers_status":
             self._about["missing"] = int(self._fill)
         self._array: Any = None
