@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import re
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -66,9 +67,9 @@ def read_image(path: Path) -> NDArray[Any]:
 
     Raises SourceError if the file cannot be read, is not an image, or is cut off.
     """
-    if path.exists() and not path.is_file():
-        raise SourceError(f"{path}: required a file, not a folder or a device")
     try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise SourceError(f"{path}: required a file, not a folder or a device")
         return decode_image(path.read_bytes(), str(path))
     except OSError as error:
         raise damaged(str(path), error) from error
