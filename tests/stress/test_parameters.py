@@ -57,4 +57,4 @@ def test_a_pipeline_file_refuses_nan_and_infinity_with_their_place(
 
 def test_the_table_of_numbers_is_not_empty() -> None:
     found = {parameter.id for parameter in NUMBERS}
-    assert {"hull.min_area", "tracker.dot", "difference.patience", "probe.false_alarms"} <= found
+    assert {"hull.min_area", "tracker.dot", "difference.certainty", "probe.false_alarms"} <= found
