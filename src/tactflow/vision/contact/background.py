@@ -297,9 +297,10 @@ def _cut_by_border(
     ends = [(rows.start == 0, 0, 0), (rows.stop == shape[0], 0, -1)]
     ends += [(columns.start == 0, 1, 0), (columns.stop == shape[1], 1, -1)]
     for reached, axis, end in ends:
-        line = np.abs(pixels.take(end, axis)).max(axis=1)
-        if reached and line[inside.take(end, axis).repeat(each)].max(initial=0) > enough:
-            return True
+        if reached:
+            line = np.abs(pixels.take(end, axis)).max(axis=1)
+            if line[inside.take(end, axis).repeat(each)].max(initial=0) > enough:
+                return True
     return False
 
 
