@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32, check_color_image
+from tactflow.vision.arrays import MAD_TO_SIGMA, Floats32, check_color_image
 from tactflow.vision.compiled import kernel
 
 TILES: Final = 24
@@ -121,8 +121,8 @@ class RestTest:
         self._frame: NDArray[np.uint8] | None = None
         self._last: Floats32 | None = None
         self._moved: Floats32 | None = None
-        self._squares: Floats32 = np.zeros((PLANES, rows, columns), np.float32)
-        self._count = 0
+        self._squares: list[Floats32] = []
+        self._planes_shape = PLANES, rows, columns
         self._variance: Floats32 | None = None
         self._bound: Floats32 | None = None
         self._sees_shifts = False
@@ -192,7 +192,7 @@ class RestTest:
         light = self._light(frame)
         ratio = ((light[::2, ::2] + 1) / (self._rest[::2, ::2] + 1)).reshape(-1, 3)
         change = light - self._rest * np.partition(ratio, len(ratio) // 2, axis=0)[len(ratio) // 2]
-        planes = np.empty_like(self._squares)
+        planes = np.empty(self._planes_shape, np.float32)
         for first, width in zip(range(0, LIGHT, 3), WINDOWS, strict=True):
             planes[first : first + 3] = cv2.blur(change, (width, width)).transpose(2, 0, 1)
         planes[LIGHT:] = (_near(self._sums[..., 3:]) * self._px_per_edge).transpose(2, 0, 1)
@@ -206,11 +206,15 @@ class RestTest:
 
     def _learn(self, step: Floats32) -> None:
         """Take in the difference of two frames in a row."""
-        self._squares += step * step
-        self._count += 1
-        if self._count < (WARM_UP if self._variance is None else BLOCK):
+        self._squares.append(step * step)
+        if len(self._squares) < (WARM_UP if self._variance is None else BLOCK):
             return
-        seen = self._squares / np.float32(2 * self._count)
+        if self._variance is None:
+            # A camera that still settles, or a gel that still moves, shall not pass for noise.
+            squares = np.median(self._squares, axis=0) * np.float32(MAD_TO_SIGMA**2)
+        else:
+            squares = np.mean(self._squares, axis=0)
+        seen = squares / np.float32(2)
         # Neighbouring tiles are alike; one that is much louder than they are is louder.
         near = np.stack([cv2.blur(plane, (5, 5)) for plane in seen])
         seen = np.maximum(np.maximum(near, seen / 2), self._floor)
@@ -220,8 +224,7 @@ class RestTest:
         self._limit = self._bound[:LIGHT] + self._level
         shifts = self._bound[LIGHT:].transpose(1, 2, 0) * self._px_per_edge
         self._sees_shifts = bool(np.median(shifts) <= SHIFT)
-        self._squares[...] = 0
-        self._count = 0
+        self._squares.clear()
 
 
 def _near(sums: Floats32) -> Floats32:
