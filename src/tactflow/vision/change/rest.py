@@ -50,6 +50,8 @@ SHIFT: Final = 0.05
 RECENT: Final = 5
 """Frames whose strongest change is what the gel shows at rest, so that a flicker of five frames is part of
 it: a sixth of a second."""
+LAG: Final = 3
+"""Frames that are too recent for that: a contact that begins slowly shall not make itself rest."""
 GLANCES: Final = 0.01
 """Share of still frames in which dots are looked at all the same: that costs less than a frame in full."""
 ROUNDING: Final = 1 / 12
@@ -126,7 +128,7 @@ class RestTest:
         self._variance: Floats32 | None = None
         self._bound: Floats32 | None = None
         self._sees_shifts = False
-        self._recent: deque[Floats32] = deque(maxlen=RECENT)
+        self._recent: deque[Floats32] = deque(maxlen=RECENT + LAG)
         self._envelope: Floats32 | None = None
         self._worked = True
 
@@ -158,7 +160,7 @@ class RestTest:
             return self._decide(now, changed=True, suspect=True) if due else Look(False, False)
         self._learn(step)
         if self._worked:
-            self._envelope = np.max(self._recent, axis=0)
+            self._envelope = self._resting_change()
         suspect = due or self._bound is None or self._departs(now)
         return self._decide(now, changed=suspect or self._moves(now), suspect=suspect)
 
@@ -176,8 +178,12 @@ class RestTest:
         if bool((np.abs(now[:LIGHT]) > self._envelope + self._limit).any()):
             return True
         # What has crept back may not come again unseen.
-        np.minimum(self._envelope, np.max(self._recent, axis=0), out=self._envelope)
+        np.minimum(self._envelope, self._resting_change(), out=self._envelope)
         return False
+
+    def _resting_change(self) -> Floats32:
+        """(9, rows, columns): the strongest change of the frames that tell what the gel shows at rest."""
+        return np.asarray(np.max(list(self._recent)[:RECENT], axis=0), np.float32)
 
     def _moves(self, now: Floats32) -> bool:
         """Whether an edge may have moved since the dots were last looked at."""
