@@ -24,11 +24,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.contact.change import to_planes
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
 
@@ -81,22 +80,17 @@ class LightChange:
         self.untouched = untouched
         height, width = untouched.shape[:2]
         side = max(1, round(max(height, width) / CELLS))
-        self._size = max(1, width // side), max(1, height // side)
-        self._light = self._cells(untouched)
+        self._size = max(1, height // side), max(1, width // side)
+        self._light = to_planes(untouched, self._size)
         self._illumination = IlluminationModel(self._light, np.ones_like(self._light))
 
     def __call__(self, image: NDArray[np.uint8]) -> float:
         """The integral over (H, W, 3) uint8 of the square root of the relative change, px^2."""
-        light = self._cells(image)
+        light = to_planes(image, self._size)
         lit = under_illumination(self._light, self._illumination.fit(light))
         change = (np.abs(light - lit) / np.maximum(lit, np.float32(DIM))).mean(axis=0)
         root = np.sqrt(np.hypot(change, np.float32(FAINT)) - np.float32(FAINT))
         return float(root.mean()) * float(image.shape[0] * image.shape[1])
-
-    def _cells(self, image: NDArray[np.uint8]) -> Floats32:
-        """(3, rows, columns) float32, grey levels."""
-        cells = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
-        return np.ascontiguousarray(cells.transpose(2, 0, 1), np.float32)
 
 
 def seen(contact: Contact, scale: Scale, depth: Depth | None, change: float, flow: Flow | None) -> Seen:

@@ -124,7 +124,6 @@ class RestTest:
         self._last: Floats32 | None = None
         self._moved: Floats32 | None = None
         self._squares: list[Floats32] = []
-        self._planes_shape = PLANES, rows, columns
         self._variance: Floats32 | None = None
         self._bound: Floats32 | None = None
         self._sees_shifts = False
@@ -198,7 +197,7 @@ class RestTest:
         light = self._light(frame)
         ratio = ((light[::2, ::2] + 1) / (self._rest[::2, ::2] + 1)).reshape(-1, 3)
         change = light - self._rest * np.partition(ratio, len(ratio) // 2, axis=0)[len(ratio) // 2]
-        planes = np.empty(self._planes_shape, np.float32)
+        planes = np.empty((PLANES, *self._sums.shape[:2]), np.float32)
         for first, width in zip(range(0, LIGHT, 3), WINDOWS, strict=True):
             planes[first : first + 3] = cv2.blur(change, (width, width)).transpose(2, 0, 1)
         planes[LIGHT:] = (_near(self._sums[..., 3:]) * self._px_per_edge).transpose(2, 0, 1)

@@ -44,7 +44,6 @@ CUT: Final = 0.5
 """Change at the picture's border, over the largest one of a contact, from which on the border cuts it. Chosen
 by hand, near the part at which `contact_outline` takes a change for the contact's."""
 
-
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
 """What `weigh_change` takes where nothing was in contact in the previous frame."""
