@@ -19,7 +19,7 @@ import pytest
 
 from tactflow.bench.label import LabelServer, main, read_items
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
-from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.errors import ConfigError
 from tests import chromium
 from tests.clock import PATIENCE
 
@@ -66,14 +66,6 @@ def test_a_broken_file_of_labels_is_refused(text: Any, message: str, tmp_path: P
     path.write_text(text if isinstance(text, str) else json.dumps(text))
     with pytest.raises(ConfigError, match=f"^{path}: {message}"):
         load_labels(path)
-
-
-def test_a_missing_file_and_an_impossible_one_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no.json: cannot be read: No such file"):
-        load_labels(tmp_path / "no.json")
-    (tmp_path / "file").touch()
-    with pytest.raises(StageError, match="cannot be written"):
-        save_labels(tmp_path / "file" / "labels.json", [])
 
 
 @pytest.fixture
@@ -160,14 +152,6 @@ def test_a_label_is_stored_changed_and_removed_and_others_stay(serve: Serve, tmp
     assert json.loads(ask(second, "GET", "/frames")[1])["labels"] == []
     assert ask(server, "DELETE", "/labels", label)[0] == 200
     assert load_labels(path) == [other]
-
-
-def test_pictures_are_served_and_nothing_else(serve: Serve) -> None:
-    server = serve()
-    assert level(ask(server, "GET", "/frames/1/picture")[1]) == 120
-    assert level(ask(server, "GET", "/frames/1/reference")[1]) == 160
-    assert ask(server, "GET", "/frames/2/picture")[0] == 404
-    assert ask(server, "GET", "/../pyproject.toml")[0] == 404
 
 
 def test_other_web_sites_and_wrong_labels_are_refused(serve: Serve, tmp_path: Path) -> None:
@@ -277,23 +261,3 @@ def test_an_outline_drawn_in_a_browser_is_in_the_file(
     page.mouse.click(*at(page, 40, 25), button="right")
     shown(page, "outlines: 0")
     assert [stored.frame for stored in load_labels(path)] == ["002"]
-
-
-def test_dots_are_marked_and_removed_and_outlines_stay(
-    serve: Serve, open_page: Callable[[LabelServer], Any], tmp_path: Path
-) -> None:
-    path = tmp_path / "labels.json"
-    first = FrameLabel(
-        recording="press", frame="001", reference="rest", lab="B", contact=True, outlines=(TRIANGLE,)
-    )
-    save_labels(path, [first])
-    page = open_page(serve(dots=True))
-    page.keyboard.press("n")
-    for x in (10, 30, 70):
-        page.mouse.click(*at(page, x, 20))
-    page.mouse.click(*at(page, 36, 20), button="right")
-    shown(page, "dots: 2")
-    (label,) = load_labels(path)
-    assert label.dots is not None
-    np.testing.assert_allclose(label.dots, [(10, 20), (70, 20)], atol=0.1)
-    assert label.model_copy(update={"dots": None}) == first

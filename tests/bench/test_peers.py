@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.peers import contact, depth, dots, page
 from benchmarks.peers.__main__ import CONTACTS, SCENES, available, cases
-from benchmarks.peers.common import another, errors_of, lines, recording, search
+from benchmarks.peers.common import errors_of, recording
 from tactflow.bench.scenes import Case
 from tactflow.calibration.presses import Press
 from tactflow.sim import open_scene
@@ -55,25 +55,6 @@ def test_a_method_that_raises_has_lost_its_dots(monkeypatch: pytest.MonkeyPatch,
     assert "displacement_rms" not in errors
 
 
-def test_the_search_changes_one_setting_after_the_other() -> None:
-    best = search({"a": (1, 2, 3), "b": (5, 4)}, lambda tried: abs(tried["a"] - 3) + abs(tried["b"] - 4))
-    assert best == {"a": 3, "b": 4}
-
-
-def test_lines_of_an_adapter_are_those_of_code() -> None:
-    def adapter(x: int) -> int:
-        """Not counted."""
-
-        # Nor is this.
-        return x + 1
-
-    assert lines(adapter) == 2
-
-
-def test_another_recording_is_half_as_long_and_of_another_seed() -> None:
-    assert another(Case("jumps", 40, "worn=0.05")) == Case("jumps", 20, "worn=0.05&seed=11")
-
-
 def test_a_perfect_answer_to_a_ball_has_no_error_wherever_its_outline_says_that_it_is() -> None:
     scale, radius, (x, y) = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0)), 3.0, np.mgrid[:80, :100][::-1]
     dx, dy = (x - 52.0) * scale.x, (y - 41.0) * scale.y
@@ -88,14 +69,6 @@ def test_a_perfect_answer_to_a_ball_has_no_error_wherever_its_outline_says_that_
     flatter = depth.errors_on(press, (0.5 * slopes, 0.5 * height), scale, radius)
     assert flatter[0] > 5
     assert flatter[1] == pytest.approx(-0.5, abs=0.01)
-
-
-def test_slopes_are_integrated_to_the_depth_that_has_them() -> None:
-    y, x = np.mgrid[:60, :80]
-    height = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 72.0)
-    slopes = np.dstack([-(x - 40) / 36.0 * height / 0.2, -(y - 30) / 36.0 * height / 0.1])
-    found = depth.integrate(slopes, Scale(0.2, 0.1, (0.0, 0.0), (0.0, 0.0)))
-    assert np.abs(found - height).max() < 0.02
 
 
 def test_the_scenes_of_the_command_exist_and_tactflow_is_always_measured() -> None:

@@ -178,3 +178,5 @@ def test_a_camera_fails_in_mid_run(
     kept = "before and after" if seqs[-1] > FAULT_AT + 30 else "before"
     expected = (0, said, "before and after") if comes_back else (4, given_up, "^before$")
     Seen(seen.exit, seen.said, kept).must_be(*expected)
+    if comes_back:
+        assert len(seen.said.splitlines()) == 2, "it is reported once, and so is its end"

@@ -45,8 +45,8 @@ def test_an_interrupted_export_leaves_nothing_behind(scene: Scene, tmp_path: Pat
         if done == 3:
             raise KeyboardInterrupt
 
-    for name in ("a.npy", "a.avi", "frames", "a.jsonl", "a.npz"):
-        write = export.write_truth if name in ("a.jsonl", "a.npz") else export.write_frames
+    for name in ("a.npy", "a.avi", "frames", "a.jsonl"):
+        write = export.write_truth if name == "a.jsonl" else export.write_frames
         with pytest.raises(KeyboardInterrupt):
             write(scene, tmp_path / name, stop)
         assert list(tmp_path.iterdir()) == []
@@ -72,24 +72,6 @@ def test_truth_as_json_lines_is_the_truth(scene: Scene, tmp_path: Path) -> None:
         np.testing.assert_array_equal(line["visible"], truth.visible)
         touched += truth.touching
     assert touched > 3
-
-
-def test_truth_as_arrays_is_the_truth(scene: Scene, tmp_path: Path) -> None:
-    export.write_truth(scene, tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz") as stored:
-        assert stored["contact_mask"].shape == (12, 600, 800)
-        start = stored["hull_start"]
-        for index in range(12):
-            truth = scene.truth(index)
-            np.testing.assert_array_equal(stored["contact_mask"][index], truth.contact_mask)
-            np.testing.assert_array_equal(stored["hull"][start[index] : start[index + 1]], truth.hull)
-            np.testing.assert_array_equal(stored["position"][index], truth.position)
-            assert stored["touching"][index] == truth.touching
-            assert stored["directed"][index] == (truth.angle is not None)
-            assert stored["has_flow"][index] == (truth.mean_flow is not None)
-            if truth.center is not None:
-                np.testing.assert_array_equal(stored["center"][index], truth.center)
-        assert all(np.isfinite(stored[name]).all() for name in stored.files)
 
 
 def test_a_csv_holds_what_a_force_gauge_would_say(scene: Scene, tmp_path: Path) -> None:

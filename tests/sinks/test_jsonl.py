@@ -14,7 +14,6 @@ from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
 from tactflow.sinks.jsonl import Jsonl
 from tests.clock import until
-from tests.sinks.full_disk import disk_full_after
 
 IMAGE = np.zeros((3, 4, 3), np.uint8)
 
@@ -30,11 +29,6 @@ def write(sink: Jsonl, seqs: range) -> None:
         sink.write(Result(Frame("main", seq, seq / 10.0, IMAGE)))
 
 
-def write_and_close(sink: Jsonl, seqs: range) -> None:
-    try:
-        write(sink, seqs)
-    finally:
-        sink.close()
 
 
 def seqs_in(path: Path) -> list[int]:
@@ -71,37 +65,6 @@ def test_an_existing_file_is_neither_replaced_nor_touched_unasked(tmp_path: Path
     with pytest.raises(StageError, match=r"r\.jsonl: this file exists.*overwrite: true.*append: true"):
         opened(path)
     assert seqs_in(path) == [7]
-
-
-@pytest.mark.parametrize("flush", [0.0, 60.0])
-@pytest.mark.parametrize("append", [False, True])
-def test_a_disk_that_fills_up_leaves_complete_lines_only(append: bool, flush: float, tmp_path: Path) -> None:
-    path = tmp_path / "r.jsonl"
-    if append:
-        path.write_text('{"seq":100}\n')
-    sink = opened(path, append=append, flush=flush)
-    with disk_full_after(1000), pytest.raises(StageError, match="File too large") as raised:
-        write_and_close(sink, range(50))
-    seqs = [seq for seq in seqs_in(path) if seq != 100]
-    # A line has about 130 bytes: 7 fit into 1000 bytes, 6 or 7 beside the one that was there.
-    assert seqs == list(range(len(seqs)))
-    assert len(seqs) in (6, 7)
-    assert f"the {len(seqs)} lines written before are complete" in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("make", "expected"),
-    [
-        (lambda folder: folder, "Is a directory"),
-        (lambda folder: folder / "file" / "r.jsonl", "file is a file, not a folder"),
-        (lambda _: Path("/proc/nowhere/r.jsonl"), "cannot be written"),
-    ],
-    ids=["a folder", "below a file", "where nothing can be created"],
-)
-def test_a_path_that_cannot_be_written_is_a_clear_error(make: Any, expected: str, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(StageError, match=expected):
-        opened(make(tmp_path))
 
 
 def test_closing_twice_or_without_opening_is_harmless(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from tactflow.drawing import film as film_module
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.video import Video
@@ -65,19 +64,6 @@ def test_a_lossless_film_gives_back_every_bit(suffix: str, size: tuple[int, int]
     film(tmp_path / f"film{suffix}", shown, lossless=True)
     back = [frame[: size[0], : size[1]] for frame in play(tmp_path / f"film{suffix}")[0]]
     np.testing.assert_array_equal(back, shown)
-
-
-def test_a_codec_that_loses_bits_is_not_accepted_as_lossless(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(film_module.LOSSLESS_CODECS, ".avi", ("FFVH", "HFYU"))
-    shown = pictures(3)
-    film(tmp_path / "film.avi", shown, lossless=True)
-    np.testing.assert_array_equal(play(tmp_path / "film.avi")[0], shown)
-    monkeypatch.setitem(film_module.LOSSLESS_CODECS, ".avi", ("FFVH", "MJPG"))
-    with pytest.raises(StageError, match=r"cannot encode \.avi losslessly"):
-        film(tmp_path / "other.avi", shown, lossless=True)
-    assert not (tmp_path / "other.avi").exists()
 
 
 def test_odd_sizes_lose_no_row_and_no_column(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -70,37 +69,6 @@ def take(source: Watched, count: int = 5) -> list[Arrival]:
     arrivals = [source.read_arrival() for _ in range(count)]
     assert None not in arrivals
     return [arrival for arrival in arrivals if arrival is not None]
-
-
-FAULTS = {
-    "gone": "is gone since",
-    "ends": "is gone since",
-    "frozen": "a frozen picture since",
-    "black": "black pictures since",
-}
-
-
-@pytest.mark.parametrize("does", FAULTS)
-def test_each_fault_is_reported_once_and_so_is_its_end(
-    does: str, device: Flaky, watched: Opens, caplog: pytest.LogCaptureFixture
-) -> None:
-    source = watched()
-    take(source)
-    assert source.state == "running"
-    reading = Reading(source)
-    try:
-        device.does = does
-        until(lambda: FAULTS[does] in caplog.text, lambda: caplog.text)
-        until(lambda: source.state.startswith("reconnecting since"), lambda: source.state)
-        device.does = "good"
-        until(lambda: "is back after" in caplog.text, lambda: caplog.text)
-        until(lambda: reading.arrivals and reading.arrivals[-1].connection > 0)
-        assert source.state == "running"
-    finally:
-        reading.stop()
-    warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    assert len(warnings) == 2, warnings
-    assert device.opened > 1
 
 
 def test_attempts_back_off_and_start_quickly_again_once_the_source_was_back(

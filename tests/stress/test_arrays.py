@@ -14,11 +14,9 @@ from tactflow.vision.change import RestTest
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
-from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
-from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.stress.builders import PICTURE_METHODS, SIZE, detector, gel
+from tests.stress.builders import PICTURE_METHODS, SIZE, gel
 
 Array = NDArray[Any]
 
@@ -102,23 +100,3 @@ def test_pictures_may_have_any_layout_and_are_not_written(name: str) -> None:
 @pytest.mark.parametrize("name", MASKS)
 def test_masks_may_have_any_layout_and_are_not_written(name: str) -> None:
     assert_same(MASKS[name], PLAIN.mask)
-
-
-def test_results_belong_to_the_caller() -> None:
-    pictures = gel(dots=False)
-    trackers = [MarkerTracker(PLAIN.reference, detect_markers(PLAIN.reference)) for _ in range(2)]
-    detectors = [detector("noise", pictures.reference.copy()) for _ in range(2)]
-    for index in (1, 0, 1):
-        markers = [tracker.track((PLAIN.reference, PLAIN.touched)[index]) for tracker in trackers]
-        masks = [each.detect((pictures.reference, pictures.touched)[index]).mask for each in detectors]
-        for part, other in zip(flat(markers[0]), flat(markers[1]), strict=True):
-            np.testing.assert_array_equal(part, other)
-            other[...] = 1
-        np.testing.assert_array_equal(masks[0], masks[1])
-        masks[1][...] = 1
-    for settings in PREPROCESS.values():
-        process = Preprocessor(SIZE, **settings)
-        first = process(PLAIN.touched)
-        kept = first.copy()
-        process(np.zeros_like(PLAIN.touched))
-        assert np.array_equal(first, kept)

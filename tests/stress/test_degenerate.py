@@ -14,10 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from tactflow.drawing.results import Annotator
-from tactflow.vision.change import RestTest
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
-from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 from tactflow.vision.types import Markers
 from tests.stress.builders import (
     DIFFERENCES,
@@ -85,30 +83,6 @@ def test_any_pair_of_pictures_has_a_mask_and_marks_within_it_or_none(
         centers = detect_markers(reference).centers
         assert (centers > -1).all()
         assert (centers < reference.shape[1::-1]).all()
-
-
-@pytest.mark.parametrize("name", PICTURES)
-def test_the_same_picture_again_is_no_contact_and_no_change(name: str) -> None:
-    for shape in SHAPES:
-        image = PICTURES[name](shape)
-        for method in DIFFERENCES:
-            contact = detector(method, image)
-            assert not any(contact.detect(image).touching for _ in range(3)), shape
-        probe = RestTest(image)
-        for _ in range(8):
-            probe.look(image)
-        assert probe.look(image) == (False, False)
-        assert Annotator()(image).shape == image.shape
-        if name not in ("checkerboard", "noise"):
-            assert find_dot(image) is None
-
-
-@pytest.mark.parametrize("radius", [0.1, 5, 300])
-@pytest.mark.parametrize("polarity", ["dark", "bright"])
-def test_any_size_of_dot_gives_a_mask_on_any_picture(radius: float, polarity: str) -> None:
-    for shape in SHAPES:
-        for make in PICTURES.values():
-            assert_mask(marker_mask(make(shape), Dot(radius, polarity, 6.0)), shape)  # type: ignore[arg-type]
 
 
 # The search for dots takes four seconds.

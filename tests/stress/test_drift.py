@@ -9,8 +9,6 @@ import pytest
 
 import tactflow
 from tactflow.sim import Truth
-from tactflow.vision.markers.detection import detect_markers
-from tactflow.vision.markers.tracking import MarkerTracker
 from tests.stress.builders import DIFFERENCES, Image, detector, gel
 
 
@@ -26,20 +24,6 @@ def test_a_detector_ends_every_one_of_many_contacts(method: str) -> None:
     for _ in range(60):
         assert contact.detect(noisy(pictures.touched, random)).touching
         assert not contact.detect(noisy(pictures.reference, random)).touching
-
-
-def test_the_same_frame_for_ever_never_drifts() -> None:
-    pictures, dotless = gel(), gel(dots=False)
-    tracker = MarkerTracker(pictures.reference, detect_markers(pictures.reference))
-    contact = detector("noise", dotless.reference)
-    positions = [tracker.track(pictures.touched).position for _ in range(60)]
-    # Half way between two of its sixteen sub-pixel phases a mark may alternate between the same two answers
-    # for ever: measured 0.017 px.
-    assert np.array_equal(positions[10], positions[-2])
-    assert max(np.abs(position - positions[0]).max() for position in positions) < 0.034
-    masks = [contact.detect(dotless.touched).mask for _ in range(60)]
-    assert masks[0].any()
-    assert all(np.array_equal(mask, masks[1]) for mask in masks[1:])
 
 
 def test_the_marker_error_of_the_default_pipeline_does_not_grow(tmp_path: Path) -> None:

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 import tactflow
-from tactflow.engine.errors import SourceError, TactflowError
+from tactflow.engine.errors import TactflowError
 from tactflow.message.result import Result
 from tests.stress.builders import Image, assert_defined, gel
 
@@ -82,15 +81,6 @@ def test_tiny_and_odd_frames_end_in_an_answer_or_in_words(name: str, shape: tupl
         return
     for result in found:
         assert_defined(parts(result))
-
-
-def test_frames_of_another_size_are_refused_with_both_sizes(tmp_path: Path) -> None:
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for index, picture in enumerate([raw(gel().reference), raw(gel().touched), raw(gel().reference)[:200]]):
-        cv2.imwrite(str(folder / f"{index}.png"), picture)
-    with pytest.raises(SourceError, match=r"(256.*200|200.*256)"):
-        results("default", folder, PLAIN)
 
 
 @pytest.mark.parametrize("name", ["default", "markerless"])

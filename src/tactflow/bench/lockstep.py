@@ -147,7 +147,6 @@ def take_turns(
     see: Callable[[str, TimedResult], str],
     *,
     unit: CopyUnit | None = None,
-    late: Callable[[], bool] = lambda: False,
     block: int = BLOCK,
 ) -> tuple[dict[str, Times], dict[str, str]]:
     """Run pipelines in turns of a few frames until all recordings are over.
@@ -158,7 +157,6 @@ def take_turns(
     see : called with (name, result) for each frame, after its turn; returns the kind of frame its time
         belongs to. The time of references is kept apart.
     unit : measured along the way. block : frames in a turn.
-    late : asked when all have had a turn; if it is, that was the last one.
 
     Returns
     -------
@@ -186,6 +184,4 @@ def take_turns(
                     times[name]["reference" if result.frame.reference else kind].append(result.cpu_s)
                 if not results:
                     del running[name]
-            if late():
-                break
     return times, failures

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--truth",
         type=Path,
         metavar="FILE",
-        help=".jsonl (one line a frame) or .npz (with contact masks), in raw pixels; .csv for force",
+        help=".jsonl (one line a frame), in raw pixels; .csv for force",
     )
     add_overwrite(parser, "these files")
     parser.add_argument("--list", action="store_true", help="print the scenes and the settings they know")

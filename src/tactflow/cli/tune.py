@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-import time
 from pathlib import Path
 
-from tactflow.cli.options import add_json, add_overwrite, add_sensor, number, refuse_output, seconds, writing
+from tactflow.cli.options import add_json, add_overwrite, add_sensor, number, refuse_output, writing
 from tactflow.cli.terminal import notes, printable, say, show, show_json, typed
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -17,8 +16,6 @@ from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
 _above_0 = number(float, sys.float_info.min, sys.float_info.max, "a number above 0")
-# The simulator takes seeds up to 2**31 - 1, and a search uses some hundreds from this one on.
-_seed = number(int, 0, 1_000_000, "a whole number from 0 to 1000000")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,20 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("any", "center", "dots", "flow"),
         help="which error counts: contact's centre, displacement of dots, mean flow; default: the largest",
     )
-    parser.add_argument(
-        "--budget",
-        type=seconds,
-        default=120.0,
-        metavar="TIME",
-        help="time limit, such as 90s or 2min (default)",
-    )
-    parser.add_argument(
-        "--seed",
-        type=_seed,
-        default=0,
-        metavar="N",
-        help="of the simulated recordings: makes errors repeatable",
-    )
     add_sensor(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
@@ -76,12 +59,11 @@ def run(args: argparse.Namespace) -> int:
     ConfigError, SourceError
         If the options are wrong, or the recording cannot be used.
     """
-    began = time.monotonic()
     page = _page(args)
     # Imported here: the simulator and the bench take their time.
     from tactflow.tune import report
     from tactflow.tune.recording import take
-    from tactflow.tune.search import Goal, Search, impossible
+    from tactflow.tune.search import Goal, impossible, search
     from tactflow.tune.space import candidates
 
     with notes("ERROR"), tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
@@ -94,8 +76,7 @@ def run(args: argparse.Namespace) -> int:
             say(f"no dots are found: starting from {file.name}")
         known = candidates(file, recording.size, None if dots is None else dots.pitch, args.sensor)
         goal = Goal(args.error, args.max_error, args.max_ms)
-        search = Search(goal, args.budget - (time.monotonic() - began), args.seed, say)
-        tuned = search.run(known, recording, folder)
+        tuned = search(known, recording, folder, goal, say)
     if args.json:
         show_json(report.as_json(tuned))
     else:

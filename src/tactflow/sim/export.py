@@ -9,7 +9,6 @@ import csv
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,10 +17,8 @@ from tactflow.sim.scenes import Scene
 from tactflow.sim.truth import Truth
 from tactflow.system.files import completed
 
-TRUTH_SUFFIXES = (".jsonl", ".npz", ".csv")
+TRUTH_SUFFIXES = (".jsonl", ".csv")
 Report = Callable[[int], None]
-_ARRAYS = ("contact_mask", "touching", "area", "depth", "position", "visible")
-"""Attributes of `Truth` that a `.npz` file contains unchanged."""
 
 
 def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
@@ -42,10 +39,8 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
     """Write the truth about all frames, in raw pixel coordinates.
 
     path : `.jsonl` has a JSON object per frame: frame, t (s), touching, center, angle, hull, area, depth,
-        origin, position, visible, mean_flow, null if missing. `.npz` has the same as arrays, and contact_mask
-        (N, H, W) bool: center, angle and mean_flow are 0 where `touching`, `directed` and `has_flow` are
-        false; the hull of frame i is hull[hull_start[i]:hull_start[i + 1]]. It is assembled in memory. `.csv`
-        is the log of a force gauge: t (s), fx, fy, fz (N).
+        origin, position, visible, mean_flow, null if missing. `.csv` is the log of a force gauge: t (s), fx,
+        fy, fz (N). Masks are in `open_scene(name).truth(index)`.
     report : called with the number of frames written so far.
 
     Raises ValueError for an unsupported suffix and OSError if the path is not writable.
@@ -54,7 +49,7 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
     if suffix not in TRUTH_SUFFIXES:
         raise ValueError(f"required the truth as {' or '.join(TRUTH_SUFFIXES)}, got {path.name!r}")
     with completed(path) as partial:
-        {".jsonl": _write_jsonl, ".npz": _write_npz, ".csv": _write_forces}[suffix](scene, partial, report)
+        {".jsonl": _write_jsonl, ".csv": _write_forces}[suffix](scene, partial, report)
 
 
 def frames_writer(path: Path) -> Callable[[Scene, Path, Report], None]:
@@ -139,22 +134,3 @@ def _write_forces(scene: Scene, path: Path, report: Report) -> None:
         table.writerow(["t", "fx", "fy", "fz"])
         for index, truth in _truths(scene, report):
             table.writerow([index / scene.fps, *truth.force])
-
-
-def _write_npz(scene: Scene, path: Path, report: Report) -> None:
-    truths = [truth for _, truth in _truths(scene, report)]
-    arrays: dict[str, Any] = {name: [getattr(truth, name) for truth in truths] for name in _ARRAYS}
-    with path.open("wb") as file:
-        np.savez_compressed(
-            file,
-            **arrays,
-            t=np.arange(len(scene)) / scene.fps,
-            center=[truth.center or (0.0, 0.0) for truth in truths],
-            angle=[truth.angle or 0.0 for truth in truths],
-            directed=[truth.angle is not None for truth in truths],
-            mean_flow=[truth.mean_flow or (0.0, 0.0) for truth in truths],
-            has_flow=[truth.mean_flow is not None for truth in truths],
-            origin=truths[0].origin,
-            hull=np.concatenate([truth.hull for truth in truths]),
-            hull_start=np.cumsum([0] + [len(truth.hull) for truth in truths]),
-        )

@@ -48,9 +48,6 @@ DRAWS: Final = 200
 INTERVAL: Final = (5.0, 95.0)
 """Percentiles of an interval's ends."""
 
-Late = Callable[[], bool]
-"""Whether the time for an evaluation is over."""
-
 
 @dataclass
 class Interval:
@@ -95,20 +92,13 @@ class Trial:
         return self.failure is None and not self.unsound
 
 
-def judge(
-    pipelines: Mapping[str, Pipeline], recordings: Sequence[Rendered], seed: int, late: Late = lambda: False
-) -> list[Trial]:
-    """Measure errors and times of pipelines on simulated recordings, in turns.
-
-    The first recording is always processed completely.
-    """
+def judge(pipelines: Mapping[str, Pipeline], recordings: Sequence[Rendered]) -> list[Trial]:
+    """Measure errors and times of pipelines on simulated recordings, in turns."""
     tallies = {name: Tally() for name in pipelines}
     times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
     scales = dict.fromkeys(pipelines, 1.0)
     failures: dict[str, str] = {}
-    for number, rendered in enumerate(recordings):
-        if number and late():
-            break
+    for rendered in recordings:
         scores = {name: PipelineScore(rendered, tally) for name, tally in tallies.items()}
 
         def observe(name: str, result: TimedResult, scores: Mapping[str, PipelineScore] = scores) -> str:
@@ -119,7 +109,7 @@ def judge(
         ready = {
             n: on_recording(_on_sensor(p), rendered.path) for n, p in pipelines.items() if n not in failures
         }
-        took, failed = take_turns(ready, observe, late=late if number else lambda: False)
+        took, failed = take_turns(ready, observe)
         failures |= failed
         for name, kinds in took.items():
             for kind, samples in kinds.items():
@@ -127,7 +117,7 @@ def judge(
     return [
         Trial(name, failure=failures[name])
         if name in failures
-        else _trial(name, tallies[name], scales[name], times[name], seed)
+        else _trial(name, tallies[name], scales[name], times[name])
         for name in pipelines
     ]
 
@@ -142,7 +132,7 @@ def _on_sensor(pipeline: Pipeline) -> Pipeline:
     )
 
 
-def _trial(name: str, tally: Tally, scale: float, times: Times, seed: int) -> Trial:
+def _trial(name: str, tally: Tally, scale: float, times: Times) -> Trial:
     trial = Trial(name, quantities=tally.errors())
     values = tally.values
     per_frame = {
@@ -152,30 +142,27 @@ def _trial(name: str, tally: Tally, scale: float, times: Times, seed: int) -> Tr
     }
     for kind, errors in per_frame.items():
         if len(errors):
-            trial.errors[kind] = _interval(scale * errors, rms if kind == "dots" else np.mean, seed)
+            trial.errors[kind] = _interval(scale * errors, rms if kind == "dots" else np.mean)
     if trial.errors:
         trial.errors[ANY] = max(trial.errors.values(), key=lambda interval: interval.value)
-    set_time(trial, times, seed)
+    set_time(trial, times)
     return trial
 
 
-def set_time(trial: Trial, times: Times, seed: int) -> None:
+def set_time(trial: Trial, times: Times) -> None:
     """Set the time of frames with contact, or of all but references if there are none."""
     counted = {kind: np.array(samples) * 1e3 for kind, samples in times.items() if kind != "reference"}
     if counted:
         busy = counted.get("contact", np.concatenate(list(counted.values())))
-        trial.ms = _interval(busy, np.median, seed, block=1)
+        trial.ms = _interval(busy, np.median, block=1)
 
 
 def _interval(
-    values: NDArray[np.float64],
-    statistic: Callable[[NDArray[np.float64]], Any],
-    seed: int,
-    block: int = BLOCK,
+    values: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], Any], block: int = BLOCK
 ) -> Interval:
     """A statistic of values (N,) and its interval by a block bootstrap with at least five blocks."""
     blocks = np.array_split(values, min(len(values), max(5, len(values) // block)))
-    draws = np.random.default_rng(seed).integers(0, len(blocks), (DRAWS, len(blocks)))
+    draws = np.random.default_rng(0).integers(0, len(blocks), (DRAWS, len(blocks)))
     drawn = [statistic(np.concatenate([blocks[index] for index in draw])) for draw in draws]
     low, high = np.percentile(drawn, INTERVAL)
     return Interval(float(statistic(values)), float(low), float(high))
@@ -194,12 +181,11 @@ def mark_unsound(trials: Sequence[Trial]) -> None:
 
 
 def measure_on_recording(
-    pipelines: Mapping[str, Pipeline], trials: Sequence[Trial], recording: Recording, seed: int, late: Late
-) -> bool:
+    pipelines: Mapping[str, Pipeline], trials: Sequence[Trial], recording: Recording
+) -> None:
     """Run pipelines on the recording, in turns; set the times, checks and failures of their trials.
 
-    pipelines : name -> pipeline; the first, the most expensive, is the baseline of the checks. late : whether
-    to stop. Returns whether there was enough time; if not, only failures are set.
+    pipelines : name -> pipeline; the first, the most expensive, is the baseline of the checks.
     """
     centers: dict[str, list[NDArray[np.float64] | None]] = {name: [] for name in pipelines}
 
@@ -210,15 +196,13 @@ def measure_on_recording(
         return "idle" if contact is None else "contact"
 
     ready = {name: on_recording(pipeline, recording.path) for name, pipeline in pipelines.items()}
-    times, failures = take_turns(ready, observe, late=late)
+    times, failures = take_turns(ready, observe)
     done = [name for name in pipelines if name not in failures]
-    complete = bool(done) and len(centers[done[0]]) == recording.frames
     for trial in trials:
         trial.failure = trial.failure or failures.get(trial.name)
-        if complete and trial.name in done:
-            set_time(trial, times[trial.name], seed)
+        if trial.name in done:
+            set_time(trial, times[trial.name])
             trial.checks = _compared(centers[trial.name], centers[done[0]])
-    return complete
 
 
 def _compared(

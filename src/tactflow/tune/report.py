@@ -19,10 +19,9 @@ from tactflow.tune.space import ORIGINAL
 
 def sections(tuned: Tuned) -> list[Section]:
     """How the pipelines were measured, a table of them, and the chosen one on the recording."""
-    timed = "on the recording" if tuned.timed_on_recording else "simulated"
     facts = [
         f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}",
-        f"errors: px of the camera image, simulated; time: CPU of a frame with contact, {timed}",
+        "errors: px of the camera image, simulated; time: CPU of a frame with contact, on the recording",
         *tuned.notes,
     ]
     kinds = [kind for kind in ERRORS if kind != ANY and any(kind in trial.errors for trial in tuned.trials)]

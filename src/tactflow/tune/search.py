@@ -1,15 +1,12 @@
-"""Try all candidates on a few simulated frames, then the best on more frames and on the recording."""
+"""Measure all candidates on the fitted simulator and on the recording, and choose one."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
-
-import numpy as np
 
 from tactflow.bench.report import pareto
 from tactflow.bench.scenes import Case
@@ -19,15 +16,9 @@ from tactflow.tune.recording import Recording
 from tactflow.tune.sensor import Fitted, Look, fit
 from tactflow.tune.space import ORIGINAL, Candidate
 
-FIRST: Final = (Case("press", 24),)
-"""Simulated recordings for all candidates: one contact."""
-LAST: Final = (Case("press", 140), Case("slide", 80))
-"""Simulated recordings for the finalists: several depths and positions, and a drag. No cable: whether its
-ends are detected under light pressure is random."""
-GROUP: Final = 6
-"""Candidates evaluated in turns in the first round; the budget is checked between groups."""
-FINALISTS: Final = 6
-"""Candidates of the last round, in addition to the original, the most expensive one and the Pareto front."""
+SIMULATED: Final = (Case("press", 140), Case("slide", 80))
+"""Simulated recordings: several depths and positions, and a drag. No cable: whether its ends are detected
+under light pressure is random."""
 ERROR_FACTOR: Final = 1.5
 """Without a budget, the largest acceptable error relative to the smallest. Chosen by hand."""
 FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask.method"})
@@ -76,9 +67,8 @@ class Goal:
 class Tuned:
     """Result of a search.
 
-    trials : of the last round, best first. front : names on the Pareto front of time and error. chosen : None
-    if no candidate is within the budgets. notes : steps skipped for lack of time. timed_on_recording :
-    whether times were measured on the recording or on simulated frames.
+    trials : of all candidates, best first. front : names on the Pareto front of time and error. chosen : None
+    if no candidate is within the budgets. notes : remarks on the choice.
     """
 
     recording: Recording
@@ -88,115 +78,78 @@ class Tuned:
     front: list[str] = field(default_factory=list[str])
     chosen: Candidate | None = None
     notes: list[str] = field(default_factory=list[str])
-    timed_on_recording: bool = False
 
 
-@dataclass
-class Search:
-    """A search for the best pipeline.
+def search(
+    known: Sequence[Candidate],
+    recording: Recording,
+    folder: Path,
+    goal: Goal,
+    say: Callable[[str], None] = lambda _: None,
+) -> Tuned:
+    """Measure all candidates, and choose the best.
 
-    seconds : time budget, checked after each group of the first round, each simulated recording, and every 20
-    frames of the recording. seed : for simulated recordings and bootstrap intervals. say : called with
-    progress messages.
+    known : the candidates, most expensive first. folder : for temporary files. say : called with progress
+    messages.
+
+    Raises
+    ------
+    SourceError
+        No candidate detects the contacts of the simulated sensor.
     """
+    tuned = Tuned(recording, fit(recording), goal)
+    say(f"fitted simulator: {tuned.look}")
+    pipelines = {candidate.name: candidate.pipeline for candidate in known}
+    say(f"{len(pipelines)} candidates on {sum(case.frames for case in SIMULATED)} simulated frames")
+    tuned.trials = judge(pipelines, [Fitted(tuned.look, case, folder, case.frames) for case in SIMULATED])
+    mark_unsound(tuned.trials)
+    _mark_unjudged_flow(tuned.trials, known)
+    _refuse_none(tuned.trials, goal)
+    running = {trial.name: pipelines[trial.name] for trial in tuned.trials if trial.failure is None}
+    say(f"{len(running)} candidates on {recording.frames} frames of the recording")
+    measure_on_recording(running, tuned.trials, recording)
+    _refuse_none(tuned.trials, goal)
+    name = _choice(tuned)
+    tuned.chosen = next((candidate for candidate in known if candidate.name == name), None)
+    tuned.front = front(tuned.trials, goal.kind)
+    tuned.trials = goal.order(tuned.trials)
+    return tuned
 
-    goal: Goal
-    seconds: float = 120.0
-    seed: int = 0
-    say: Callable[[str], None] = lambda _: None
 
-    def run(self, known: Sequence[Candidate], recording: Recording, folder: Path) -> Tuned:
-        """Run the search.
+def _mark_unjudged_flow(trials: Sequence[Trial], known: Sequence[Candidate]) -> None:
+    """Mark trials with another mean flow as unsound where none could be compared with the truth."""
+    if any("flow" in trial.errors for trial in trials):
+        return
+    changed = {candidate.name for candidate in known if candidate.settings.keys() & FLOW}
+    for trial in trials:
+        if trial.name in changed and trial.usable:
+            trial.unsound = "its mean flow could not be judged: too few dots in the contact"
 
-        known : the candidates, most expensive first. folder : for temporary files.
 
-        Raises
-        ------
-        SourceError
-            No candidate detects the contacts of the simulated sensor.
-        """
-        self._began, self._folder = time.monotonic(), folder
-        tuned = Tuned(recording, fit(recording), self.goal)
-        self.say(f"fitted simulator: {tuned.look}")
-        # The others in random order, as the time may be over before all were tried.
-        first = [known[0], *(c for c in known[1:] if c.name == ORIGINAL)]
-        others = [c for c in known if c not in first]
-        order = np.random.default_rng(self.seed).permutation(len(others))
-        tuned.trials = self._round([*first, *(others[index] for index in order)], FIRST, tuned, GROUP)
-        finalists = self._finalists(known, tuned.trials)
-        if self._is_over(0.5):
-            tuned.notes.append("out of time after the first round")
-            names = {candidate.name for candidate in finalists}
-            tuned.trials = [trial for trial in tuned.trials if trial.name in names]
-        else:
-            tuned.trials = self._round(finalists, LAST, tuned, len(finalists))
-        running = {trial.name for trial in tuned.trials if trial.failure is None}
-        pipelines = {c.name: c.pipeline for c in finalists if c.name in running}
-        self.say(f"{len(pipelines)} candidates on {recording.frames} frames of the recording")
-        tuned.timed_on_recording = measure_on_recording(
-            pipelines, tuned.trials, recording, self.seed, self._is_over
-        )
-        if not tuned.timed_on_recording:
-            tuned.notes.append("out of time during the recording: times are of simulated frames")
-        name = self._choice(tuned)
-        tuned.chosen = next((candidate for candidate in finalists if candidate.name == name), None)
-        tuned.front = front(tuned.trials, self.goal.kind)
-        tuned.trials = self.goal.order(tuned.trials)
-        return tuned
+def _refuse_none(trials: Sequence[Trial], goal: Goal) -> None:
+    """Raise SourceError if no trial can be chosen."""
+    if any(trial.usable and math.isfinite(trial.of(goal.kind)) for trial in trials):
+        return
+    reasons = [trial.failure or trial.unsound for trial in trials if not trial.usable]
+    why = reasons[0] if reasons else f"none has a {ERRORS[goal.kind]}"
+    raise SourceError(
+        f"no pipeline works on the simulated sensor: {why}; see tactflow doctor, and tactflow detect"
+    )
 
-    def _is_over(self, share: float = 1.0) -> bool:
-        """Whether a fraction of the time budget has passed."""
-        return time.monotonic() - self._began > share * self.seconds
 
-    def _finalists(self, known: Sequence[Candidate], trials: Sequence[Trial]) -> list[Candidate]:
-        """Select the most expensive, the original, the best and the front."""
-        runs = {trial.name for trial in trials if trial.failure is None}
-        best = [trial.name for trial in self.goal.order(trials) if trial.usable][:FINALISTS]
-        chosen = {known[0].name, ORIGINAL, *best, *front(trials, self.goal.kind)}
-        return [candidate for candidate in known if candidate.name in chosen & runs]
-
-    def _round(
-        self, known: Sequence[Candidate], cases: Sequence[Case], tuned: Tuned, size: int
-    ) -> list[Trial]:
-        """Evaluate candidates on simulated recordings, `size` of them in turns, until half of the budget has
-        passed."""
-        self.say(f"{len(known)} candidates on {sum(case.frames for case in cases)} simulated frames")
-        rendered = [Fitted(tuned.look, case, self._folder, self.seed + case.frames) for case in cases]
-        trials: list[Trial] = []
-        for start in range(0, len(known), size):
-            if trials and self._is_over(0.5):
-                tuned.notes.append(f"out of time after {len(trials)} of {len(known)} candidates")
-                break
-            pipelines = {candidate.name: candidate.pipeline for candidate in known[start : start + size]}
-            trials += judge(pipelines, rendered, self.seed, self._is_over)
-        mark_unsound(trials)
-        if not any("flow" in trial.errors for trial in trials):
-            changed = {candidate.name for candidate in known if candidate.settings.keys() & FLOW}
-            for trial in trials:
-                if trial.name in changed and trial.usable:
-                    trial.unsound = "its mean flow could not be judged: too few dots in the contact"
-        kind = self.goal.kind
-        if not any(trial.usable and math.isfinite(trial.of(kind)) for trial in trials):
-            reasons = [trial.failure or trial.unsound for trial in trials if not trial.usable]
-            why = reasons[0] if reasons else f"none has a {ERRORS[kind]}"
-            raise SourceError(
-                f"no pipeline works on the simulated sensor: {why}; see tactflow doctor, and tactflow detect"
-            )
-        return trials
-
-    def _choice(self, tuned: Tuned) -> str | None:
-        """Name of the best candidate likely to be within the budgets, else of the best nominally within."""
-        goal = self.goal
-        bound = goal.error_limit(tuned.trials)
-        picked = [trial for trial in goal.order(tuned.trials) if trial.usable and goal.keeps(trial, bound)]
-        if goal.max_error is not None:
-            likely = [trial for trial in picked if trial.errors[goal.kind].likely <= bound]
-            if picked and not likely:
-                tuned.notes.append("the budget lies within the interval of the chosen pipeline's error")
-            picked = likely or picked
-        # Keep the original unless the best is significantly faster.
-        same = [trial for trial in picked if trial.name == ORIGINAL and trial.ms.value <= picked[0].ms.high]
-        return [*same, *picked][0].name if picked else None
+def _choice(tuned: Tuned) -> str | None:
+    """Name of the best candidate likely to be within the budgets, else of the best nominally within."""
+    goal = tuned.goal
+    bound = goal.error_limit(tuned.trials)
+    picked = [trial for trial in goal.order(tuned.trials) if trial.usable and goal.keeps(trial, bound)]
+    if goal.max_error is not None:
+        likely = [trial for trial in picked if trial.errors[goal.kind].likely <= bound]
+        if picked and not likely:
+            tuned.notes.append("the budget lies within the interval of the chosen pipeline's error")
+        picked = likely or picked
+    # Keep the original unless the best is significantly faster.
+    same = [trial for trial in picked if trial.name == ORIGINAL and trial.ms.value <= picked[0].ms.high]
+    return [*same, *picked][0].name if picked else None
 
 
 def front(trials: Sequence[Trial], kind: str) -> list[str]:
