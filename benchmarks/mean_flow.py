@@ -2,7 +2,7 @@
 
     python -m benchmarks.mean_flow [--scenes 150] [--seeds 1 2]
 
-Named scenes of the simulator, and random gels far beyond any single sensor (`tactflow.sim.wide`), all
+Named scenes of the simulator, and random gels far beyond any single sensor (`benchmarks/wide.py`), all
 through the pipeline `default`. Columns: RMS error of the mean flow, px; median of its stated error, px; share
 of errors within one and within two stated errors, %; median overlap (IoU) of the contact's region with the
 true one; frames. Random gels are split by that overlap: below 0.3 the contact was found somewhere else.
@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 import tactflow
+from benchmarks.wide import WideScene, wide_scene
 from tactflow.bench.metrics import mask_iou
 from tactflow.cli.terminal import show, table
 from tactflow.engine.errors import TactflowError
 from tactflow.message.result import Result
 from tactflow.sim import open_scene
-from tactflow.sim.wide import WideScene, wide_scene
 from tactflow.vision.arrays import Floats
 from tactflow.vision.types import MarkerStatus
 

@@ -1,7 +1,7 @@
-"""Train the contact network on the random scenes of `tactflow.sim.wide`, and on nothing else.
+"""Train the contact network on the random scenes of `benchmarks/wide.py`, and on nothing else.
 
     pip install "tactflow[train]"
-    python benchmarks/train_contact.py
+    python -m benchmarks.train_contact
 
 The result replaces src/tactflow/vision/contact/contact.onnx. Scenes, weights and order follow from fixed
 seeds. `--scenes` and `--steps` are for shorter trials.
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 import tactflow.vision.contact as room
-from tactflow.sim.wide import WideScene, wide_scene
+from benchmarks.wide import WideScene, wide_scene
 from tactflow.vision.contact.change import CELLS, PLANES, Untouched, to_cells
 from tactflow.vision.contact.network import WEIGHTS
 from tactflow.vision.markers.inpaint import remove_markers

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from tactflow.drawing.film import CODECS, LOSSLESS_CODECS, Film
+from tactflow.drawing.film import CODECS, Film
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.frame import Tick
 from tactflow.ports import Picture
@@ -32,9 +32,6 @@ class Video(Sink):
             description="file: .avi (MJPG), .mkv, .mp4, .m4v, .mov (MPEG-4); relative to the current "
             "directory. An .avi survives a killed process, an .mp4 does not",
         )
-        lossless: bool = Field(
-            False, description="keep every bit (HFYU, else FFV1; .avi or .mkv): about a third of the raw size"
-        )
         fps: float | None = Field(
             None, gt=0, le=1000, description="rate of the file, frames per second; default: as captured"
         )
@@ -42,12 +39,8 @@ class Video(Sink):
 
         @model_validator(mode="after")
         def _known_extension(self) -> Video.Params:
-            known = LOSSLESS_CODECS if self.lossless else CODECS
-            if Path(self.path).suffix.lower() not in known:
-                kind = "a lossless video" if self.lossless else "a video"
-                raise ValueError(
-                    f"required a path that ends in {', '.join(known)} for {kind}, got {self.path!r}"
-                )
+            if Path(self.path).suffix.lower() not in CODECS:
+                raise ValueError(f"required a path that ends in {', '.join(CODECS)}, got {self.path!r}")
             return self
 
     def __init__(self, params: Params) -> None:
@@ -70,10 +63,10 @@ class Video(Sink):
     def open(self) -> None:
         """Create the file and its folder.
 
-        Raises StageError if the file exists, is a pipe or device, cannot be written, or cannot be lossless.
+        Raises StageError if the file exists, is a pipe or device, or cannot be written.
         """
         p = self.params
-        self._film = Film(self._path, lossless=p.lossless, fps=p.fps, overwrite=p.overwrite)
+        self._film = Film(self._path, fps=p.fps, overwrite=p.overwrite)
 
     def counters(self) -> dict[str, int]:
         """frames : written so far."""

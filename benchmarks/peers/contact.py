@@ -29,6 +29,7 @@ from benchmarks.peers.common import (
     turns,
 )
 from benchmarks.peers.dots import FIRST_WIDE
+from benchmarks.wide import WideScene, wide_scene
 from tactflow import Frame, Result
 from tactflow.bench import judge
 from tactflow.bench.label_file import FrameLabel, load_labels
@@ -39,7 +40,6 @@ from tactflow.bench.scenes import Case
 from tactflow.bench.score import add_decision, add_geometry, add_mask
 from tactflow.classic.functions import difference, mask_marker
 from tactflow.config.shipped import find_pipeline
-from tactflow.sim.wide import WideScene, wide_scene
 from tactflow.sources import open_source
 from tactflow.sources.files import load_image, to_bgr
 from tactflow.vision.geometry import PixelMapping

@@ -26,6 +26,7 @@ from benchmarks.peers.common import (
     search,
     turns,
 )
+from benchmarks.wide import WideScene, wide_scene
 from tactflow import Markers, MarkerStatus, MarkerTracker
 from tactflow.bench import judge_dots
 from tactflow.bench.label_file import load_labels
@@ -34,7 +35,6 @@ from tactflow.bench.scenes import Case
 from tactflow.bench.score import MarkerScore
 from tactflow.classic.functions import marker_center
 from tactflow.classic.tracker import GridTracker
-from tactflow.sim.wide import WideScene, wide_scene
 from tactflow.vision.arrays import Floats
 
 FIRST_WIDE: Final = 2_000_000

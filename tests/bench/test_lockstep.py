@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -94,16 +93,6 @@ def test_what_came_before_a_failure_is_kept_and_then_it_is_raised(pipeline: Pipe
         with pytest.raises(TactflowError, match="too bright"):
             lockstep.block(4)
     lockstep.close()
-
-
-def test_every_stage_runs_in_one_thread_and_none_is_left(pipeline: Pipeline, tmp_path: Path) -> None:
-    before = threading.active_count()
-    lockstep = LockstepPipeline(recorded(pipeline, tmp_path, 1, 2, 3))
-    lockstep.block(1)
-    # One for the engine's run, one for its only segment.
-    assert threading.active_count() == before + 2
-    lockstep.close()
-    assert threading.active_count() == before
 
 
 def test_pipelines_take_turns_and_each_sees_every_frame_once(pipeline: Pipeline, tmp_path: Path) -> None:

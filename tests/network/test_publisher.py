@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import closing
 
 import pytest
 import zmq
 
-from tactflow.engine.contract import Publication
-from tactflow.fleet.relay import relay
 from tactflow.network.publisher import MOST_EVENTS, SEND_BUFFER, Publisher
-from tests.clock import PATIENCE
 
 TOPIC = b"tactflow.main "
 FLOOD = 5 * MOST_EVENTS
@@ -48,31 +44,6 @@ def test_a_flood_of_subscriptions_is_read_in_parts_and_answers_stay_right(publis
         reader.unsubscribe(b"tactflow.")
         _read_until(publisher, 0)
         assert not publisher.is_subscribed(TOPIC)
-
-
-def test_a_flood_through_the_relay_loses_no_subscription_while_a_sensor_is_busy(publisher: Publisher) -> None:
-    busy = Publisher("tcp://127.0.0.1:*", 32, SEND_BUFFER)
-    finder = Publisher("tcp://127.0.0.1:*", 32, SEND_BUFFER)
-    finder.close()
-    with (
-        closing(busy),
-        relay(Publication(finder.endpoint, 32), [publisher.endpoint, busy.endpoint]),
-        zmq.Context() as context,
-        context.socket(zmq.SUB) as flood,
-        context.socket(zmq.SUB) as reader,
-    ):
-        for socket in (flood, reader):
-            socket.setsockopt(zmq.SNDHWM, 0)
-            socket.linger = 0
-            socket.connect(finder.endpoint)
-        for number in range(FLOOD):
-            flood.subscribe(b"tactflow.%d" % number)
-        _read_until(publisher, FLOOD)
-        reader.subscribe(TOPIC)
-        assert publisher.wait_for(TOPIC, PATIENCE)
-        assert busy.wait_for(TOPIC, 10)
-        busy.send(TOPIC + b"{}")
-        assert reader.poll(1000 * PATIENCE)
 
 
 def _read_until(publisher: Publisher, count: int) -> list[int]:

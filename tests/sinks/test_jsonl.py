@@ -29,8 +29,6 @@ def write(sink: Jsonl, seqs: range) -> None:
         sink.write(Result(Frame("main", seq, seq / 10.0, IMAGE)))
 
 
-
-
 def seqs_in(path: Path) -> list[int]:
     text = path.read_text()
     assert text == "" or text.endswith("\n")

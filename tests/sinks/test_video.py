@@ -57,15 +57,6 @@ def test_every_frame_is_in_the_film(suffix: str, count: int, tmp_path: Path) -> 
     assert [entry.name for entry in path.parent.iterdir()] == [path.name], "nothing else may be left there"
 
 
-@pytest.mark.parametrize("suffix", [".avi", ".mkv"])
-@pytest.mark.parametrize("size", [(48, 64), (47, 63)])
-def test_a_lossless_film_gives_back_every_bit(suffix: str, size: tuple[int, int], tmp_path: Path) -> None:
-    shown = pictures(15, *size)
-    film(tmp_path / f"film{suffix}", shown, lossless=True)
-    back = [frame[: size[0], : size[1]] for frame in play(tmp_path / f"film{suffix}")[0]]
-    np.testing.assert_array_equal(back, shown)
-
-
 def test_odd_sizes_lose_no_row_and_no_column(tmp_path: Path) -> None:
     picture = np.zeros((47, 63, 3), np.uint8)
     picture[46] = picture[:, 62] = 200
@@ -114,7 +105,6 @@ def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
     [
         ({"path": "film"}, "required a path that ends in"),
         ({"path": "film.gif"}, "required a path that ends in"),
-        ({"path": "film.mp4", "lossless": True}, "lossless"),
         ({"fps": 0}, "greater than 0"),
     ],
 )

@@ -48,18 +48,35 @@ print(*compiled.load(), loops.twice(3), loops.after(7), loops.total(np.arange(4)
 RESULTS = "6 8 6\n"
 
 
+def write_program(folder: Path) -> Path:
+    (folder / "loops.py").write_text(MODULE)
+    (folder / "program.py").write_text(PROGRAM)
+    return folder
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "loops.py").write_text(MODULE)
-    (tmp_path / "program.py").write_text(PROGRAM)
-    return tmp_path
+    """A program with loops that nobody has compiled."""
+    return write_program(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
+    """The run that compiles the loops of `kept`."""
+    return run(write_program(tmp_path_factory.mktemp("kept")))
+
+
+@pytest.fixture
+def compiled(first: subprocess.CompletedProcess[str]) -> Path:
+    """A program whose loops are compiled."""
+    return Path(first.args[1]).parent
 
 
 def run(folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run PROGRAM; loops are kept in `kept` unless said otherwise."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kept"), **variables}
     environment = {name: value for name, value in environment.items() if value}
-    command = [sys.executable, "program.py"]
+    command = [sys.executable, str(folder / "program.py")]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
 
 
@@ -102,31 +119,31 @@ def test_a_kernel_refuses_types_that_its_signature_does_not_name() -> None:
             _running_sum(np.arange(4.0), wrong)
 
 
-def test_what_was_compiled_once_is_read_from_disk_without_a_word(folder: Path) -> None:
-    first, second = run(folder), run(folder)
+def test_what_was_compiled_once_is_read_from_disk_without_a_word(
+    first: subprocess.CompletedProcess[str], compiled: Path
+) -> None:
+    second = run(compiled)
     assert first.stdout == f"3 3 {RESULTS}"
     assert first.stderr.startswith("tactflow: compiling loops for this processor, once: 1 of 3 are done\n")
     assert (second.stdout, second.stderr) == (f"3 0 {RESULTS}", "")
 
 
-def test_damaged_files_are_replaced(folder: Path) -> None:
-    run(folder)
-    kept = folder / "kept"
+def test_damaged_files_are_replaced(compiled: Path) -> None:
+    kept = compiled / "kept"
     for empty, zeros in (("twice*.nbi", "total*.nbc"), ("twice*.nbc", "total*.nbi")):
         for pattern, content in ((empty, b""), (zeros, bytes(300))):
             (file,) = kept.rglob(f"loops.{pattern}")
             file.write_bytes(content)
-        assert run(folder).stdout == f"3 2 {RESULTS}"
-    assert run(folder).stdout == f"3 0 {RESULTS}"
+        assert run(compiled).stdout == f"3 2 {RESULTS}"
+    assert run(compiled).stdout == f"3 0 {RESULTS}"
 
 
-def test_machine_code_with_flipped_bits_is_made_anew_with_a_line(folder: Path) -> None:
-    run(folder)
-    for file in (folder / "kept").rglob("loops.t*.nbc"):
+def test_machine_code_with_flipped_bits_is_made_anew_with_a_line(compiled: Path) -> None:
+    for file in (compiled / "kept").rglob("loops.t*.nbc"):
         code = np.frombuffer(file.read_bytes(), np.uint8).copy()
         code[len(code) // 4 :: 97] ^= 0x10
         file.write_bytes(code.tobytes())
-    second, third = run(folder), run(folder)
+    second, third = run(compiled), run(compiled)
     assert (second.stdout, third.stdout, third.stderr) == (f"3 2 {RESULTS}", f"3 0 {RESULTS}", "")
     assert "loops.twice: its compiled code on disk is damaged" in second.stderr
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import shutil
 import statistics
-import tempfile
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from tactflow.system.outputs import create, refuse_interference
 log = logging.getLogger("tactflow")
 
 CODECS = {".avi": "MJPG", ".mkv": "mp4v", ".mp4": "mp4v", ".m4v": "mp4v", ".mov": "mp4v"}
-LOSSLESS_CODECS = {".avi": ("HFYU", "FFV1"), ".mkv": ("HFYU", "FFV1")}
 FRAMES_TO_MEASURE_RATE = 12
 """Frames held back at the start, because their rate is not known before. Chosen by hand."""
 MIN_FREE_BYTES = 16 << 20
@@ -34,8 +32,8 @@ class Film:
 
     Parameters
     ----------
-    path : the file; its extension chooses the codec. lossless : keep every bit. fps : frames per second, or
-    None, the rate of the first frames. overwrite : replace an existing file.
+    path : the file; its extension chooses the codec. fps : frames per second, or None, the rate of the first
+    frames. overwrite : replace an existing file.
 
     Raises
     ------
@@ -46,9 +44,7 @@ class Film:
     frames : written so far.
     """
 
-    def __init__(
-        self, path: Path, *, lossless: bool = False, fps: float | None = None, overwrite: bool = False
-    ) -> None:
+    def __init__(self, path: Path, *, fps: float | None = None, overwrite: bool = False) -> None:
         self.frames = 0
         self._path = path
         self._fps = fps
@@ -57,8 +53,7 @@ class Film:
         self._size: tuple[int, int] | None = None
         create(path, overwrite=overwrite)
         self._ours = path.stat()
-        suffix = path.suffix.lower()
-        self._codec = self._lossless_codec(suffix) if lossless else CODECS[suffix]
+        self._codec = CODECS[path.suffix.lower()]
 
     def add(self, t: float, picture: NDArray[np.uint8]) -> None:
         """Add one frame. t : its time, s. picture : (H, W, 3) uint8 BGR.
@@ -126,27 +121,6 @@ class Film:
         height, width = picture.shape[:2]
         writer.write(cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
         self.frames += 1
-
-    def _lossless_codec(self, suffix: str) -> str:
-        """A codec that gives back every bit of a small film: some silently halve the colours' resolution."""
-        # Noise has detail in every channel.
-        frames = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
-        with tempfile.TemporaryDirectory(dir=self._path.parent, prefix=".tactflow-") as folder:
-            for codec in LOSSLESS_CODECS[suffix]:
-                probe = str(Path(folder, f"{codec}{suffix}"))
-                writer = cv2.VideoWriter(
-                    probe, cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), 30.0, (64, 48)
-                )
-                for frame in frames:
-                    writer.write(frame)
-                writer.release()
-                capture = cv2.VideoCapture(probe, cv2.CAP_FFMPEG)
-                same = all(np.array_equal(frame, capture.read()[1]) for frame in frames)
-                capture.release()
-                if same:
-                    return codec
-        self._path.unlink()
-        raise StageError(f"{self._path}: this OpenCV cannot encode {suffix} losslessly; try .avi or .mkv")
 
 
 def film_problem(path: Path, frames: int) -> str | None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.wide import wide_scene
 from tactflow.bench.metrics import mask_iou
 from tactflow.sim import open_scene
-from tactflow.sim.wide import wide_scene
 from tactflow.vision.contact import LearnedDetector
 from tactflow.vision.geometry import Preprocessor
 

@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.geometry.downsample import halved
 
 Image = NDArray[np.uint8]
 
@@ -23,26 +22,6 @@ def plain_halved(picture: Image) -> Image:
     height, width = picture.shape[0] // 2, picture.shape[1] // 2
     whole = np.ascontiguousarray(picture[: 2 * height, : 2 * width])
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-
-
-@pytest.mark.parametrize("size", [(2, 2), (3, 5), (8, 7), (64, 131), (150, 401)], ids=str)
-def test_halves_are_those_of_opencv_to_the_bit(size: tuple[int, int]) -> None:
-    picture = noise(*size)
-    # Sums of which every remainder occurs, also with the largest values.
-    picture[:1, :, 0], picture[1:, :, 0] = 255, 254
-    assert np.array_equal(halved(picture), plain_halved(picture))
-
-
-def test_a_block_is_halved_as_if_it_were_cut_out_first() -> None:
-    picture = noise(40, 60)
-    block = slice(3, 32), slice(5, 48)
-    expected = plain_halved(picture[block])
-    assert np.array_equal(halved(picture, block), expected)
-    strided = np.dstack([picture, picture])[:, :, ::2]
-    assert np.array_equal(halved(strided, block), plain_halved(strided[block]))
-    into = np.zeros_like(expected)
-    assert halved(picture, block, into=into) is into
-    assert np.array_equal(into, expected)
 
 
 @pytest.mark.parametrize("rotate", [0, 90, 180, 270])

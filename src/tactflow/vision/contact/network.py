@@ -1,7 +1,7 @@
 """The network that says how likely each place of a gel is in contact.
 
 A convolutional encoder and decoder (U-Net; Ronneberger, Fischer, Brox, MICCAI 2015) with 72,000 weights,
-trained on the random scenes of `tactflow.sim.wide` by `benchmarks/train_contact.py`, and on no recording.
+trained on the random scenes of `benchmarks/wide.py` by `benchmarks/train_contact.py`, and on no recording.
 """
 
 from __future__ import annotations
