@@ -82,5 +82,5 @@ def test_the_wheel_runs_in_a_fresh_environment_and_compiles_nothing_after_warmup
     assert str(tmp_path / "venv") in where
     assert any(line.startswith("hull") for line in lines)
     assert "0 True 0" in lines
-    assert "mini.yaml: OK" in lines[-1]
+    assert any("mini.yaml: OK" in line for line in lines)
     assert len((empty / "out.jsonl").read_text().splitlines()) == 30

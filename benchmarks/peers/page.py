@@ -73,7 +73,6 @@ def text(numbers: Numbers, picture: str) -> str:
     }
     others = {
         "machine": [", ".join(f"{key} {value}" for key, value in numbers["machine"].items())],
-        "better": ["; ".join(better(tables))],
         "picture": [picture],
         "settings": ["; ".join(settings(numbers))],
         "attempts": attempts(numbers["attempts"]),
@@ -121,20 +120,6 @@ def table(numbers: Numbers, columns: Sequence[Column], methods: Sequence[str]) -
             is_better = value is not None and sign * (float(shown) - float(format(ours, form))) > 0
             cells.append(f"**{shown}**" if is_better else shown)
         yield f"| {method} | " + " | ".join(cells) + " |"
-
-
-def better(tables: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """What a peer does better than tactflow's default: the bold numbers, but for memory and lines."""
-    for name, (header, _, first, *rows) in tables.items():
-        headings, ours = header.strip("| ").split(" | "), first.strip("| ").split(" | ")[1:]
-        for row in rows:
-            method, *cells = row.strip("| ").split(" | ")
-            kind = ""
-            for heading, cell, beaten in zip(headings, cells, ours, strict=True):
-                kind = heading.partition(": ")[0] + ": " if ": " in heading else kind
-                if cell.startswith("**") and "tactflow" not in method and heading not in ("MB", "lines"):
-                    where = heading if ": " in heading else kind + heading
-                    yield f"{method}, {name}, {where} {cell.strip('*')} instead of {beaten}"
 
 
 def settings(numbers: Numbers) -> Iterator[str]:

@@ -27,7 +27,6 @@ def test_what_a_peer_does_better_is_bold() -> None:
     methods = [*numbers["error"], "unknown"]
     rows = list(page.table(numbers, [("where: error", "error|*", ".2f", -1)], methods))
     assert [row.split(" | ")[-1] for row in rows[2:]] == ["0.20 |", "**0.10** |", "0.20 |", "0.30 |", "- |"]
-    assert list(page.better({"dots": rows})) == ["better, dots, where: error 0.10 instead of 0.20"]
 
 
 def test_tactflow_is_measured_where_no_peer_is_installed(tmp_path: Path) -> None:

@@ -48,9 +48,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     [
         ("press", "default", True),
         ("halo", "markerless", False),
-        ("bright_dots", "default", True),
         ("painted", "default", True),
-        ("mixed", "default", True),
     ],
 )
 def test_a_script_takes_the_proposals_and_the_file_finds_the_contacts(

@@ -27,7 +27,7 @@ def test_a_detector_ends_every_one_of_many_contacts(method: str) -> None:
 
 
 def test_the_marker_error_of_the_default_pipeline_does_not_grow(tmp_path: Path) -> None:
-    cycle, presses, random = 40, 4, np.random.default_rng(0)
+    cycle, presses, random = 40, 3, np.random.default_rng(0)
     scene = tactflow.open_scene(f"press?frames={cycle}&noise=0")
     pictures = [scene.frame(index) for index in range(cycle)]
     np.save(tmp_path / "frames.npy", [noisy(picture, random) for picture in pictures * presses])

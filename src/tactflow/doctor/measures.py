@@ -10,10 +10,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import MAD_TO_SIGMA, ColorImage
 from tactflow.vision.markers import Detection
 from tactflow.vision.markers.lattice import corners
 
-Image = NDArray[np.uint8]
 Gray = NDArray[np.float32]
 
 TILE: Final = 16
@@ -39,8 +39,8 @@ class Pair(NamedTuple):
     """
 
     number: int
-    image: Image
-    after: Image | None
+    image: ColorImage
+    after: ColorImage | None
 
 
 class Lattice(NamedTuple):
@@ -56,15 +56,15 @@ class Lattice(NamedTuple):
 
 def spread(values: NDArray[Any]) -> float:
     """Robust standard deviation of values around 0, from the median absolute value."""
-    return 1.4826 * float(np.median(np.abs(values)))
+    return MAD_TO_SIGMA * float(np.median(np.abs(values)))
 
 
-def grey(image: Image) -> Gray:
+def grey(image: ColorImage) -> Gray:
     """(H, W, 3) uint8 BGR to (H, W) float32 of whole grey levels."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.float32)
 
 
-def temporal_noise(first: Image, second: Image) -> float:
+def temporal_noise(first: ColorImage, second: ColorImage) -> float:
     """Standard deviation of the noise of a frame, grey levels, from two consecutive frames.
 
     first, second : (H, W, 3) uint8. Robust to motion in up to three quarters of the picture.
@@ -77,11 +77,11 @@ def temporal_noise(first: Image, second: Image) -> float:
     return _calm_deviation(first.astype(np.float32) - second) / 2**0.5
 
 
-def spatial_noise(image: Image) -> float:
+def spatial_noise(image: ColorImage) -> float:
     """Standard deviation of the noise of a single frame, grey levels; texture adds to it.
 
     image : (H, W, 3) uint8. The difference of two Laplacians cancels slopes and edges along the axes (J.
-    Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding 64, 1996).
+    Immerkaer, "Fast noise variance estimation", Computer Vision and ColorImage Understanding 64, 1996).
     """
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     return _calm_deviation(np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel), np.float32)) / 6.0
@@ -108,7 +108,7 @@ def _calm_deviation(values: NDArray[np.float32]) -> float:
     return float(np.sqrt(np.percentile(variance, 25.0)))
 
 
-def exposure(image: Image) -> tuple[float, float]:
+def exposure(image: ColorImage) -> tuple[float, float]:
     """Level and clipped share of a frame (H, W, 3) uint8, without the black surround.
 
     The level is the 95th percentile of the gel's brightest channel, grey levels, because a dark gel with
@@ -168,7 +168,7 @@ def jpeg_step(gray: Gray) -> float | None:
 
     gray : (H, W) float32, whole grey levels of one frame, not cropped. The coefficients of its blocks are
     multiples of the step (Z. Fan and R. L. de Queiroz, "Identification of bitmap compression history", IEEE
-    Trans. Image Processing 12, 2003).
+    Trans. ColorImage Processing 12, 2003).
     """
     height, width = (side - side % BLOCK for side in gray.shape)
     blocks = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
@@ -244,13 +244,13 @@ def _empty_positions(detection: Detection) -> list[NDArray[np.float64]]:
     return empty
 
 
-def points(image: Image) -> NDArray[np.float32]:
+def points(image: ColorImage) -> NDArray[np.float32]:
     """(N, 2) float32, px: up to 200 trackable points of a picture, at least 8 px apart."""
     found = cv2.goodFeaturesToTrack(_smooth(image), 200, 0.05, 8.0)
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2), np.float32)
 
 
-def motion(reference: Image, now: Image, points: NDArray[np.float32]) -> NDArray[np.float32]:
+def motion(reference: ColorImage, now: ColorImage, points: NDArray[np.float32]) -> NDArray[np.float32]:
     """Displacements (M, 2), px, of those of the points (N, 2) that are found again.
 
     reference, now : (H, W, 3) uint8. Each point is tracked to `now` and back, and must return to within
@@ -265,6 +265,6 @@ def motion(reference: Image, now: Image, points: NDArray[np.float32]) -> NDArray
     return np.asarray(np.subtract(ends, points)[good], np.float32)
 
 
-def _smooth(image: Image) -> Image:
+def _smooth(image: ColorImage) -> ColorImage:
     """(H, W) uint8 grey, blurred by 1.5 px against noise."""
     return np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), 1.5), np.uint8)

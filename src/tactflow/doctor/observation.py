@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from tactflow.doctor.measures import REGULAR, Gray, Image, Pair, exposure, grey, jpeg_step
+from tactflow.doctor.measures import REGULAR, Gray, Pair, exposure, grey, jpeg_step
 from tactflow.engine.errors import SourceError
 from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.devices import Camera
 from tactflow.sources.files import ArrayFile, ImageFiles
+from tactflow.vision.arrays import ColorImage
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Detection, NoMarkersError, detect_markers
 
@@ -103,7 +104,7 @@ class Observation:
         return None
 
 
-def _dots_of(image: Image) -> Detection | None:
+def _dots_of(image: ColorImage) -> Detection | None:
     try:
         return detect_markers(image, valid=valid_area(image))
     except NoMarkersError:
@@ -160,7 +161,7 @@ def _read(
     # The reader invents the rate of separate pictures.
     if not isinstance(reader, ImageFiles | ArrayFile):
         observation.nominal, observation.times = reader.fps, times
-    last: Image | None = None
+    last: ColorImage | None = None
     last_seq: int | None = None
     stride = 1
     while (frame := _next(reader)) is not None:

@@ -27,10 +27,9 @@ from tactflow.message.result import Result
 from tactflow.streaming import stream
 from tactflow.tune.recording import CHANGE, MAX_USED, change_between
 from tactflow.tune.space import DOWNSAMPLE, MIN_PITCH, MIN_SIDE
+from tactflow.vision.arrays import ColorImage
 from tactflow.vision.change import Settling
 from tactflow.vision.types import MarkerStatus
-
-Image = NDArray[np.uint8]
 
 LARGE: Final = 500
 """px: pictures with a longer side are shrunk; the shipped pipelines are measured on 160 to 480 px."""
@@ -55,7 +54,7 @@ class Seen:
     indices of frames. changes : largest relative change of light of each frame from the reference.
     """
 
-    frames: list[Image]
+    frames: list[ColorImage]
     reference: int
     rest: list[int]
     pressed: list[int]
@@ -115,18 +114,18 @@ class Kept:
     """
 
     def __init__(self) -> None:
-        self._first: list[Image] = []
-        self._window: deque[tuple[float, Image]] = deque()
+        self._first: list[ColorImage] = []
+        self._window: deque[tuple[float, ColorImage]] = deque()
 
     def __len__(self) -> int:
         return len(self._first) + len(self._window)
 
     @property
-    def frames(self) -> list[Image]:
+    def frames(self) -> list[ColorImage]:
         """(H, W, 3) uint8 each, in order."""
         return [*self._first, *(image for _, image in self._window)]
 
-    def add(self, image: Image, *, at_rest: bool = False) -> None:
+    def add(self, image: ColorImage, *, at_rest: bool = False) -> None:
         """Keep a frame, or let it go. at_rest : only as one of the first."""
         if len(self._first) < FIRST:
             self._first.append(image.copy())
@@ -144,7 +143,7 @@ class Kept:
         self._window.append((change, image.copy()))
 
 
-def divide(frames: Sequence[Image], at_rest: int | None = None) -> Seen:
+def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Seen:
     """Tell frames of the untouched gel from those with a press, by the change of light alone.
 
     at_rest : number of first frames known to show the untouched gel; None: as many as look like the

@@ -10,7 +10,6 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.bench.lockstep import with_params
 from tactflow.doctor.measures import DIM, Pair
@@ -19,8 +18,7 @@ from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.sources import open_source
-
-Image = NDArray[np.uint8]
+from tactflow.vision.arrays import ColorImage
 
 MAX_READ: Final = 1800
 """Maximum number of frames searched for a contact: 30 s at 60 frames/s."""
@@ -90,7 +88,7 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
     return Recording(source, path, len(used), (width, height), observation, [changes[i] for i in indices])
 
 
-def _frames(source: str, count: int) -> Iterator[Image]:
+def _frames(source: str, count: int) -> Iterator[ColorImage]:
     """The first frames of a recording."""
     with closing(open_source(source)) as reader:
         if reader.live:
@@ -101,7 +99,7 @@ def _frames(source: str, count: int) -> Iterator[Image]:
             yield frame[0].copy()
 
 
-def change_between(first: Image, now: Image) -> float:
+def change_between(first: ColorImage, now: ColorImage) -> float:
     """Maximum relative change of light between two pictures (H, W, 3) uint8."""
     # 96 px are enough for a contact to cover several pixels.
     size = (96, max(1, round(96 * first.shape[0] / first.shape[1])))
@@ -111,7 +109,7 @@ def change_between(first: Image, now: Image) -> float:
     return float(cv2.blur(np.abs(ratio - 1.0).max(axis=2), (7, 7)).max())
 
 
-def _geometry(pipeline: Pipeline) -> Callable[[Image], Image]:
+def _geometry(pipeline: Pipeline) -> Callable[[ColorImage], ColorImage]:
     """The geometry of the pipeline's `preprocess` without downsampling, a function on (H, W, 3) uint8."""
     if "preprocess" not in pipeline.nodes:
         return np.array

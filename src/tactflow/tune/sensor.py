@@ -17,10 +17,9 @@ from tactflow.doctor.observation import Observation
 from tactflow.sim import Truth, open_scene
 from tactflow.sim.camera import SIZE
 from tactflow.tune.recording import Recording, change_between
+from tactflow.vision.arrays import ColorImage
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.markers import NoMarkersError, detect_markers
-
-Image = NDArray[np.uint8]
 
 OWN_BLUR: Final = 0.9
 """Intrinsic blur of the simulator's dots as the doctor measures it, px of its frame."""
@@ -100,18 +99,18 @@ def _dots(observation: Observation, scale: float) -> str:
     return f"{grid}&missing={min(missing, 0.5):.3f}"
 
 
-def rounded(light: NDArray[Any]) -> Image:
+def rounded(light: NDArray[Any]) -> ColorImage:
     """(H, W, 3) uint8 from grey levels."""
     return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
 
 
-def _levels(image: Image) -> NDArray[np.float64]:
+def _levels(image: ColorImage) -> NDArray[np.float64]:
     """Median grey levels (3,) of the gel, BGR."""
     gel = image[image.max(axis=2) > measures.BLACK]
     return np.asarray(np.median(gel, axis=0) if len(gel) else np.ones(3), np.float64)
 
 
-def _contrast_ratio(observation: Observation, simulated: Image, levels: tuple[float, ...]) -> float:
+def _contrast_ratio(observation: Observation, simulated: ColorImage, levels: tuple[float, ...]) -> float:
     """Contrast of the dots, relative to the dots of the simulated frame at the same light levels."""
     if observation.dots is None:
         return 1.0
@@ -143,7 +142,7 @@ def _light_of(recording: Recording) -> str:
     return min(LIGHTS, key=lambda name: abs(LIGHTS[name] - max(common, 0.0)))
 
 
-def _depth(recording: Recording, plain: Look, untouched: Image) -> float:
+def _depth(recording: Recording, plain: Look, untouched: ColorImage) -> float:
     """Depth of the simulated press that changes the light as much as the recording.
 
     untouched : simulated frame of the untouched gel.
@@ -184,7 +183,7 @@ class Fitted(Rendered):
         query = "&".join(part for part in (look.query, case.query, "noise=0", f"seed={seed}") if part)
         super().__init__(replace(case, query=query), folder, look.size)
 
-    def render(self, index: int) -> Image:
+    def render(self, index: int) -> ColorImage:
         """The frame, with blur and noise."""
         frame = light(self._look, self.scene, index)
         if self._look.blur:

@@ -7,8 +7,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-GrayImage = NDArray[np.uint8]
-"""(H, W), grey levels."""
 ColorImage = NDArray[np.uint8]
 """(H, W, 3), grey levels, blue, green, red."""
 Mask = NDArray[np.uint8]

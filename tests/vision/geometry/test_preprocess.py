@@ -76,7 +76,8 @@ def test_a_rendered_dot_lands_where_the_mapping_says(
     # 0.01 px is the promise; measured: 0.006, nearly all of it left with float pictures too. The dot has a
     # sigma of 4 processed pixels, as a marker may have; one of a single pixel aliases in bilinear sampling.
     pictures = {factor: dot(*size, place, 4.0 * factor) for factor in (1, 2, 4)}
-    for rotate, (factor, method), crop in STEPS:
+    # What a lens and a perspective do does not depend on how the picture is turned afterwards.
+    for rotate, (factor, method), crop in STEPS if lens == "no lens" else STEPS[::3]:
         preprocess = Preprocessor(
             size,
             rotate=rotate,
