@@ -7,13 +7,12 @@ import pytest
 from tactflow.bench.methods import alternatives, measure_methods
 from tactflow.bench.pipelines import Bench
 from tactflow.bench.results import BenchResult
-from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, Rendered
+from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.graph import Pipeline
 from tactflow.sim import scene_descriptions
-from tactflow.vision.geometry import PixelMapping
 
 
 @pytest.fixture(scope="module")
@@ -79,13 +78,3 @@ def test_all_scenes_exist_and_have_names_of_their_own() -> None:
         assert {case.name for case in cases} <= set(scene_descriptions())
     labels = [case.label for case in (*FULL, *TROUBLES)]
     assert len(labels) == len(set(labels))
-
-
-def test_half_depth_is_reached_only_in_contact(tmp_path: Path) -> None:
-    rendered = Rendered(Case("press", 40), tmp_path)
-    assert (rendered.frames[2] == rendered.scene.frame(2)).all()
-    raw = rendered.truths(PixelMapping.identity((800, 600)))
-    deep = [rendered.deep(index) for index in range(len(rendered))]
-    assert any(deep)
-    assert not any(d and not t.touching for d, t in zip(deep, raw, strict=True))
-    assert sum(deep) < sum(t.touching for t in raw)

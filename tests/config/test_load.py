@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
@@ -255,35 +253,7 @@ def test_a_program_gives_python_values_and_a_mistake_names_its_settings(load: Lo
     assert "outline" not in nodes
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.lists(
-        st.sampled_from(["stages", "sinks", "prepare", "out", "corners", "in", "0", "x", ""]), max_size=5
-    ),
-    st.one_of(st.text(max_size=12), st.sampled_from(["null", "[[", "{a: 1}", "&a [*a]", "touching", "!!x"])),
-)
-def test_whatever_set_says_the_pipeline_is_right_or_refused(load: Load, keys: list[str], value: str) -> None:
-    try:
-        load(BODY, f"{'.'.join(keys)}={value}")
-    except ConfigError as error:
-        message = str(error)
-    else:
-        return
-    assert "--set" in message or "p.yaml:" in message
-
-
 class TestOptionsOfTheCommandLine:
-    def test_values_for_the_source_replace_those_of_the_file(self, load: Load) -> None:
-        values = [Override("source", "film.mp4", "--source"), Override("realtime", True, "--realtime")]
-        pipeline = load(BODY, source_values=values)
-        assert pipeline.source.params.model_dump() == {"source": "film.mp4", "realtime": True}
-
-    def test_a_value_the_source_does_not_have_names_the_option(self, load: Load) -> None:
-        with pytest.raises(
-            ConfigError, match=r"^--frame-rate: stages\.capture\.frame_rate: unknown parameter"
-        ):
-            load(BODY, source_values=[Override("frame_rate", 3, "--frame-rate")])
-
     def test_an_added_sink_gets_an_id_that_is_free(self, load: Load) -> None:
         text = BODY.replace("  out:", "  jsonl:")
         nodes = load(text, extra_sinks={"--jsonl": {"path": "-"}}).nodes

@@ -486,15 +486,6 @@ def test_a_paused_run_can_be_stopped(toy_runner: MakeRunner) -> None:
     assert not thread.is_alive()
 
 
-def test_a_run_that_was_not_stopped_may_take_as_long_as_it_needs(
-    toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.0)
-    runner = toy_runner({"join": {"seconds": 0.7}, "capture": {"frames": 3}})
-    ran(runner)
-    assert len(rows(runner)) == 3
-
-
 def test_a_run_that_is_stopped_before_its_sinks_are_open_opens_none(toy_runner: MakeRunner) -> None:
     runner = toy_runner()
     runner.stop()

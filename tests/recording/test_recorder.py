@@ -16,7 +16,6 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.run import Runner
 from tactflow.message.result import Result
 from tactflow.recording.frames import parse_frame
 from tactflow.sinks.record import Record
@@ -246,18 +245,6 @@ def test_a_recording_in_several_files_is_the_same_as_in_one(rotation: dict[str, 
         references = [0, 1] if begins <= 11 else [11]
         assert [frame.seq for frame in frames if frame.reference][: len(references)] == references
         assert frames[0].reference, "each file begins with the references of its first frame"
-
-
-def test_a_run_loses_no_frame_where_one_file_ends_and_the_next_begins(tmp_path: Path) -> None:
-    file = tmp_path / "pipeline.yaml"
-    file.write_text(
-        'stages:\n  capture: {source: "sim:idle?frames=120"}\n'
-        f"sinks:\n  record: {{path: '{tmp_path / 'a.mcap'}', rotate_after: 0.05, preview: 0}}\n"
-    )
-    result = Runner(load_pipeline(file)).run()
-    files = [tmp_path / "a.mcap", *sorted(tmp_path.glob("a-*.mcap"))]
-    assert sum(topic == "/main/results" for path in files for topic, *_ in messages_in(path)) == 120
-    assert result.stats["sinks"]["record"]["counters"]["files"] == len(files) == 40
 
 
 def test_a_contact_that_no_stage_gives_cannot_begin_a_recording(tmp_path: Path) -> None:

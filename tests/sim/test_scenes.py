@@ -322,13 +322,6 @@ def test_a_stray_reflection_is_not_a_contact_and_lies_far_from_it() -> None:
     assert not (stray & near).any()
 
 
-@pytest.mark.parametrize("spec", ["key?markers=none", "coin?markers=none", "stray?perspective=0.2"])
-def test_settings_of_different_scenes_combine(spec: str) -> None:
-    scene = open_scene(spec)
-    assert scene.frame(50).shape == (600, 800, 3)
-    assert scene.truth(50).touching
-
-
 def test_painted_markers_differ_in_size_and_leds_glare_beside_bright_ones() -> None:
     layout = open_scene("painted").layout
     assert layout.radii.min() < 0.6 * layout.radius

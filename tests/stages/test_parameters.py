@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.config.registry import catalogue
 
 WEDGE = {
     "from": [[33, 58], [208, 61], [56, 250], [185, 244]],
@@ -50,10 +49,3 @@ WRONG: dict[str, list[dict[str, Any]]] = {
 def test_a_wrong_parameter_is_refused_by_name(stage: str, wrong: dict[str, Any]) -> None:
     with pytest.raises(tactflow.ConfigError, match="|".join(wrong)):
         tactflow.stage(stage, **wrong)
-
-
-def test_every_part_built_by_its_class_keeps_its_parameters() -> None:
-    for part in catalogue()[0]:
-        if not any(field.is_required() for field in part.params.model_fields.values()):
-            params = part.params()
-            assert part.cls(params).params is params, part.name
