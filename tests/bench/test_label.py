@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from http.client import HTTPConnection
@@ -136,24 +132,6 @@ def test_frames_are_chosen_by_name_index_and_step(press: Path) -> None:
         read_items(str(press), "a", "rset")
 
 
-def test_a_label_is_stored_changed_and_removed_and_others_stay(serve: Serve, tmp_path: Path) -> None:
-    path = tmp_path / "labels.json"
-    other = FrameLabel(recording="other", frame=1, reference=0, contact=None)
-    save_labels(path, [other])
-    server = serve()
-    label = entry(recording="press", frame="001", reference="rest")
-    assert ask(server, "POST", "/labels", label) == (200, b"saved")
-    assert ask(server, "POST", "/labels", label | {"outlines": [TRIANGLE, TRIANGLE]})[0] == 200
-    assert [len(stored.outlines) for stored in load_labels(path)] == [0, 2]
-    overview = json.loads(ask(server, "GET", "/frames")[1])
-    assert [frame["frame"] for frame in overview["frames"]] == ["001", "002"]
-    assert len(overview["labels"][1]["outlines"]) == 2
-    second = serve(round_=2)
-    assert json.loads(ask(second, "GET", "/frames")[1])["labels"] == []
-    assert ask(server, "DELETE", "/labels", label)[0] == 200
-    assert load_labels(path) == [other]
-
-
 def test_other_web_sites_and_wrong_labels_are_refused(serve: Serve, tmp_path: Path) -> None:
     server, label = serve(), entry(recording="press", frame="001", reference="rest")
     assert ask(server, "GET", "/frames", Host="evil.example")[0] == 421
@@ -173,25 +151,6 @@ def test_a_broken_file_of_labels_is_never_overwritten(
     assert b"not a file of labels" in message
     assert main([str(press), "--labels", str(path), "--every", "1"]) == 2
     assert "not a file of labels" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is not sent to one process there")
-def test_the_command_prints_its_address_and_ends_at_ctrl_c(press: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tactflow.bench.label", str(press), "--labels", "labels.json"]
-    command += ["--every", "1", "--root", str(tmp_path), "--seed", "3", "--lab", "A", "--round", "2"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        found = re.search(r"3 frames to label at http://(127\.0\.0\.1:\d+)/", process.stdout.readline())
-        assert found
-        connection = HTTPConnection(found[1], timeout=PATIENCE)
-        connection.request("GET", "/frames")
-        overview = json.loads(connection.getresponse().read())
-        connection.close()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 0
-    assert {frame["recording"] for frame in overview["frames"]} == {"finger/press"}
-    assert sorted(frame["frame"] for frame in overview["frames"]) == ["001", "002", "rest"]
-    assert (overview["lab"], overview["round"]) == ("A", 2)
 
 
 @pytest.fixture

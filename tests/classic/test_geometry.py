@@ -11,8 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.classic.functions import (
-    fit_ellipse,
-    get_all_contour,
     get_convex_hull_area,
     mean_flow,
 )
@@ -64,17 +62,6 @@ def test_the_hull_and_its_line_are_those_of_the_script(seed: int) -> None:
     assert contact.center == middle
 
 
-def test_one_pixel_is_a_point_without_area() -> None:
-    mask = np.zeros((30, 40), np.uint8)
-    mask[7, 11] = 255
-    contact = described(mask)
-    assert contact.center == (11, 7)
-    assert contact.angle is None
-    assert contact.ellipse is None
-    assert contact.hull.tolist() == [[11, 7]]
-    assert (contact.region_area, contact.area) == (1, 0)
-
-
 def test_a_vertical_line_has_an_angle_and_no_slope() -> None:
     mask = np.zeros((120, 100), np.uint8)
     mask[10:90, 30] = 255
@@ -83,23 +70,6 @@ def test_a_vertical_line_has_an_angle_and_no_slope() -> None:
     assert contact.slope is None
     assert contact.center == pytest.approx((30, 49.5), abs=1e-4)
     assert contact.ellipse is None
-
-
-def test_the_ellipse_is_the_one_that_was_drawn() -> None:
-    mask = np.zeros((140, 160), np.uint8)
-    cv2.ellipse(mask, (70, 60), (40, 20), -25, 0, 360, 255, -1)
-    ellipse = described(mask).ellipse
-    assert ellipse is not None
-    assert ellipse.angle == pytest.approx(25, abs=1)
-    assert ellipse.center == pytest.approx((70, 60), abs=0.5)
-    # Contours run through pixel centres: about a pixel shorter than the shape.
-    assert ellipse.axes == pytest.approx((80, 40), abs=1.5)
-
-
-def test_fewer_than_five_points_have_no_ellipse() -> None:
-    mask = np.zeros((30, 40), np.uint8)
-    mask[7:9, 11:13] = 255
-    assert fit_ellipse(get_all_contour(mask)) is None
 
 
 GRID = np.stack(np.meshgrid(np.arange(10.0, 200, 15), np.arange(10.0, 160, 15)), axis=-1).reshape(-1, 2)

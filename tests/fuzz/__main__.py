@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import faulthandler
-import hashlib
 import itertools
 import os
 import sys
@@ -33,51 +32,34 @@ FACTOR = 64
 """And so many times its size: a value of a YAML list is an object with its place, of a byte or two."""
 
 
-class Findings:
-    """What went wrong, once for each place in the code; the first input that shows it is kept."""
+def try_input(parser: Parser, data: bytes, kept: Path) -> bool:
+    """Feed one input, which is in the file `kept` while it is tried; whether the parser refused it.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.inputs = self.refused = 0
-        self.found: set[tuple[str, ...]] = set()
-
-    def add(self, target: str, kind: str, place: str, data: bytes) -> None:
-        """Keep a finding, unless its like is known."""
-        if (target, kind, place) not in self.found:
-            self.found.add((target, kind, place))
-            path = self.folder / f"{target}-{hashlib.sha256(data).hexdigest()[:12]}"
-            path.write_bytes(data)
-            print(f"FOUND {target}: {kind}\n      {place}\n      {path}", file=sys.stderr, flush=True)
-
-    def try_input(self, target: str, parser: Parser, data: bytes) -> None:
-        """Feed one input. A crash or a hang ends the process; the input is then in `current-TARGET`."""
-        current = self.folder / f"current-{target}"
-        current.write_bytes(data)
-        self.inputs += 1
-        failed: list[BaseException] = []
-        before, threading.excepthook = threading.excepthook, lambda of: failed.append(of.exc_value)
-        faulthandler.dump_traceback_later(HANGS_AFTER, exit=True)
-        if sys.platform == "linux":
-            # Measure the peak anew.
-            Path("/proc/self/clear_refs").write_text("5")
-        memory = _memory("VmRSS")
-        try:
-            parser.feed(data)
-        except parser.refusals:
-            self.refused += 1
-        except Exception as error:
-            failed.append(error)
-        finally:
-            faulthandler.cancel_dump_traceback_later()
-            threading.excepthook = before
-        for error in failed:
-            last = traceback.extract_tb(error.__traceback__)[-3:]
-            place = " > ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in last)
-            self.add(target, f"{type(error).__name__}: {str(error)[:200]}", place, data)
-        taken = _memory("VmHWM") - memory
-        if taken > ALLOWANCE + FACTOR * len(data):
-            self.add(target, "memory", f"{taken >> 20} MB for {len(data)} bytes", data)
-        current.unlink()
+    Raises what the parser should not have raised. A crash or a hang ends the process.
+    """
+    kept.write_bytes(data)
+    failed: list[BaseException] = []
+    before, threading.excepthook = threading.excepthook, lambda of: failed.append(of.exc_value)
+    faulthandler.dump_traceback_later(HANGS_AFTER, exit=True)
+    if sys.platform == "linux":
+        # Measure the peak anew.
+        Path("/proc/self/clear_refs").write_text("5")
+    memory = _memory("VmRSS")
+    refused = False
+    try:
+        parser.feed(data)
+    except parser.refusals:
+        refused = True
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+        threading.excepthook = before
+    if failed:
+        raise failed[0]
+    taken = _memory("VmHWM") - memory
+    if taken > ALLOWANCE + FACTOR * len(data):
+        raise MemoryError(f"{taken >> 20} MB for {len(data)} bytes")
+    kept.unlink()
+    return refused
 
 
 def _memory(key: str) -> int:
@@ -102,18 +84,25 @@ def main() -> int:
     folder = args.folder or Path(tempfile.mkdtemp(prefix="tactflow-fuzz-"))
     folder.mkdir(parents=True, exist_ok=True)
     faulthandler.enable()
-    findings = Findings(folder)
+    inputs = refused = findings = 0
     for name in args.targets or TARGETS:
-        began = time.monotonic()
+        began, kept = time.monotonic(), folder / name
         with tempfile.TemporaryDirectory() as scratch, TARGETS[name](Path(scratch)) as target:
             mutator = Mutator(target.samples, args.seed)
             damaged = (mutator.next() for _ in range(args.inputs))
             for data in itertools.chain(target.samples, damaged):
-                findings.try_input(name, target, data)
+                inputs += 1
+                try:
+                    refused += try_input(target, data, kept)
+                except Exception:
+                    # The next parser: this one would show the same again and again.
+                    findings += 1
+                    print(f"FOUND {kept}\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+                    break
                 if time.monotonic() - began > args.seconds:
                     break
-    print(f"{findings.inputs} inputs, {findings.refused} refused, {len(findings.found)} findings ({folder})")
-    return 1 if findings.found else 0
+    print(f"{inputs} inputs, {refused} refused, {findings} findings ({folder})")
+    return 1 if findings else 0
 
 
 if __name__ == "__main__":
