@@ -30,8 +30,12 @@ class Probe(Stage):
     class Params(StageParams):
         """How careful to be."""
 
+        repeatability: float = Field(
+            0.025, ge=0, le=1, description="as of difference: set both to the same value"
+        )
+        tint: float = Field(0.01, ge=0, le=1, description="as of difference: set both to the same value")
         false_alarms: float = Field(
-            1e-3, gt=0, le=0.5, description="share of still frames that are worked on all the same"
+            0.01, gt=0, le=0.5, description="share of still frames in which dots are looked at all the same"
         )
         at_least_every: int = Field(
             30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
@@ -56,7 +60,12 @@ class Probe(Stage):
             return ProbePorts(True, True)
         if self._test is None:
             self._gel = bounding_box(valid_area(frame.image))
-            self._test = RestTest(frame.image[self._gel], false_alarms=self.params.false_alarms)
+            self._test = RestTest(
+                frame.image[self._gel],
+                repeatability=self.params.repeatability,
+                tint=self.params.tint,
+                false_alarms=self.params.false_alarms,
+            )
         self._since_work += 1
         due = frame.reference or self._since_work >= self.params.at_least_every
         look = self._test.look(frame.image[self._gel], touching=self.watched, due=due)

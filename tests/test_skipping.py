@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,13 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 import tactflow
+from benchmarks.skipping import differing, numbers
 from tactflow import Result
 
 FRAMES = 60
 Frames = NDArray[np.uint8]
-
-TOLERANCE = {"dots": 0.05, "center": 0.5, "flow": 0.05}
-"""Of the published numbers, px."""
 
 
 @lru_cache(maxsize=4)
@@ -113,28 +111,6 @@ def run(pipeline: str, frames: Frames, **settings: object) -> list[Result]:
     return list(tactflow.stream(pipeline, source=frames, settings=upright | settings))
 
 
-def published(result: Result) -> dict[str, NDArray[np.float64]]:
-    """The numbers of a frame that are compared, px."""
-    numbers = {}
-    if result.markers is not None:
-        numbers["dots"] = result.markers.position
-    if result.contact is not None:
-        numbers["center"] = np.array(result.contact.center)
-    if result.flow is not None and result.flow.mean is not None:
-        numbers["flow"] = np.array(result.flow.mean)
-    return numbers
-
-
-def differing(skipping: Result, fresh: Result) -> Iterator[str]:
-    """What differs by more than its tolerance."""
-    if (skipping.contact is None) != (fresh.contact is None):
-        yield "decision"
-    ours, theirs = published(skipping), published(fresh)
-    for name in ours.keys() & theirs.keys():
-        if np.abs(ours[name] - theirs[name]).max(initial=0) > TOLERANCE[name]:
-            yield name
-
-
 def assert_law(pipeline: str, frames: Frames) -> list[Result]:
     """Nothing may differ for more than one frame; returns the results with skipping."""
     skipping, fresh = (run(pipeline, frames, skipping=on) for on in (True, False))
@@ -142,7 +118,7 @@ def assert_law(pipeline: str, frames: Frames) -> list[Result]:
     assert not any({"unchanged", "at_rest"} & set(result.skipped.values()) for result in fresh)
     before: set[str] = set()
     for one, other in zip(skipping, fresh, strict=True):
-        differ = set(differing(one, other))
+        differ = differing(one, other)
         assert not differ & before, f"frame {one.seq}"
         before = differ
     return skipping
@@ -180,6 +156,6 @@ def test_a_sink_that_looks_at_everything_changes_nothing(tmp_path: Path) -> None
     more = settings | {"sinks": {}} | video
     seen = list(tactflow.stream("default", source=str(recording), settings=more, sinks=True))
     for one, other in zip(alone, seen, strict=True):
-        assert published(one).keys() == published(other).keys()
-        for name, values in published(one).items():
-            np.testing.assert_array_equal(values, published(other)[name])
+        assert numbers(one).keys() == numbers(other).keys()
+        for name, values in numbers(one).items():
+            np.testing.assert_array_equal(values, numbers(other)[name])

@@ -13,7 +13,7 @@ def suspects(probe: Probe, count: int, *, reference: bool = False, skip: int = 0
     random = np.random.default_rng(skip)
     return [
         probe.process(
-            Frame("s", i, i / 60, random.integers(90, 110, (60, 80, 3), np.uint8), reference=reference)
+            Frame("s", i, i / 60, random.integers(95, 105, (60, 80, 3), np.uint8), reference=reference)
         ).suspect
         for i in range(count)
     ]
@@ -44,4 +44,4 @@ def test_a_reset_starts_anew() -> None:
     probe = Probe(Probe.Params())
     assert not suspects(probe, 20)[-1]
     probe.reset()
-    assert suspects(probe, 3, skip=1) == [True] * 3
+    assert suspects(probe, 1, skip=1) == [True]
