@@ -10,9 +10,8 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import ContactMask, MarkerMask, Touching, Unmarked, Valid
-from tactflow.vision.contact import ContactDetector, LearnedDetector
+from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.reference import ReferenceCheck
-from tactflow.vision.types import Markers
 
 
 class ContactPorts(NamedTuple):
@@ -35,11 +34,10 @@ class Difference(Stage):
     class Params(StageParams):
         """How contact is detected; the description of a parameter names the methods that use it."""
 
-        method: Literal["noise", "network", "colour"] = Field(
+        method: Literal["noise", "colour"] = Field(
             "noise",
             description="noise tests against the sensor's own noise, for gels that answer with brightness or "
-            "colour; network asks a neural network that was trained on random simulated gels, for faint, "
-            "large and textured contacts; colour is a plain distance of colours",
+            "colour; colour is a plain distance of colours",
         )
         false_alarms: float = Field(
             1e-6, gt=0, lt=1, description="noise: false contacts of the untouched gel, per frame"
@@ -60,19 +58,13 @@ class Difference(Stage):
             0.2,
             ge=0,
             lt=1,
-            description="noise, network: what a released gel still shows, relative to the strongest change",
+            description="noise: what a released gel still shows, relative to the strongest change",
         )
         creep: float = Field(
             0.1,
             ge=0,
             le=1,
             description="noise: how much of its change a released gel loses from frame to frame at most",
-        )
-        certainty: float = Field(
-            0.9,
-            ge=0.5,
-            lt=1,
-            description="network: probability from which a region is a contact; higher misses lighter ones",
         )
         patience: int = Field(
             30,
@@ -82,15 +74,10 @@ class Difference(Stage):
         )
         distance: float = Field(24.0, gt=0, le=441, description="colour: change that is contact, grey levels")
 
-    _detector: ContactDetector | LearnedDetector
-
     def __init__(self, params: Params) -> None:
         super().__init__(params)
         self._check: ReferenceCheck | None = None
         self._doubted = 0
-        if params.method == "network":
-            self._detector = LearnedDetector(certainty=params.certainty, relaxation=params.relaxation)
-            return
         self._detector = ContactDetector(
             params.method,
             false_alarms=params.false_alarms,
@@ -113,19 +100,15 @@ class Difference(Stage):
         frame: Frame,
         marker_mask: MarkerMask | None = None,
         valid: Valid | None = None,
-        markers: Markers | None = None,
     ) -> ContactPorts:
         """The contact mask of this frame; below markers its outline runs straight.
 
-        Nothing outside of `valid` counts. `network` looks at the markers, too, where a tracker stands above.
+        Nothing outside of `valid` counts.
         """
         if frame.reference or not self._detector.has_reference:
             self._detector.add_reference(unmarked, valid)
             self._check = self._check or ReferenceCheck(unmarked)
-        if isinstance(self._detector, LearnedDetector):
-            result = self._detector.detect(unmarked, marker_mask, markers)
-        else:
-            result = self._detector.detect(unmarked, marker_mask)
+        result = self._detector.detect(unmarked, marker_mask)
         if not result.touching or self._check is None or not self._check.was_touched(unmarked, result.mask):
             self._doubted = 0
             return ContactPorts(result.mask, result.touching)

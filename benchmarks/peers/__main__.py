@@ -135,9 +135,9 @@ def main() -> None:
             "contact": lambda: contact.on_named(cases(CONTACTS, args.frames), folder, names["contact"]),
             "contact_wide": lambda: contact.on_wide(args.wide, names["contact"]),
             "dots_gels": lambda: dots.on_gels(args.data, names["dots"]),
-            "contact_gels": lambda: contact.on_gels(args.data, folder, names["contact"]),
+            "contact_gels": lambda: contact.on_gels(args.data, names["contact"]),
             "depth": lambda: depth.on_balls(args.data, network),
-            "memory": lambda: memory(names | {"contact": [*contact.OURS, *names["contact"]]}),
+            "memory": lambda: memory(names | {"contact": [contact.OURS, *names["contact"]]}),
             "code": code,
             "attempts": attempts,
         }

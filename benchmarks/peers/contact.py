@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import lru_cache, partial
 from pathlib import Path
@@ -39,7 +39,6 @@ from tactflow.bench.quantities import Tally
 from tactflow.bench.scenes import Case
 from tactflow.bench.score import add_decision, add_geometry, add_mask
 from tactflow.classic.functions import difference, mask_marker
-from tactflow.config.shipped import find_pipeline
 from tactflow.sources import open_source
 from tactflow.sources.files import load_image, to_bgr
 from tactflow.vision.geometry import PixelMapping
@@ -54,17 +53,15 @@ AS_THEY_ARE: Final = {
     "sinks.view": None,
 }
 """Pipeline settings for pictures that were processed already."""
-OURS: Final = {"tactflow, noise": "noise", "tactflow, network": "network"}
-"""Method -> `method` of the stage `difference`; the first is the default."""
+OURS: Final = "tactflow"
 
 
 # What a user of each package writes: a mask (H, W) uint8, 255 in contact; None without a contact.
 
 
-def tactflow_contact(pictures: Sequence[Picture], method: str, pipeline: str) -> list[Picture | None]:
+def tactflow_contact(pictures: Sequence[Picture], pipeline: str) -> list[Picture | None]:
     """tactflow: pictures of one recording; the first shows the untouched gel."""
-    settings = {**AS_THEY_ARE, "stages.difference.method": method}
-    results = tactflow.stream(pipeline, source=pictures, settings=settings)
+    results = tactflow.stream(pipeline, source=pictures, settings=AS_THEY_ARE)
     return [result.contact_mask if result.contact else None for result in results]
 
 
@@ -142,7 +139,7 @@ CHOICES: Final[Mapping[str, Mapping[str, Sequence[Any]]]] = {
 }
 AT_REST: Final = 6
 """Recordings of a lab without an outline that are judged: all 48 of a gripper would take half of the time."""
-ADAPTERS: Final = {**dict.fromkeys(OURS, tactflow_contact), **PEERS}
+ADAPTERS: Final = {OURS: tactflow_contact, **PEERS}
 
 
 # How they are measured.
@@ -154,9 +151,8 @@ class Ours:
     Its time is that of everything that it computes: contact, dots, flow, and the message.
     """
 
-    def __init__(self, method: str, pipeline: str, pictures: Sequence[Picture]) -> None:
-        settings = {**AS_THEY_ARE, "stages.difference.method": method}
-        self._running = LockstepPipeline(tactflow.load(pipeline, source=pictures, settings=settings))
+    def __init__(self, pipeline: str, pictures: Sequence[Picture]) -> None:
+        self._running = LockstepPipeline(tactflow.load(pipeline, source=pictures, settings=AS_THEY_ARE))
 
     def block(self, frames: int) -> list[tuple[Any, float]]:
         """Masks of the next pictures, None without a contact, and times, s."""
@@ -174,7 +170,7 @@ def on_named(cases: Sequence[Case], folder: Path, peers: Sequence[str]) -> dict[
         return sum(overlap_lost(errors_of(follow, other, name, tried)) for other in others)
 
     settings = {name: search(CHOICES.get(name, {}), partial(loss, name)) for name in peers}
-    return on_scenes(cases, folder, follow, lambda _: {name: {} for name in OURS} | settings)
+    return on_scenes(cases, folder, follow, lambda _: {OURS: {}} | settings)
 
 
 def overlap_lost(errors: Numbers) -> float:
@@ -190,8 +186,8 @@ def follow(
     rendered, pictures, truths = scene
     pipeline = "default" if len(truths[0].origin) else "markerless"
     running = {
-        name: Ours(OURS[name], pipeline, pictures)
-        if name in OURS
+        name: Ours(pipeline, pictures)
+        if name == OURS
         else Calls(PEERS[name](pictures[0], **settings), pictures)
         for name, settings in methods.items()
     }
@@ -217,9 +213,9 @@ def on_wide(count: int, peers: Sequence[str]) -> dict[str, Any]:
         tally = Tally()
         for scene in scenes:
             touching = bool(scene.contact.any())
-            if name in OURS:
+            if name == OURS:
                 pipelines = ["default", "markerless"] if scene.dots.any() else ["markerless"]
-                mask = _ours_or_none(name, [scene.reference, scene.picture], pipelines)
+                mask = _ours_or_none([scene.reference, scene.picture], pipelines)
             else:
                 mask = _peers_or_none(name, PEERS[name](scene.reference, **settings), scene.picture)
             if touching:
@@ -231,20 +227,20 @@ def on_wide(count: int, peers: Sequence[str]) -> dict[str, Any]:
         return tally.errors()
 
     answers = {}
-    for name in [*OURS, *peers]:
+    for name in [OURS, *peers]:
         loss = partial(errors, scenes[::2], name)
         settings = search(CHOICES.get(name, {}), lambda tried, loss=loss: overlap_lost(loss(tried)))
         answers[name] = errors(scenes[1::2], name, settings) | {"settings": settings}
     return {"scenes": count, "all": answers}
 
 
-def _ours_or_none(name: str, pictures: Sequence[Picture], pipelines: Sequence[str]) -> Picture | None:
+def _ours_or_none(pictures: Sequence[Picture], pipelines: Sequence[str]) -> Picture | None:
     """By the first pipeline that takes the gel: where it has no dots, the message names `markerless`."""
     for pipeline in pipelines:
         try:
-            return tactflow_contact(pictures, OURS[name], pipeline)[-1]
+            return tactflow_contact(pictures, pipeline)[-1]
         except tactflow.TactflowError as error:
-            failed(name, error)
+            failed(OURS, error)
     return None
 
 
@@ -258,12 +254,10 @@ def _peers_or_none(
         return None
 
 
-def on_gels(data: Path, folder: Path, peers: Sequence[str]) -> dict[str, Any]:
-    """Outlines drawn on frames of real gels: settings, and our method, chosen on the other labs."""
+def on_gels(data: Path, peers: Sequence[str]) -> dict[str, Any]:
+    """Outlines drawn on frames of real gels; settings were chosen on the other labs."""
     labels = _labels(data)
-    ours = {name: list(_judged(method, labels, data, folder)) for name, method in OURS.items()}
-    answers = {name: _summary(judged) for name, judged in ours.items()}
-    answers["tactflow, chosen"] = _summary(judge.chosen_elsewhere(ours))
+    answers = {OURS: _summary(list(judge.judge("default", labels, data)))}
     pairs = [(label, *_pair(label, data)) for label in labels]
     for name in peers:
         candidates = {}
@@ -288,16 +282,6 @@ def _labels(data: Path) -> list[FrameLabel]:
         others = sorted({label.recording for label in labels if label.lab == lab} - outlined)
         kept.update(others[:AT_REST])
     return [label for label in labels if label.recording in kept]
-
-
-def _judged(method: str, labels: Sequence[FrameLabel], data: Path, folder: Path) -> Iterator[judge.Judged]:
-    for pipeline in ("default", "markerless"):
-        shipped = find_pipeline(pipeline).read_text()
-        path = folder / f"{pipeline}_{method}.yaml"
-        path.write_text(shipped.replace("method: noise", f"method: {method}"))
-        plain = pipeline == "markerless"
-        chosen = [label for label in labels if label.recording.startswith(judge.PLAIN) == plain]
-        yield from judge.judge(str(path), chosen, data)
 
 
 @lru_cache(maxsize=1)

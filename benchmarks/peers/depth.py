@@ -16,7 +16,7 @@ from benchmarks.peers.common import Numbers, Picture
 from tactflow.bench.timing import BLOCK
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press, Session
-from tactflow.calibration.samples import INNER
+from tactflow.calibration.samples import reach
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Scale
 
@@ -167,8 +167,7 @@ def on_ball(
     """Pixels that show the ball for sure, and the distance of each pixel of the picture from `center`, mm."""
     y, x = np.mgrid[: press.mask.shape[0], : press.mask.shape[1]]
     dx, dy = (x - center[0]) * scale.x, (y - center[1]) * scale.y
-    reach = INNER * min(press.radius * (scale.x * scale.y) ** 0.5, radius)
-    return (np.hypot(dx, dy) < reach) & ~press.hidden, dx, dy
+    return (np.hypot(dx, dy) < reach(press, scale, radius)) & ~press.hidden, dx, dy
 
 
 def errors_on(press: Press, answer: Answer, scale: Scale, radius: float) -> tuple[float, float]:

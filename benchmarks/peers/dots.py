@@ -38,7 +38,7 @@ from tactflow.classic.tracker import GridTracker
 from tactflow.vision.arrays import Floats
 
 FIRST_WIDE: Final = 2_000_000
-"""Seed of the first random scene here: the network was trained and chosen on others."""
+"""Seed of the first random scene here."""
 MEMORY: Final = 20
 """Frames for which trackpy remembers a particle that it does not see."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
-from tactflow.vision.contact import ContactDetector, LearnedDetector
+from tactflow.vision.contact import ContactDetector
 from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
@@ -111,10 +111,9 @@ def dog_mask(reference: Image, image: Image) -> Image:
     return np.zeros(image.shape[:2], np.uint8) if dot is None else marker_mask(image, dot)
 
 
-def detector(method: str, reference: Image) -> ContactDetector | LearnedDetector:
+def detector(method: str, reference: Image) -> ContactDetector:
     """A detector with one reference."""
-    made: ContactDetector | LearnedDetector
-    made = LearnedDetector() if method == "network" else ContactDetector(method)  # type: ignore[arg-type]
+    made = ContactDetector(method)  # type: ignore[arg-type]
     made.add_reference(reference)
     return made
 
@@ -134,7 +133,7 @@ def filled(method: Any, _reference: Image, image: Image) -> Image:
     return remove_markers(image, marker_mask(image, Dot(3.0)), method=method)
 
 
-DIFFERENCES = ("noise", "network", "colour")
+DIFFERENCES = ("noise", "colour")
 INPAINTING = ("normalized", "telea", "ns", "none")
 PICTURE_METHODS: Mapping[str, Callable[[Image, Image], Any]] = {
     "marker_mask": dog_mask,

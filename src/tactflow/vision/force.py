@@ -27,7 +27,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.change import to_planes
+from tactflow.vision.contact.cells import to_planes
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
 

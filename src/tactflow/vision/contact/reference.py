@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32, Mask
-from tactflow.vision.contact.change import HALF, grid_size, to_cells, to_planes
+from tactflow.vision.contact.cells import HALF, grid_size, to_cells, to_planes
 
 SMOOTHER: Final = 0.5
 """Roughness of a region over that of the same place in the reference, below which the reference was touched
