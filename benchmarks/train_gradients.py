@@ -25,8 +25,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.calibration.photometric import INNER, fit_photometry
+from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press, Session
+from tactflow.calibration.samples import reach
 from tactflow.calibration.scale import centre
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.geometry import Preprocessor
@@ -76,15 +77,16 @@ def read(folder: Path, split: str) -> list[Press]:
     return found
 
 
-def slopes_of_ball(press: Press, ball: float, inner: float) -> tuple[NDArray[Any], NDArray[np.float32]]:
+def slopes_of_ball(press: Press, ball: float, within: float) -> tuple[NDArray[Any], NDArray[np.float32]]:
     """Where the surface is the ball, (H, W) bool, and its slopes to the right and down there, (n, 2).
 
-    The gel is pushed in deeper towards the middle of the ball. ball : its radius, px.
+    The gel is pushed in deeper towards the middle of the ball. ball : its radius, px. within : distance from
+    its middle, px.
     """
     rows, columns = np.mgrid[: press.mask.shape[0], : press.mask.shape[1]]
     dx, dy = columns - press.center[0], rows - press.center[1]
     distance = np.hypot(dx, dy)
-    inside = distance < inner * min(press.radius, ball)
+    inside = distance < min(within, ball)
     height = np.sqrt(ball**2 - distance[inside] ** 2)
     return inside, np.stack([-dx[inside] / height, -dy[inside] / height], axis=1).astype(np.float32)
 
@@ -103,7 +105,7 @@ def train(presses: list[Press], rest: Image, ball: float, epochs: int, out: Path
     for press in presses:
         change = (press.image.astype(np.float32) - rest) / 255
         table = np.dstack([change, columns / width, rows / height]).astype(np.float32)
-        inside, slopes = slopes_of_ball(press, ball, 1.0)
+        inside, slopes = slopes_of_ball(press, ball, press.radius)
         calm = (cv2.dilate(press.mask, np.ones((31, 31))) == 0) & (rng.random(inside.shape) < AT_REST)
         samples += [table[inside], table[calm]]
         aims += [slopes, np.zeros((np.count_nonzero(calm), 2), np.float32)]
@@ -184,7 +186,7 @@ def compare(args: argparse.Namespace, rest: Image, ball: float) -> None:
             began = time.thread_time()
             heights = method(press)
             times.append(1e3 * (time.thread_time() - began))
-            inside, true = slopes_of_ball(press, ball, INNER)
+            inside, true = slopes_of_ball(press, ball, reach(press, scale, args.radius) / args.scale)
             down, right = np.gradient(heights, args.scale)
             angles.append(angle(np.stack([right[inside], down[inside]], axis=1), true))
             radii.append(sphere(heights, inside, args.scale))

@@ -1,10 +1,10 @@
-"""Random scenes far beyond any single sensor, to train and judge what finds contacts.
+"""Random scenes far beyond any single sensor, to judge what finds contacts and dots.
 
 Every scene is drawn from its seed alone: the shape of the object and its texture, the gel that it is pressed
 into, how the gel answers the light, printed dots, the housing, the camera, and what changes although nothing
 touches. Lengths are parts of the picture's longer side.
 
-Contact is where the surface of the object lies below the free surface of the gel, which sinks around it.
+Contact is where the surface of the object lies below that of the untouched gel, which sinks around it.
 
 References
 ----------
@@ -133,7 +133,7 @@ def _imprint(rng: Generator, x: Plane, y: Plane) -> _Imprint:
         surface = surface + np.float32(_between(rng, 0.0002, 0.004)) * _field(
             rng, x.shape, _between(rng, 0.2, 0.6)
         )
-    return _Imprint(surface, contact, _shift(rng, x, y, contact, sunk, far))
+    return _Imprint(surface, reach > 0, _shift(rng, x, y, contact, sunk, far))
 
 
 def _sunk(reach: Plane, length: float) -> tuple[Plane, NDArray[np.bool_]]:

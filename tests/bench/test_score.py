@@ -157,7 +157,7 @@ def test_flow_is_compared_where_both_know_it_and_with_its_own_standard_error(
     assert truth.contact_flow is not None
     x, y = truth.contact_flow
     score.add_flow(tally, Flow((x + 0.3, y + 0.4), 5, stderr=(0.5, 0.3)), truth)
-    score.add_flow(tally, Flow((x + 0.4, y - 0.3), 5, stderr=(0.2, 0.4)), truth)
+    score.add_flow(tally, Flow((x + 0.4, y - 0.3), 5, stderr=(0.19, 0.4)), truth)
     score.add_flow(tally, Flow(None, 0), truth)
     score.add_flow(tally, None, truth)
     within = {"flow_within_one": 50, "flow_within_two": pytest.approx(75)}

@@ -155,8 +155,10 @@ def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius(sink: float) -> No
     index = deepest(scene)
     (press,) = scene.presses(index)
     truth = scene.truth(index)
-    # The ball reaches depth - r^2 / 2R; contact is where that exceeds sink x depth (0.5: Hertz's sqrt(R d)).
-    radius = math.sqrt(2 * 95.0 * (1 - sink) * press.depth)
+    # The ball reaches depth - r^2 / 2R; contact is where that is below the untouched surface, however far the
+    # gel clings to the ball (sink 0.5: up to Hertz's sqrt(R d)).
+    radius = math.sqrt(2 * 95.0 * press.depth)
+    assert press.radius == pytest.approx(math.sqrt(1 - sink) * radius, rel=1e-4)
     # Counting pixel centres in a circle: the error of the area is of the order of the radius' square root.
     assert truth.contact_mask.sum() == pytest.approx(math.pi * radius**2, rel=0.004)
     assert truth.center == pytest.approx((press.x, press.y), abs=0.05)

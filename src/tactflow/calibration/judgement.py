@@ -16,8 +16,9 @@ FEWEST_PRESSES: Final = 8
 """Presses that a fit needs at least; 20 or more are advised. Chosen by hand."""
 SPREAD: Final = 0.15
 """Part of the picture's width and height that the presses must span at least. Chosen by hand."""
-TOO_LARGE: Final = 1.25
-"""Radius of a contact over that of the ball that no ball can make; what outlines add to it is less."""
+TOO_LARGE: Final = 2.0
+"""Radius of a contact over that of the ball that no ball can make. More than 1 is what outlines add to it:
+on five gels it is 0.46 to 1.55 in the median."""
 LEAST_EXPLAINED: Final = 0.7
 """Median share of the slopes of presses that a fit to others must explain. Two faces of an edge can explain
 0.36 of the slopes of a ball, as (E|x|)^2 / E(x^2 + y^2) on a disc. Balls on five gels have 0.94 to 0.99,
@@ -26,7 +27,7 @@ LARGEST_ERROR: Final = 0.35
 """Relative error of depth above which a fit is refused. By hand: balls on five gels have 0.04 to 0.14."""
 SHALLOW: Final = 0.4
 """Radius of the contacts over that of the ball, in the median, below which it is asked whether the diameter
-was given. Balls on five gels have 0.42 to 1.1, and half of it where the diameter is given."""
+was given. Balls on five gels have 0.46 to 1.55, and half of it where the diameter is given."""
 OTHER_RADIUS: Final = 2**0.5
 """Factor between the radius of a ball as given and as another sensor of the kind sees it, from which on it is
 asked: half way to a diameter. Balls on two Minis and a DIGIT have 0.9 to 1.3, one by one."""

@@ -18,9 +18,11 @@ from tactflow.vision.depth.surface import Rest, Surface, colour_change
 from tactflow.vision.depth.surroundings import Window, surroundings
 from tactflow.vision.types import Scale
 
-INNER: Final = 0.85
-"""Part of a contact's radius inside which the surface is the ball for sure, and part of the ball's radius up
-to which its colours tell slopes apart. Chosen on wedge_ball."""
+CLINGS: Final = 0.5**0.5
+"""Part of the radius of a contact, where the ball lies below the untouched gel, up to which a deep gel clings
+to it, and the surface is the ball's (Hertz); a thin layer clings to all of it. An outline that is wider than
+the ball counts as the ball's: with slopes of more than 45 degrees, caps on digit_fots and wedge_ball were 14
+and 7 % too deep."""
 SMOOTHED: Final = 0.02
 """Standard deviation of the Gaussian over which colours are averaged to be learned, in radii of the ball.
 Noise makes learned slopes too small: without it a box under `mixed` has errors of 8 % instead of 4. On
@@ -38,6 +40,11 @@ EDGE: Final = 0.1
 RIM: Final = 6
 """Pixels at half resolution along the border of a press's window that roundness is not asked of. Chosen by
 hand."""
+
+
+def reach(press: Press, scale: Scale, ball_radius: float) -> float:
+    """Distance from the middle of a press up to which the surface is that of the ball for sure, mm."""
+    return CLINGS * min(press.radius * math.sqrt(scale.x * scale.y), ball_radius)
 
 
 class Misfit(NamedTuple):
@@ -156,7 +163,7 @@ def _prepare(
         hidden=(hidden[::2, ::2] | hidden[1::2, ::2] | hidden[::2, 1::2] | hidden[1::2, 1::2]).ravel(),
         inner=inner.ravel(),
         start=np.array(scale.point(press.center)),
-        reach=min(INNER * press.radius * (scale.x * scale.y) ** 0.5, INNER * ball_radius),
+        reach=reach(press, scale, ball_radius),
         window=window,
         ball_radius=ball_radius,
     )

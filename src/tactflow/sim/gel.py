@@ -1,10 +1,11 @@
 """The gel: contact region, surface and displacement under an indenter.
 
-A soft surface sinks around a contact. When a ball of radius R is pressed by d into a deep gel, the surface
-has sunk by d / 2 at the edge of the contact, whose radius is sqrt(R d) (Hertz); a thin layer on a plate sinks
-only in the contact, whose radius is the sqrt(2 R d) of the geometric overlap (Johnson, Contact Mechanics,
-1985, ch. 4 and 5.8). A sensor's gel lies in between: here it sinks by s = SINK_IN d at the edge, and for
-every shape the contact is where the indenter reaches deeper than s. In the contact, the surface is that of
+What counts as contact is where the indenter lies below the surface of the untouched gel. It need not touch
+the gel there: a soft surface sinks. When a ball of radius R is pressed by d into a deep gel, that region has
+a radius of sqrt(2 R d), but the gel clings to the ball only up to sqrt(R d), where the surface has sunk by
+d / 2 (Hertz); a thin layer on a plate sinks only where it is touched, so that both are the same (Johnson,
+Contact Mechanics, 1985, ch. 4 and 5.8). A sensor's gel lies in between: here it sinks by s = SINK_IN d where
+it leaves the indenter, for every shape, and what lies deeper carries the force. There the surface is that of
 the indenter. Around it, the surface decays as s exp(RIM (reached / s - 1)), a closed form of the Gaussian
 pyramid of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L
 2022).
@@ -21,11 +22,11 @@ from numpy.typing import NDArray
 from tactflow.sim.shapes import Array, Shape
 
 SINK_IN = 0.3
-"""Depth of the surface at the edge of a contact, relative to full depth. Chosen by hand, between a thin layer
-(0) and a deep gel (0.5)."""
+"""Depth of the surface where it leaves the indenter, relative to full depth. Chosen by hand, between a thin
+layer (0) and a deep gel (0.5)."""
 RIM = 0.6
-"""Slope of the surface just outside a contact relative to just inside; less than 1 is a crease. Chosen by
-hand."""
+"""Slope of the surface just outside of where it leaves the indenter relative to just inside; less than 1 is a
+crease. Chosen by hand."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px. Chosen by hand."""
 _MAX_STICK = 0.999
@@ -55,7 +56,7 @@ class Press:
     depth : px, 0 off the gel. shear : (sx, sy), displacement of the gel under it, px. twist : rotation of the
     gel under it, radians. dilation : maximum outward displacement of the gel, px. sink, rim : `SINK_IN` and
     `RIM`.
-    stick : for a ball, radius of the stick region relative to the contact's, 0 to 1, with slip around it
+    stick : for a ball, radius of the stick region relative to `radius`, 0 to 1, with slip around it
     (Mindlin). None: no slip. sliding : whether the indenter moves relative to the gel under it.
     tilt : rotation vector (x, y) about the indenter's centre before it was turned by `angle`, radians;
     `shape` is the one after that.
@@ -77,7 +78,8 @@ class Press:
 
     @property
     def radius(self) -> float:
-        """Extent of the contact along x from the origin, px: for a ball, its contact radius."""
+        """How far along x from the origin the gel clings to it, px: for a ball, the radius of the disc that
+        carries the force."""
         near, far = 0.0, self.shape.reach
         for _ in range(_BISECTIONS):
             middle = np.array([(near + far) / 2], np.float32)
@@ -87,7 +89,7 @@ class Press:
 
     @property
     def stick_ratio(self) -> float:
-        """Share of the contact's area that sticks to the indenter."""
+        """Share of the area that clings to the indenter which sticks."""
         if self.sliding:
             return 0.0
         return 1.0 if self.stick is None else self.stick**2
@@ -107,11 +109,12 @@ def reached(press: Press, x: Array, y: Array) -> Array:
 
 
 def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_]:
-    """Whether the gel is in contact: bool of the shape of x and y (float32 gel coordinates, px)."""
+    """Whether an indenter lies below the untouched surface: bool of the shape of x and y (float32 gel
+    coordinates, px)."""
     mask = np.zeros(x.shape, dtype=np.bool_)
     for press in presses:
         if press.touching:
-            mask |= reached(press, x, y) > press.sink * press.depth
+            mask |= reached(press, x, y) > 0
     return mask
 
 

@@ -28,7 +28,7 @@ class Truth:
     """Ground truth of one frame. Coordinates as in `tactflow.vision.types`.
 
     touching : whether the contact covers at least one pixel of the frame.
-    contact_mask : (H, W) bool, true where the gel is in contact at the pixel's centre.
+    contact_mask : (H, W) bool, true where an indenter lies below the untouched gel at the pixel's centre.
     center : (x, y) centroid of the contact region, px; None without a contact.
     angle : principal direction of the region, degrees in (-90, 90]; None for a disc and without a contact.
     hull : (N, 2) float64, vertices of the convex hull of the region's pixel centres, in order; (0, 2)

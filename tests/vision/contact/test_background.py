@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tactflow.vision.contact import (
     ContactDetector,
     background,
-    border,
     illumination,
 )
 from tactflow.vision.contact.background import BackgroundModel, Change
@@ -25,7 +24,6 @@ from tests.oracles.background import (
     plain_smooth_cells,
     plain_weigh_change,
 )
-from tests.oracles.border import plain_border_level
 from tests.oracles.illumination import plain_compare_blocks, plain_fit_robustly
 
 Image = NDArray[np.uint8]
@@ -40,7 +38,6 @@ ORACLES = (
     (background, "smooth_cells", plain_smooth_cells),
     (illumination, "compare_blocks", plain_compare_blocks),
     (illumination, "fit_robustly", plain_fit_robustly),
-    (border, "border_level", plain_border_level),
 )
 
 

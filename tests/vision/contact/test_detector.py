@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
+from tactflow.sim.gel import RIM, SINK_IN
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
 from tactflow.vision.contact import detector as contact
 from tactflow.vision.contact.filling import is_solid, traced
@@ -32,14 +33,23 @@ def _gel(shape: tuple[int, int] = (160, 128)) -> NDArray[np.float64]:
 def _pressed(
     gel: NDArray[np.float64], center: tuple[float, float], radius: float, strength: float = 0.4
 ) -> NDArray[np.float64]:
-    """A ball on a gel lit from three sides: the slope grows to the rim and fades outside (Hertz)."""
+    """A ball on a gel lit from three sides: the slope grows to where the gel leaves the ball, and fades.
+
+    radius : px, where the ball crosses the untouched surface. The gel is that of `tactflow.sim`.
+    """
     y, x = np.mgrid[0 : gel.shape[0], 0 : gel.shape[1]].astype(float)
     dx, dy = (x - center[0]) / radius, (y - center[1]) / radius
-    far = np.hypot(dx, dy)
-    out = np.maximum(far, 1.0)
-    fade = 2 / np.pi * (np.arcsin(1 / out) - np.sqrt(out**2 - 1) / out**2)
+    reached = 1 - (dx**2 + dy**2)
+    fade = np.where(reached > SINK_IN, 1, RIM * np.exp(RIM * (reached / SINK_IN - 1)))
     angles = np.radians([90.0, 210.0, 330.0])
     return gel * np.stack([1 + strength * fade * (dx * np.cos(a) + dy * np.sin(a)) for a in angles], axis=-1)
+
+
+def _sunk(shape: tuple[int, ...], center: tuple[float, float], radius: float) -> NDArray[np.float64]:
+    """(H, W): depth of the same surface, 1 in the middle."""
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
+    reached = 1 - ((x - center[0]) ** 2 + (y - center[1]) ** 2) / radius**2
+    return np.where(reached > SINK_IN, reached, SINK_IN * np.exp(RIM * (reached / SINK_IN - 1)))
 
 
 def _noisy(gel: NDArray[np.float64], seed: int, noise: float = 1.5) -> Image:
@@ -107,25 +117,23 @@ def test_the_contact_of_a_ball_is_found_with_its_middle(noise: float) -> None:
     result = _detector(_noisy(gel, 1, noise)).detect(_noisy(_pressed(gel, center, radius), 2, noise))
     mask = result.mask > 0
     assert result.touching
-    assert _overlap(mask, _disc(mask.shape, center, radius)) > 0.88  # measured 0.93 to 0.96
+    assert _overlap(mask, _disc(mask.shape, center, radius)) > 0.84  # measured 0.85 to 0.87
     y, x = np.nonzero(mask)
     assert math.hypot(x.mean() - center[0], y.mean() - center[1]) < 1  # measured 0.1 to 0.3
 
 
-def test_a_brightened_area_ends_where_half_of_it_is_gone() -> None:
+def test_a_brightened_area_is_contact() -> None:
     gel = _gel()
-    truth = _disc(gel.shape[:2], (61, 83), 24)
-    bright = gel + 30 * cv2.GaussianBlur(truth.astype(float), (0, 0), 3)[..., None]
+    bright = gel + 40 * _sunk(gel.shape[:2], (61, 83), 24)[..., None]
     mask = _detector(_noisy(gel, 1)).detect(_noisy(bright, 2)).mask > 0
-    assert _overlap(mask, truth) > 0.9  # measured 0.95
+    assert _overlap(mask, _disc(mask.shape, (61, 83), 24)) > 0.9
 
 
 def test_a_darkened_area_is_contact_too() -> None:
     gel = _gel()
-    truth = _disc(gel.shape[:2], (61, 83), 24)
-    dark = gel - 30 * cv2.GaussianBlur(truth.astype(float), (0, 0), 3)[..., None]
+    dark = gel - 40 * _sunk(gel.shape[:2], (61, 83), 24)[..., None]
     mask = _detector(_noisy(gel, 1)).detect(_noisy(dark, 2)).mask > 0
-    assert _overlap(mask, truth) > 0.9
+    assert _overlap(mask, _disc(mask.shape, (61, 83), 24)) > 0.9
 
 
 def test_two_contacts_are_two_regions() -> None:
@@ -468,9 +476,18 @@ class _Sensor:
 
 
 @pytest.mark.parametrize(
-    "scene", ["press", "cable", "box", "press?light=bright", "press?light=mixed", "press?markers=none"]
+    ("scene", "least"),
+    [
+        ("press", 0.88),
+        ("cable", 0.88),
+        ("box", 0.88),
+        ("press?markers=none", 0.88),
+        # Their simulated coatings change the light only near to where the gel clings to the object.
+        ("press?light=bright", 0.78),
+        ("press?light=mixed", 0.76),
+    ],
 )
-def test_simulated_contacts_are_found_from_half_depth_on_with_their_outline(scene: str) -> None:
+def test_simulated_contacts_are_found_from_half_depth_on_with_their_outline(scene: str, least: float) -> None:
     sensor = _Sensor(scene, 90)
     hulls, centers = [], []
     for index in range(1, 90, 4):
@@ -490,8 +507,7 @@ def test_simulated_contacts_are_found_from_half_depth_on_with_their_outline(scen
         assert truth.center is not None
         centers.append(math.hypot(x.mean() - truth.center[0], y.mean() - truth.center[1]))
     assert len(hulls) >= 5
-    # Measured over whole recordings: medians 0.91 to 0.98, and 0.2 to 0.6 px.
-    assert np.median(hulls) > 0.88
+    assert np.median(hulls) > least
     assert np.median(centers) < 1
 
 
@@ -571,10 +587,11 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
         assert mask.any()
         y, x = np.nonzero(mask)
         errors.append((x.mean() - float(label["x"]), y.mean() - float(label["y"])))
-        growth.append(math.sqrt(x.size / math.pi) - float(label["radius"]))
+        growth.append(math.sqrt(x.size / math.pi) - 2**0.5 * float(label["radius"]))
     distance = np.hypot(*(np.array(errors) - np.median(errors, axis=0)).T)
     # Measured over all 200: 2.1 px median, 5.1 px at the 95th percentile, against labels that scatter by
-    # about 2 px themselves; the outline's radius is 2.8 px above the label's in the median.
+    # about 2 px themselves. They outline the disc to which the gel clings, whose radius is smaller by the
+    # root of two on a half-space (Hertz): the outline's is 1.6 px above that in the median.
     assert np.median(distance) < 2.6
     assert np.percentile(distance, 95) < 6.5
     assert abs(np.median(growth)) < 5

@@ -7,15 +7,14 @@
 2. `components` tells which connected changes are contacts: `Component`s, in cells.
 3. `background` again, for the window of each of them, at half resolution or pixel by pixel: a `WindowChange`,
    in which `response` makes slopes of all directions count alike.
-4. `contact_outline` finds the outline, a level set, with `nearby`, `filling` and `border`.
+4. `contact_outline` finds the outline, a level set, with `nearby` and `filling`.
 5. `resolution` draws it into the mask of the frame.
 
 `fusion` joins that mask with what the markers show.
 
-`learned` does without all of this: it shows the change (`change`) to a neural network (`network`).
+`reference` tells whether the reference was touched.
 """
 
 from tactflow.vision.contact.detector import ContactDetector, ContactResult, chi_square_threshold
-from tactflow.vision.contact.learned import LearnedDetector
 
-__all__ = ["ContactDetector", "ContactResult", "LearnedDetector", "chi_square_threshold"]
+__all__ = ["ContactDetector", "ContactResult", "chi_square_threshold"]

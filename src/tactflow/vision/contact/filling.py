@@ -43,6 +43,11 @@ class Hidden(NamedTuple):
     pixels: Mask
     beside: Mask
 
+    @classmethod
+    def of(cls, pixels: Mask) -> Hidden:
+        """From the pixels alone."""
+        return cls(pixels, np.asarray(cv2.dilate(pixels, SQUARE), np.uint8))
+
 
 class Region(NamedTuple):
     """A region without holes, and its border.
@@ -115,41 +120,6 @@ def is_solid(region: Region) -> bool:
         return False
     # Depths come in 256ths of a pixel.
     return bays is None or bool(max(bays.ravel()[3::4].tolist()) <= BAY * 256)
-
-
-def fill_bay(region: Region, faint: Mask) -> Region:
-    """Close a ring that is open on the side that lights hardly reach.
-
-    Where a region is one piece, its largest bay is filled with what has changed faintly there, and what that
-    encloses. If little of the bay is left then, it was no bay of the object.
-
-    faint : (h, w) uint8, 0 or 1: what has changed, if only faintly. Returns the region itself if it has not
-    grown.
-
-    >>> import numpy as np
-    >>> ring = np.ones((9, 9), np.uint8)
-    >>> ring[3:, 3:6] = 0
-    >>> faint = np.zeros_like(ring)
-    >>> int(fill_bay(traced(ring), faint).filled.sum())
-    63
-    >>> faint[8] = 1
-    >>> int(fill_bay(traced(ring), faint).filled.sum())
-    81
-    """
-    filled, outlines = region
-    if len(outlines) != 1:
-        return region
-    bays = np.asarray(cv2.bitwise_xor(_hull(region), filled), np.uint8)
-    missing = cv2.countNonZero(bays)
-    grown = _without_holes(filled | (faint & bays))
-    if cv2.countNonZero(grown) - cv2.countNonZero(filled) <= POCKET * missing:
-        return region
-    borders, _ = cv2.findContours(bays, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    bay = np.zeros_like(filled)
-    cv2.drawContours(bay, [max(borders, key=cv2.contourArea)], 0, 1, cv2.FILLED)
-    closed = enclosed(filled | (faint & bay))
-    covered = cv2.countNonZero(np.asarray(cv2.bitwise_and(closed.filled, bay), np.uint8))
-    return closed if covered > POCKET * cv2.countNonZero(bay) else region
 
 
 def _hull(region: Region) -> Mask:
