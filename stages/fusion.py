@@ -74,7 +74,7 @@ class Fusion(Stage):
         """What touches the gel, by both."""
         if markers is None:
             return FusedPorts(contact_mask, touching, "light" if touching else None)
-        if self._motion is None:
+        if self._motion is None or len(markers.origin) != self._motion.count:
             params = self.params
             self._motion = MotionTest(
                 markers.origin,

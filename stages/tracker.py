@@ -48,12 +48,13 @@ class Tracker(Stage):
         """Forget the reference; a new one follows."""
         self._references: list[NDArray[np.uint8]] = []
         self._detection: Detection | None = None
+        self._valid: NDArray[np.uint8] | None = None
         self._tracker: MarkerTracker | None = None
 
     def process(self, image: Image, frame: Frame, valid: Valid | None = None) -> Markers:
         """Position, status and standard error of every marker; the first frame serves as reference.
 
-        Marks are looked for inside of `valid`.
+        Marks are looked for inside of `valid`. One that the reference did not show joins behind the others.
         """
         if self._tracker is None:
             self._references.append(image)
@@ -67,6 +68,7 @@ class Tracker(Stage):
         return self._tracker.track(image)
 
     def _first_tracker(self, image: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> MarkerTracker:
+        self._valid = valid
         self._detection = detect_markers(
             image, dot_radius=self.params.dot, polarity=self.params.polarity, valid=valid
         )
@@ -75,4 +77,5 @@ class Tracker(Stage):
         return self._tracker_of([image], self._detection)
 
     def _tracker_of(self, references: list[NDArray[np.uint8]], detection: Detection) -> MarkerTracker:
-        return MarkerTracker(references, detection, max_displacement=self.params.max_displacement)
+        farthest = self.params.max_displacement
+        return MarkerTracker(references, detection, max_displacement=farthest, valid=self._valid)

@@ -185,7 +185,9 @@ class TactflowCamera(Camera):
             case Output.MARKERS:
                 markers = _required(result, "markers", "a stage tracker")
                 columns = [markers.origin, markers.displacement, markers.status[:, None]]
-                return np.hstack(columns).astype(np.float32)
+                # A dataset has one shape: markers found after the first frame are left out.
+                count = self._shape[0] if self._shape else None
+                return np.hstack(columns).astype(np.float32)[:count]
 
     def _in_order(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A copy that the caller may write to, (H, W, 3), in the colors' order that is configured."""

@@ -44,3 +44,10 @@ def test_a_simulated_press_is_shown_by_both() -> None:
         if result.contact is not None
     ]
     assert shown.count("both") > 0.8 * len(shown) > 30
+
+
+def test_a_marker_that_joins_is_taken_into_account() -> None:
+    stage = Fusion(Fusion.Params())
+    fewer = Markers(ORIGIN[:-1], ORIGIN[:-1], np.zeros(len(ORIGIN) - 1, np.uint8), RESTING.stderr[:-1])
+    for markers in (fewer, RESTING):
+        assert not stage.process(EVERYWHERE * 0, False, markers).touching

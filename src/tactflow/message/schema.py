@@ -109,7 +109,7 @@ class _FlowModel(_Strict):
 
 
 class _MarkersModel(_Strict):
-    """The markers; index i is the same physical marker for the whole run."""
+    """The markers; index i is the same physical marker for the whole run. Ones found later come last."""
 
     origin: list[_Point] = Field(description="positions in the reference frame, px")
     position: list[_Point] = Field(
@@ -121,7 +121,7 @@ class _MarkersModel(_Strict):
     )
     probability: list[_Share | None] = Field(
         default_factory=list,
-        description="of each being a marker at all, from the reference frame; null when unknown (detail)",
+        description="of each being a marker at all, by its looks and motion; null when unknown (detail)",
     )
 
 

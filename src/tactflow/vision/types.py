@@ -85,13 +85,15 @@ class Contact:
 class Markers:
     """The markers of the reference frame, now. Index i is the same physical marker for the whole run.
 
+    Markers that are found later come last.
+
     origin : (N, 2) float64, position in the reference frame, px.
     position : (N, 2) float64, position in this frame, px. Finite for every status.
     status : (N,) uint8, values of `MarkerStatus`.
     stderr : (N,) float64, standard error of each coordinate of `position`, px; NaN where unknown.
     radius : of a marker in the reference frame, px; None where the method does not know it.
-    probability : (N,) float64, of being a marker at all, 0 to 1, from the reference frame; NaN where unknown.
-        None where the method does not tell.
+    probability : (N,) float64, of being a marker at all, 0 to 1, by its looks in the reference frame and its
+        motion since; NaN where unknown. None where the method does not tell.
 
     >>> origin = np.array([[10.0, 20.0]])
     >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(1, np.uint8), np.array([0.01]))

@@ -531,3 +531,84 @@ def test_the_tracker_does_not_depend_on_opencv_threads() -> None:
     finally:
         cv2.setNumThreads(threads)
     np.testing.assert_array_equal(found[0], found[1])
+
+
+STAYS = 44
+
+
+@cache
+def _sheared(amount: float, seed: int, stays: bool) -> NDArray[np.uint8]:
+    """The gel shifted as a whole by `amount` pitches, but for one spot if it stays."""
+    now = TRUTH + amount * PITCH * np.array([1.0, 0.3])
+    if stays:
+        now[STAYS] = TRUTH[STAYS]
+    return picture(now, seed=seed)
+
+
+def _followed(under_test: MarkerTracker, stays: bool, most: float = 0.4) -> Markers:
+    """The gel goes out and back in eight steps; returns the markers where it went farthest."""
+    out = [under_test.track(_sheared(most * step / 4, step, stays)) for step in range(1, 5)]
+    for step in (3, 2, 1, 0):
+        under_test.track(_sheared(most * step / 4, 10 + step, stays))
+    return out[-1]
+
+
+def test_a_spot_that_stays_while_the_gel_moves_leaves() -> None:
+    under_test = tracker()
+    before = under_test.track(_sheared(0.0, 20, True))
+    assert before.probability is not None
+    assert before.probability.min() > 0.9
+    farthest = _followed(under_test, stays=True)
+    assert np.flatnonzero(farthest.status != MarkerStatus.TRACKED).tolist() == [STAYS]
+    assert farthest.status[STAYS] == MarkerStatus.LOST
+    assert farthest.probability is not None
+    assert np.flatnonzero(farthest.probability < 0.5).tolist() == [STAYS]
+    # It is back among the others, and still none of them.
+    assert under_test.track(_sheared(0.0, 21, True)).status[STAYS] == MarkerStatus.LOST
+
+
+def test_marks_that_move_with_the_gel_stay() -> None:
+    under_test = tracker()
+    markers = _followed(under_test, stays=False)
+    assert (markers.status == MarkerStatus.TRACKED).all()
+    assert markers.probability is not None
+    assert markers.probability.min() > 0.99
+    for shift in ((20.0, 0.0), (-9.0, 14.0), (0.0, -20.0)):
+        pressed = under_test.track(picture(dragged(shift, reach=60.0)))
+        assert (pressed.status == MarkerStatus.TRACKED).all()
+
+
+def _without(hidden: int) -> MarkerTracker:
+    return tracker(picture(np.delete(TRUTH, hidden, axis=0), seed=99))
+
+
+def test_a_mark_that_the_reference_did_not_show_joins_behind_the_others() -> None:
+    under_test = _without(STAYS)
+    others = np.delete(TRUTH, STAYS, axis=0)
+    assert len(under_test.track(picture(TRUTH, seed=1)).origin) == 79
+    _followed(under_test, stays=False)
+    now = dragged((14.0, 3.0))
+    markers = under_test.track(picture(now, seed=2))
+    assert len(markers.origin) == len(markers.status) == 80
+    np.testing.assert_allclose(markers.origin[:79], others, atol=0.1)
+    np.testing.assert_allclose(markers.origin[79], TRUTH[STAYS], atol=0.1)
+    assert (markers.status == MarkerStatus.TRACKED).all()
+    moved = np.append(np.delete(now - TRUTH, STAYS, axis=0), [(now - TRUTH)[STAYS]], axis=0)
+    assert np.abs(markers.displacement - moved).max() < 0.1
+    assert markers.probability is not None
+    assert markers.probability[79] > 0.95
+
+
+def test_what_lies_between_the_marks_does_not_join() -> None:
+    under_test = _without(STAYS)
+    dirt = np.append(np.delete(TRUTH, STAYS, axis=0), [TRUTH[STAYS] + 0.5 * PITCH], axis=0)
+    for step in (1, 2, 1, 0, 0):
+        markers = under_test.track(picture(dirt + 0.1 * step * PITCH, seed=step))
+    assert len(markers.origin) == 79
+
+
+def test_marks_join_only_after_the_gel_has_moved_and_rests() -> None:
+    under_test = _without(STAYS)
+    for step in (0, 0, 2, 3):
+        assert len(under_test.track(_sheared(0.1 * step, step, False)).origin) == 79
+    assert len(under_test.track(_sheared(0.0, 1, False)).origin) == 80

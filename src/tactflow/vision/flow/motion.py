@@ -116,7 +116,8 @@ class MotionTest:
         if not 0 <= relaxation < 1:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
         self._origin = np.array(origin, np.float64)
-        count = len(self._origin)
+        self.count = count = len(self._origin)
+        """Number of markers."""
         arms = self._origin - (self._origin.mean(axis=0) if count else 0.0)
         levers = arms / np.maximum((arms * arms).sum(axis=1, keepdims=True), 1.0)
         self._rest = np.ascontiguousarray(np.hstack([self._origin, arms, levers]).T)

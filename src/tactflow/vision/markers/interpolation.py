@@ -47,7 +47,7 @@ class Interpolator:
 
     def __init__(self, origin: Floats, pitch: float) -> None:
         self._origin, self._pitch = origin, pitch
-        self._around, self._weight = _surroundings(origin, pitch)
+        self._around, self._weight = surroundings(origin, pitch)
 
     def place(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that are not found, where enough of those around them are.
@@ -72,7 +72,7 @@ class Interpolator:
         return placed
 
 
-def _surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
+def surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
     """For each mark up to 24 nearest others, and their weights: two (N, n) arrays."""
     away, near = nearest(origin, NEIGHBOURS)
     weight = np.exp(-(away**2) / (2 * (WEIGHT_SIGMA * pitch) ** 2))

@@ -259,7 +259,7 @@ def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
 
 def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     """Of spots that touch no mark, those that go on with the lattice and are like the marks around."""
-    support = lattice.support(spots.points, _expected(marks.points))
+    support = lattice.support(spots.points, expected_marks(marks.points))
     wanted, support = spots.at(support > 0), support[support > 0]
     away = _distances(wanted.points, marks.points)
     around = np.argsort(away, axis=1, kind="stable")[:, :MARKS_AROUND]
@@ -277,7 +277,7 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     return _apart(wanted.at(fits & chosen), rank[fits & chosen])
 
 
-def _expected(points: Floats) -> Corners:
+def expected_marks(points: Floats) -> Corners:
     """Where the lattice wants marks: the corners of parallelograms, and the next place along each line."""
     edges = links(points)
     found = lattice.corners(points, edges)

@@ -145,29 +145,40 @@ class MarkerTemplates:
         return Alignment(position, found[0], found[1], found[2])
 
 
-class SizedTemplates:
-    """Templates of marks of several sizes: each holds its mark, and none its neighbours.
+class TemplateGroups:
+    """Templates of marks of several sizes, or of several frames: each holds its mark, and no neighbour.
 
     As `MarkerTemplates`, but radii : (N,) float64, px.
     """
 
     def __init__(self, reference: Floats32, origin: Floats, radii: Floats, dark: bool = True) -> None:
+        self._dark = dark
+        self._templates: list[MarkerTemplates] = []
+        self._group, self._place = np.zeros((2, 0), np.int64)
+        self.add(reference, origin, radii)
+
+    def add(self, reference: Floats32, origin: Floats, radii: Floats) -> None:
+        """Append marks (n, 2), px, with radii (n,), px, as they look in another frame."""
         step = np.floor(np.log(radii / radii.min()) / np.log(ONE_TEMPLATE) + 1e-6)
-        sizes, self._size = np.unique(step, return_inverse=True)
-        self._place = np.empty(len(radii), np.int64)
-        self._templates = []
+        sizes, group = np.unique(step, return_inverse=True)
+        place = np.empty(len(radii), np.int64)
+        known = len(self._templates)
         for size in range(len(sizes)):
-            marks = np.flatnonzero(self._size == size)
-            self._place[marks] = np.arange(len(marks))
+            marks = np.flatnonzero(group == size)
+            place[marks] = np.arange(len(marks))
             radius = float(np.max(radii[marks]))
-            self._templates.append(MarkerTemplates(reference, origin[marks], radius, dark))
+            self._templates.append(MarkerTemplates(reference, origin[marks], radius, self._dark))
+        self._group = np.concatenate([self._group, group + known])
+        self._place = np.concatenate([self._place, place])
 
     def align(self, image: NDArray[np.uint8], start: Floats, marks: Indices | None = None) -> Alignment:
         """As `MarkerTemplates.align`."""
-        marks = np.arange(len(self._size)) if marks is None else marks
+        if len(self._templates) == 1:
+            return self._templates[0].align(image, start, marks)
+        marks = np.arange(len(self._group)) if marks is None else marks
         found = np.empty((len(marks), 2)), *np.empty((3, len(marks)), np.float32)
-        for size, templates in enumerate(self._templates):
-            those = np.flatnonzero(self._size[marks] == size)
+        for group, templates in enumerate(self._templates):
+            those = np.flatnonzero(self._group[marks] == group)
             if len(those):
                 part = templates.align(image, start[those], self._place[marks[those]])
                 for whole, values in zip(found, part, strict=True):

@@ -11,8 +11,10 @@ from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
 from tactflow.vision.compiled import kernel
+from tactflow.vision.markers import lattice
 from tactflow.vision.markers.detection import (
     Detection,
+    NoMarkersError,
     detect_markers,
     refine_centers,
     require_image,
@@ -20,8 +22,10 @@ from tactflow.vision.markers.detection import (
 )
 from tactflow.vision.markers.interpolation import Interpolator
 from tactflow.vision.markers.matching import MarkerGraph, choose_spots, common_displacement
+from tactflow.vision.markers.motion import MotionEvidence
+from tactflow.vision.markers.selection import expected_marks
 from tactflow.vision.markers.spots import SpotFinder
-from tactflow.vision.markers.template import Alignment, MarkerTemplates, SizedTemplates
+from tactflow.vision.markers.template import Alignment, TemplateGroups
 from tactflow.vision.types import Markers, MarkerStatus
 
 LEAST_GAIN: Final = np.float32(0.2)
@@ -61,7 +65,13 @@ SPOT_STRENGTH: Final = 0.25
 SAME_SPOT: Final = 0.3
 """Distance within which a mark is at a spot, pitches. Chosen by hand."""
 
-_TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
+LEAVING_LOG_ODDS: Final = -3.0
+"""Logarithm of the odds that a mark moves with the gel, below which it leaves: strong evidence (Kass and
+Raftery, "Bayes factors", 1995)."""
+
+JOINING_PROBABILITY: Final = 0.95
+"""Of a mark that the reference did not show, at least: of those called so 96 % are marks."""
+
 _INFERRED: Final = np.uint8(MarkerStatus.INFERRED)
 _LOST: Final = np.uint8(MarkerStatus.LOST)
 
@@ -78,6 +88,10 @@ class MarkerTracker:
     as a starting point. Identities rest on the smoothness of the whole field, so a wrong one does not
     survive.
 
+    A mark that stays while those around it move, as dirt before the camera or a reflection does, leaves: it
+    is lost from then on. When the gel is at rest again after its first motion, marks are looked for once
+    more. Those that the reference did not show, where the lattice wants a mark, join behind the others.
+
     Measured in float32, with templates of 16 bits; positions and standard errors are those of float64 to
     1e-4 px.
 
@@ -89,6 +103,7 @@ class MarkerTracker:
         None: those that `detect_markers` finds in the first frame.
     max_displacement : farthest a mark may go between two frames, or from where its neighbours suggest, px.
         Larger values cost time in the search and admit more confusion. None: 1.3 times the pitch.
+    valid : (H, W) uint8, not 0 where there is gel, for marks that join. None: everywhere.
 
     Raises
     ------
@@ -115,6 +130,7 @@ class MarkerTracker:
         detection: Detection | None = None,
         *,
         max_displacement: float | None = None,
+        valid: NDArray[np.uint8] | None = None,
     ) -> None:
         frames = [reference] if isinstance(reference, np.ndarray) else list(reference)
         if not frames:
@@ -124,25 +140,23 @@ class MarkerTracker:
             raise ValueError(f"required reference frames of one size, got {[gray.shape for gray in grays]}")
         if max_displacement is not None and not 0 < max_displacement < np.inf:
             raise ValueError(f"required max_displacement > 0 px, got {max_displacement:g}")
-        detection = detection or detect_markers(frames[0])
+        detection = detection or detect_markers(frames[0], valid=valid)
         mean = np.asarray(np.mean(np.stack(grays), axis=0, dtype=np.float32))
         self._shape = grays[0].shape
         self._shapes = (self._shape, (*self._shape, 3))
         self._pitch, self._radius = detection.pitch, detection.dot_radius
-        self._probability = detection.probability
+        self._valid, self._looked_again = valid, False
+        self._prior = None if detection.probability is None else _log_odds(detection.probability)
         # Nothing that is seen goes farther than across the frame; the votes for a jump take memory.
         across = float(np.hypot(*self._shape))
         self._farthest = min(max_displacement or MAX_DISPLACEMENT * self._pitch, across)
+        self._polarity = detection.polarity
         dark = detection.polarity == "dark"
         self._origin = np.array(detection.centers, np.float64)
         if len(grays) > 1:
             self._origin = refine_centers(mean if dark else 255 - mean, self._origin, self._radius)
         self._count = len(self._origin)
-        self._templates: MarkerTemplates | SizedTemplates = (
-            MarkerTemplates(mean, self._origin, self._radius, dark)
-            if detection.radii is None
-            else SizedTemplates(mean, self._origin, detection.radii, dark)
-        )
+        self._templates = TemplateGroups(mean, self._origin, _radii(detection), dark)
         self._spots = SpotFinder(np.rint(mean).astype(np.uint8), detection)
         self._graph = MarkerGraph(self._origin, detection.edges)
         self._interpolator = Interpolator(self._origin, self._pitch)
@@ -153,25 +167,32 @@ class MarkerTracker:
         self._position = self._origin.copy()
         self._seen = np.ones(self._count, bool)
         self._age = 0
+        self._evidence = MotionEvidence(self._origin, self._pitch)
+        self._left: Indices = np.zeros(0, np.int64)
+        self._has_moved = False
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
         """Find the marks in one frame.
 
         image : (H, W, 3) uint8 BGR or (H, W) uint8, of the reference's size.
-        Returns fresh arrays; `stderr` is NaN for marks that are not seen. Raises ValueError for another size.
+        Returns fresh arrays; `stderr` is NaN for marks that are not seen. Marks that join are behind those
+        that were there before. Raises ValueError for another size.
         """
         if image.shape not in self._shapes or image.dtype != np.uint8:
             require_image(image)
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {image.shape[:2]}")
         image = np.ascontiguousarray(image)
         found = self._templates.align(image, self._position)
+        found.gain[self._left] = 0
         position, stderr = found.position, found.stderr
         seen, strain, doubt = self._check(found)
         self._age += 1
         # Where something stays missing, look again now and then.
-        if doubt or (self._age >= SEARCH_INTERVAL and not seen.all()):
+        missing = np.count_nonzero(seen) < self._count - len(self._left)
+        if doubt or (self._age >= SEARCH_INTERVAL and missing):
             position, seen, stderr = self._search(image, found, seen, strain)
             self._age = 0
+        rests = self._weigh_motion(position, stderr, seen)
         # All tracked, which is 0; `np.full` takes three times as long.
         status = np.zeros(self._count, np.uint8)
         errors = stderr.astype(np.float64)
@@ -179,9 +200,59 @@ class MarkerTracker:
             errors[~seen] = np.nan
             status[~seen] = _LOST
             status[self._infer(position, seen)] = _INFERRED
+            status[self._left] = _LOST
         self._position, self._seen = position, seen
-        probability = None if self._probability is None else self._probability.copy()
+        if rests and self._has_moved and not self._looked_again:
+            self._looked_again = True
+            if self._join(image):
+                return self.track(image)
+        probability = None if self._prior is None else _probability(self._prior + self._evidence.log_odds)
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
+
+    def _weigh_motion(self, position: Floats, stderr: NDArray[Any], seen: Flags) -> bool:
+        """Have marks that do not move with the gel leave `seen`; returns whether the gel rests."""
+        displacement = position - self._origin
+        moves = (np.abs(displacement) > REST * self._pitch).any(axis=1)
+        if moves.any():
+            self._has_moved = True
+            self._evidence.add(displacement, stderr, seen)
+            motion = self._evidence.log_odds
+            if self._prior is not None and motion.min(initial=0) < LEAVING_LOG_ODDS:
+                self._left = np.flatnonzero((motion < LEAVING_LOG_ODDS) & (self._prior + motion < 0))
+                seen[self._left] = False
+        whole = np.count_nonzero(seen) > WHOLE * (self._count - len(self._left))
+        return bool(whole and not moves[seen].any())
+
+    def _join(self, image: NDArray[np.uint8]) -> bool:
+        """Take up marks of a frame at rest that the reference did not show; returns whether there are any."""
+        try:
+            radius = min(max(1.0, self._radius), min(self._shape) / 4)
+            found = detect_markers(image, dot_radius=radius, polarity=self._polarity, valid=self._valid)
+        except NoMarkersError:
+            return False
+        if found.probability is None or self._prior is None:
+            return False
+        joins = (found.probability > JOINING_PROBABILITY) & (
+            lattice.support(found.centers, expected_marks(self._position)) > 0
+        )
+        joins &= _are_apart(found.centers, self._position, HALF_PITCH * self._pitch)
+        if not joins.any():
+            return False
+        centers, known = found.centers[joins], np.arange(self._count + int(joins.sum())) < self._count
+        self._templates.add(to_gray(image).astype(np.float32), centers, _radii(found)[joins])
+        # Where they were in the reference: the marks around tell how the gel has moved since.
+        origin = np.concatenate([self._origin, centers])
+        placed = np.concatenate([self._position, centers])
+        Interpolator(origin, self._pitch).place(placed, known)
+        origin[~known] -= placed[~known] - centers
+        self._origin, self._count = origin, len(origin)
+        self._graph = MarkerGraph(origin, lattice.neighbour_graph(origin, lattice.LONGEST_LINK * self._pitch))
+        self._interpolator = Interpolator(origin, self._pitch)
+        self._evidence = self._evidence.extended(origin, self._pitch)
+        self._prior = np.concatenate([self._prior, _log_odds(found.probability[joins])])
+        self._position = np.concatenate([self._position, centers])
+        self._seen = np.concatenate([self._seen, known[~known]])
+        return True
 
     def _check(self, found: Alignment) -> tuple[Flags, Floats, bool]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
@@ -196,10 +267,11 @@ class MarkerTracker:
         jumped = self._jumps(image, seen)
         if jumped is not None:
             found = self._templates.align(image, jumped)
+            found.gain[self._left] = 0
             seen = trusted(found.gain, found.r_squared)
             strain = self._graph.strain(found.position)
         inliers = self._graph.largest_component(seen, strain)
-        free = np.flatnonzero(~inliers)
+        free = np.setdiff1d(np.flatnonzero(~inliers), self._left)
         if len(free) == 0:
             return _Result(found.position, seen, found.stderr)
         moved = found.position - self._origin
@@ -281,6 +353,20 @@ class _Result(NamedTuple):
     position: Floats
     found: Flags
     stderr: NDArray[Any]
+
+
+def _radii(detection: Detection) -> Floats:
+    """(N,) of each mark, px."""
+    count, radii = len(detection.centers), detection.radii
+    return np.full(count, detection.dot_radius) if radii is None else radii
+
+
+def _log_odds(probability: Floats) -> Floats:
+    return np.asarray(np.log(probability / (1 - probability)), np.float64)
+
+
+def _probability(log_odds: Floats) -> Floats:
+    return np.asarray(1 / (1 + np.exp(-log_odds)), np.float64)
 
 
 def _median(vectors: Floats) -> Floats:
