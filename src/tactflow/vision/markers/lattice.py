@@ -6,6 +6,8 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from tactflow.vision.arrays import Flags, Floats, Indices
 
@@ -161,16 +163,10 @@ def own_shares(centers: Floats, edges: Indices) -> tuple[Floats, Indices]:
 
 
 def components(groups: Indices, count: int) -> Indices:
-    """For each mark (count,) the first mark that groups of marks (C, k), one after another, lead to."""
-    name = np.arange(count)
-    while True:
-        first = name.copy()
-        np.minimum.at(first, groups.ravel(), np.repeat(name[groups].min(axis=1), groups.shape[1]))
-        # A name of a name is as good: so it takes few rounds.
-        first = first[first]
-        if (first == name).all():
-            return name
-        name = first
+    """For each mark (count,) the number of the component that it is in, of groups of marks (C, k)."""
+    first, others = np.repeat(groups[:, 0], groups.shape[1] - 1), groups[:, 1:].ravel()
+    linked = coo_array((np.ones(len(first)), (first, others)), shape=(count, count))
+    return np.asarray(connected_components(linked, directed=False)[1], np.int64)
 
 
 def support(points: Floats, expected: Corners) -> Indices:

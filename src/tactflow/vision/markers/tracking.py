@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
-from tactflow.vision.compiled import kernel
 from tactflow.vision.markers import lattice
 from tactflow.vision.markers.detection import (
     Detection,
@@ -51,7 +50,8 @@ BORDER_SEEN: Final = 0.85
 hand."""
 
 HALF_PITCH: Final = 0.5
-"""Displacement of a grid, pitches, from which on it might be a pitch off."""
+"""Displacement of a grid, pitches, from which on it might be a pitch off; and distance from all marks from
+which on a spot is another one."""
 
 REST: Final = 0.1
 """Distance of a mark from its rest within which it rests, pitches. Chosen by hand."""
@@ -212,16 +212,16 @@ class MarkerTracker:
     def _weigh_motion(self, position: Floats, stderr: NDArray[Any], seen: Flags) -> bool:
         """Have marks that do not move with the gel leave `seen`; returns whether the gel rests."""
         displacement = position - self._origin
-        moves = (np.abs(displacement) > REST * self._pitch).any(axis=1)
-        if moves.any():
+        far = np.asarray(np.abs(displacement).max(axis=1) > REST * self._pitch)
+        if far.any():
             self._has_moved = True
             self._evidence.add(displacement, stderr, seen)
             motion = self._evidence.log_odds
             if self._prior is not None and motion.min(initial=0) < LEAVING_LOG_ODDS:
                 self._left = np.flatnonzero((motion < LEAVING_LOG_ODDS) & (self._prior + motion < 0))
-                seen[self._left] = False
+            seen[self._left] = False
         whole = np.count_nonzero(seen) > WHOLE * (self._count - len(self._left))
-        return bool(whole and not moves[seen].any())
+        return bool(whole and not far[seen].any())
 
     def _join(self, image: NDArray[np.uint8]) -> bool:
         """Take up marks of a frame at rest that the reference did not show; returns whether there are any."""
@@ -257,10 +257,9 @@ class MarkerTracker:
     def _check(self, found: Alignment) -> tuple[Flags, Floats, bool]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
         may have missed or mistaken one."""
-        seen, strain = np.empty(self._count, np.bool_), np.empty(len(self._graph.edges))
-        edges, length = self._graph.edges, self._graph.length
-        fit = found.position, self._origin, found.gain, found.r_squared
-        return seen, strain, check_marks(*fit, edges, length, self._seen, seen, strain)
+        seen, strain = trusted(found.gain, found.r_squared), self._graph.strain(found.position)
+        steep = self._graph.edges[strain > STEEP_STRAIN]
+        return seen, strain, bool((self._seen & ~seen).any() or seen[steep].all(axis=1).any())
 
     def _search(self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats) -> _Result:
         """Joint choice among the spots, for marks outside the largest smooth component."""
@@ -294,7 +293,7 @@ class MarkerTracker:
         return result
 
     def _jumps(self, image: NDArray[np.uint8], seen: Flags) -> Floats | None:
-        """Where the marks (N, 2) are, px, if a whole grid jumped or is a pitch off; None if none.
+        """Where the marks (N, 2) are, px, if a whole grid jumped; None if none.
 
         A grid apart from the others that is off by a pitch is as smooth as before. What tells is its border,
         where a row of marks is missing on one side, and that more of it is seen at its rest.
@@ -391,33 +390,3 @@ def _lengths(vectors: Floats) -> Floats:
 def trusted(gain: Any, r_squared: Any) -> Any:
     """Whether a mark is seen, from how its template fits; of numbers or arrays."""
     return (gain > LEAST_GAIN) & (gain < MOST_GAIN) & (r_squared > LEAST_R_SQUARED)
-
-
-@kernel(
-    "boolean(float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1], float64[::1],"
-    "boolean[::1], boolean[::1], float64[::1])"
-)
-def check_marks(
-    position: Floats,
-    origin: Floats,
-    gain: NDArray[np.float32],
-    r_squared: NDArray[np.float32],
-    edges: Indices,
-    length: Floats,
-    seen_before: Flags,
-    seen: Flags,
-    strain: Floats,
-) -> bool:
-    """Fill `seen`, (N,), and `strain`, (E,), of each link; returns whether a mark was lost or a link between
-    marks that are seen is too steep."""
-    doubt = False
-    for n in range(len(position)):
-        seen[n] = gain[n] > LEAST_GAIN and gain[n] < MOST_GAIN and r_squared[n] > LEAST_R_SQUARED
-        doubt = doubt or (seen_before[n] and not seen[n])
-    for e in range(len(edges)):
-        one, other = edges[e, 0], edges[e, 1]
-        x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
-        y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
-        strain[e] = np.sqrt(x * x + y * y) / length[e]
-        doubt = doubt or (strain[e] > STEEP_STRAIN and seen[one] and seen[other])
-    return doubt
