@@ -87,7 +87,15 @@ def test_every_kind_of_picture_without_dots_is_drawn_alike_each_time() -> None:
 
 def test_dots_at_rest_spread_by_the_noise() -> None:
     pictures = [render(SIZE, TRUTH, 4.0, noise=2.0, seed=seed) for seed in range(6)]
-    assert 0.002 < spread_at_rest(pictures) < 0.03
+    for spread in spread_at_rest(pictures):
+        assert 0.002 < spread < 0.03
+
+
+def test_what_all_dots_do_together_is_no_spread_of_their_own() -> None:
+    pictures = [render(SIZE, TRUTH + 0.2 * step, 4.0, noise=2.0, seed=step) for step in range(6)]
+    spread, own = spread_at_rest(pictures)
+    assert spread > 0.3
+    assert 0.002 < own < 0.03
 
 
 def test_the_labels_of_the_package_name_dots_of_many_labs_and_pictures_without() -> None:

@@ -342,14 +342,21 @@ def _cloth(gel: Floats, generator: np.random.Generator) -> Floats:
     return np.asarray(drawn, np.float64)
 
 
-def spread_at_rest(pictures: Sequence[Picture]) -> float:
-    """Median over the dots of their spread (standard deviation, px) over frames at rest, by coordinate.
+def spread_at_rest(pictures: Sequence[Picture]) -> tuple[float, float]:
+    """Median over the dots of their spread (standard deviation, px) over frames at rest, by coordinate; and
+    the part of it that each dot has on its own: without what a motion of the whole gel, quadratic in the
+    place, explains in each frame.
 
     Raises NoMarkersError if the first frame has no dots.
     """
     tracker = MarkerTracker(pictures[0])
-    positions = np.stack([tracker.track(picture).position for picture in pictures])
-    return float(np.median(positions.std(axis=0)))
+    tracked = [tracker.track(picture) for picture in pictures]
+    origin = tracked[0].origin
+    moved = np.stack([markers.position[: len(origin)] - origin for markers in tracked])
+    x, y = ((origin - origin.mean(axis=0)) / origin.std(axis=0)).T
+    basis, _ = np.linalg.qr(np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y]))
+    own = moved - basis @ (basis.T @ moved)
+    return float(np.median(moved.std(axis=0))), float(np.median(own.std(axis=0)))
 
 
 def summary(judged: Sequence[FoundDots]) -> Iterator[str]:
@@ -404,8 +411,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\nFound + false of each change in percent of the dots marked.")
         for recording, (first, end) in REST.items():
             if (options.data / recording).exists():
-                spread = spread_at_rest(frames(options.data, recording, first, end))
-                print(f"{recording}: spread of a dot at rest {spread:.3f} px (median)")
+                spread, own = spread_at_rest(frames(options.data, recording, first, end))
+                print(
+                    f"{recording}: dots at rest spread by {spread:.3f} px (median), each alone by {own:.3f}"
+                )
     except TactflowError as error:
         say(f"tactflow: {error}")
         return error.exit_code

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy.sparse import csr_array
 
-from tactflow.vision.arrays import Flags, Floats
+from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.interpolation import surroundings
 
 BEST_AGREEMENT: Final = 0.25
@@ -42,46 +42,60 @@ class MotionEvidence:
     >>> evidence = MotionEvidence(10 * np.column_stack([x.ravel(), y.ravel()]), 10.0)
     >>> moved = np.full((25, 2), 2.0)
     >>> moved[12] = 0
-    >>> evidence.add(moved, np.full(25, 0.02), np.ones(25, bool))
+    >>> evidence.add(moved, np.full(25, 0.02, np.float32), np.ones(25, bool))
     >>> evidence.log_odds[[12, 13]].round(1)
     array([-8.,  5.])
     """
 
     def __init__(self, origin: Floats, pitch: float) -> None:
-        count = len(origin)
-        near, weight = surroundings(origin, pitch)
-        first = np.arange(count + 1) * near.shape[1]
-        self._weights = csr_array((weight.ravel(), near.ravel(), first), shape=(count, count))
-        self._moves, self._stays = np.zeros((2, count))
+        self._around, self._weight = surroundings(origin, pitch)
+        self._strongest = np.zeros((2, len(origin)))
 
     @property
     def log_odds(self) -> Floats:
         """(N,) float64, logarithm of how much more probable it is that a mark moves with the gel."""
-        return np.asarray(self._moves - self._stays, np.float64)
+        return np.asarray(self._strongest[0] - self._strongest[1], np.float64)
 
-    def add(self, displacement: Floats, stderr: Floats, seen: Flags) -> None:
+    def add(self, displacement: Floats, stderr: Floats32, seen: Flags) -> None:
         """Take one frame into account.
 
-        displacement : (N, 2) float64, px. stderr : (N,) float64, px. seen : (N,) bool; of others both may be
+        displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool; of others both may be
         anything finite.
         """
-        squares = (displacement**2).sum(axis=1)
-        sums = self._weights @ (
-            np.column_stack([displacement, squares, np.ones_like(squares)]) * seen[:, None]
-        )
-        total = np.maximum(sums[:, 3], LEAST_WEIGHT)
-        mean = sums[:, :2] / total[:, None]
-        length = (mean**2).sum(axis=1)
-        spread = np.maximum(sums[:, 2] / total - length, 0) / 2
-        expected = spread + stderr**2 + BEST_AGREEMENT**2 * length + LEAST_SPREAD**2
-        ratio = ((mean * displacement).sum(axis=1) - length / 2) / expected
-        ratio = np.where(seen & (sums[:, 3] >= LEAST_WEIGHT), ratio, 0.0)
-        self._moves = np.maximum(self._moves, ratio)
-        self._stays = np.maximum(self._stays, -ratio)
+        weigh_motion(displacement, stderr, seen, self._around, self._weight, self._strongest)
 
     def extended(self, origin: Floats, pitch: float) -> MotionEvidence:
         """What is known of the marks, with others behind them."""
         longer = MotionEvidence(origin, pitch)
-        known = len(self._moves)
-        longer._moves[:known], longer._stays[:known] = self._moves, self._stays
+        longer._strongest[:, : self._strongest.shape[1]] = self._strongest
         return longer
+
+
+@kernel(
+    "void(float64[:, ::1], float32[::1], boolean[::1], int64[:, ::1], float64[:, ::1], float64[:, ::1])",
+)
+def weigh_motion(
+    displacement: Floats, stderr: Floats32, seen: Flags, around: Indices, weight: Floats, strongest: Floats
+) -> None:
+    """Raise `strongest`, (2, N), to the evidence of a frame: that each mark moves, and that it stays.
+
+    displacement : (N, 2). stderr, seen : (N,). around, weight : (N, K), the marks around and their weights.
+    """
+    for n in range(len(displacement)):
+        total = mean_x = mean_y = squares = 0.0
+        for k in range(around.shape[1]):
+            other, share = around[n, k], weight[n, k]
+            if seen[other] and share > 0.0:
+                x, y = displacement[other, 0], displacement[other, 1]
+                total, mean_x, mean_y = total + share, mean_x + share * x, mean_y + share * y
+                squares += share * (x * x + y * y)
+        if not seen[n] or total < LEAST_WEIGHT:
+            continue
+        mean_x, mean_y = mean_x / total, mean_y / total
+        length = mean_x * mean_x + mean_y * mean_y
+        spread = max(squares / total - length, 0.0) / 2
+        expected = spread + stderr[n] * stderr[n] + BEST_AGREEMENT**2 * length + LEAST_SPREAD**2
+        along = mean_x * displacement[n, 0] + mean_y * displacement[n, 1]
+        ratio = (along - length / 2) / expected
+        strongest[0, n] = max(strongest[0, n], ratio)
+        strongest[1, n] = max(strongest[1, n], -ratio)

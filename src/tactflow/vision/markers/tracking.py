@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers import lattice
 from tactflow.vision.markers.detection import (
     Detection,
@@ -257,9 +258,10 @@ class MarkerTracker:
     def _check(self, found: Alignment) -> tuple[Flags, Floats, bool]:
         """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
         may have missed or mistaken one."""
-        seen, strain = trusted(found.gain, found.r_squared), self._graph.strain(found.position)
-        steep = self._graph.edges[strain > STEEP_STRAIN]
-        return seen, strain, bool((self._seen & ~seen).any() or seen[steep].all(axis=1).any())
+        seen, strain = np.empty(self._count, np.bool_), np.empty(len(self._graph.edges))
+        edges, length = self._graph.edges, self._graph.length
+        fit = found.position, self._origin, found.gain, found.r_squared
+        return seen, strain, check_marks(*fit, edges, length, self._seen, seen, strain)
 
     def _search(self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats) -> _Result:
         """Joint choice among the spots, for marks outside the largest smooth component."""
@@ -390,3 +392,33 @@ def _lengths(vectors: Floats) -> Floats:
 def trusted(gain: Any, r_squared: Any) -> Any:
     """Whether a mark is seen, from how its template fits; of numbers or arrays."""
     return (gain > LEAST_GAIN) & (gain < MOST_GAIN) & (r_squared > LEAST_R_SQUARED)
+
+
+@kernel(
+    "boolean(float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1], float64[::1],"
+    "boolean[::1], boolean[::1], float64[::1])"
+)
+def check_marks(
+    position: Floats,
+    origin: Floats,
+    gain: NDArray[np.float32],
+    r_squared: NDArray[np.float32],
+    edges: Indices,
+    length: Floats,
+    seen_before: Flags,
+    seen: Flags,
+    strain: Floats,
+) -> bool:
+    """Fill `seen`, (N,), and `strain`, (E,), of each link; returns whether a mark was lost or a link between
+    marks that are seen is too steep."""
+    doubt = False
+    for n in range(len(position)):
+        seen[n] = gain[n] > LEAST_GAIN and gain[n] < MOST_GAIN and r_squared[n] > LEAST_R_SQUARED
+        doubt = doubt or (seen_before[n] and not seen[n])
+    for e in range(len(edges)):
+        one, other = edges[e, 0], edges[e, 1]
+        x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
+        y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
+        strain[e] = np.sqrt(x * x + y * y) / length[e]
+        doubt = doubt or (strain[e] > STEEP_STRAIN and seen[one] and seen[other])
+    return doubt
