@@ -128,7 +128,8 @@ def assert_law(pipeline: str, frames: Frames) -> list[Result]:
 def test_a_result_differs_from_a_fresh_one_by_no_more_than_its_tolerance(
     trouble: str, tmp_path: Path
 ) -> None:
-    assert_law("default", TROUBLES[trouble](scene("press"), tmp_path))
+    results = assert_law("default", TROUBLES[trouble](scene("press"), tmp_path))
+    assert sum("at_rest" in result.skipped.values() for result in results[1:10]) >= 5
 
 
 @pytest.mark.parametrize(
