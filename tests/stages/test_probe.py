@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tactflow.engine.frame import Frame
 from tactflow.stages.probe import Probe
@@ -45,3 +46,12 @@ def test_a_reset_starts_anew() -> None:
     assert not suspects(probe, 20)[-1]
     probe.reset()
     assert suspects(probe, 1, skip=1) == [True]
+
+
+@pytest.mark.parametrize(("repeatability", "suspect"), [(0.025, False), (0.005, True)])
+def test_it_is_as_sensitive_as_the_contact_test_is_set_to_be(repeatability: float, suspect: bool) -> None:
+    probe = Probe(Probe.Params(repeatability=repeatability, tint=0.005))
+    assert not suspects(probe, 20)[-1]
+    brighter = np.full((60, 80, 3), 100, np.uint8)
+    brighter[20:40, 30:50] += 5
+    assert probe.process(Frame("s", 20, 0.4, brighter)).suspect is suspect
