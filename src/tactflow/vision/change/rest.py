@@ -25,8 +25,8 @@ from tactflow.vision.contact.components import WIDE_DEVIATION
 from tactflow.vision.contact.illumination import IlluminationModel, positions
 
 TILES: Final = 24
-"""Tiles along the longer side of a frame: a contact of 4 % of its width fills one. A
-smaller spot that has no colour may pass unseen."""
+"""Tiles along the longer side of a frame: a contact of 4 % of its width fills one. A smaller
+spot that has no colour may pass unseen."""
 READ: Final = 250_000
 """Bytes of a frame that are read: all of a small one, a sixth of 800 x 600 px. More cost time."""
 LINES: Final = 6
