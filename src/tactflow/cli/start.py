@@ -22,8 +22,8 @@ from tactflow.sources.cameras import list_cameras
 from tactflow.system.files import completed
 from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
-from tactflow.tune.propose import FEWEST_FOUND, Attempt, Kept, Seen, distinct_pipelines, divide, propose
-from tactflow.tune.recording import CHANGE
+from tactflow.tune.propose import FEWEST_FOUND, Attempt, Seen, distinct_pipelines, divide, propose
+from tactflow.tune.recording import CHANGE, Kept
 from tactflow.tune.report import changed_pipeline
 from tactflow.view.questions import Questions
 

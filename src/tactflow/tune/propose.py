@@ -7,7 +7,6 @@ rest, where every contact is false, and while the gel is pressed, where every fr
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ from tactflow.doctor.checks import STEADY
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
 from tactflow.streaming import stream
-from tactflow.tune.recording import CHANGE, MAX_USED, change_between
+from tactflow.tune.recording import CHANGE, change_between
 from tactflow.tune.space import DOWNSAMPLE, MIN_PITCH, MIN_SIDE
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.change import Settling
@@ -36,10 +35,6 @@ LARGE: Final = 500
 PRESSED: Final = 0.5
 """Change of light, relative to the largest, from which a frame counts as pressed. Those between are left out,
 because whether they show a contact is a matter of definition."""
-FIRST: Final = 48
-"""Number of first frames that are kept: a second or two."""
-MEMORY: Final = 256_000_000
-"""Bytes of the frames that are kept around the strongest press, at most `MAX_USED` of them."""
 FEWEST_FOUND: Final = 0.5
 """Share of presses below which a pipeline does not find the contacts of a gel: no better than a coin."""
 GEOMETRY: Final = frozenset({"capture", "preprocess", "visualize"})
@@ -104,43 +99,6 @@ class Attempt:
         )
         dots = f"{self.dots} dots, steady to {self.steady:.2f} px" if self.dots else "no dots"
         return f"{self.pipeline}: {found}, {100 * self.false:.0f} % false contacts at rest, {dots}"
-
-
-class Kept:
-    """The first frames of a sensor, and those around the strongest press.
-
-    They are consecutive, because pipelines also judge by what changes from frame to frame: of every eighth
-    pair of frames with presses, `markerless` finds a contact in a tenth.
-    """
-
-    def __init__(self) -> None:
-        self._first: list[ColorImage] = []
-        self._window: deque[tuple[float, ColorImage]] = deque()
-
-    def __len__(self) -> int:
-        return len(self._first) + len(self._window)
-
-    @property
-    def frames(self) -> list[ColorImage]:
-        """(H, W, 3) uint8 each, in order."""
-        return [*self._first, *(image for _, image in self._window)]
-
-    def add(self, image: ColorImage, *, at_rest: bool = False) -> None:
-        """Keep a frame, or let it go. at_rest : only as one of the first."""
-        if len(self._first) < FIRST:
-            self._first.append(image.copy())
-            return
-        if at_rest:
-            return
-        room = int(np.clip(MEMORY // image.nbytes, FIRST, MAX_USED))
-        changes = [change for change, _ in self._window]
-        change = change_between(self._first[0], image)
-        if len(changes) == room:
-            # The strongest press comes to lie in the middle, and stays there.
-            if change <= max(changes) and int(np.argmax(changes)) <= room // 2:
-                return
-            self._window.popleft()
-        self._window.append((change, image.copy()))
 
 
 def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Seen:

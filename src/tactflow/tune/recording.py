@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections import deque
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,24 +15,63 @@ import numpy as np
 
 from tactflow.bench.lockstep import with_params
 from tactflow.doctor.measures import DIM, Pair
-from tactflow.doctor.observation import KEPT, Observation
+from tactflow.doctor.observation import Observation, watch
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
-from tactflow.sources import open_source
+from tactflow.sources import Arrival, open_source
 from tactflow.vision.arrays import ColorImage
 
 MAX_READ: Final = 1800
 """Maximum number of frames searched for a contact: 30 s at 60 frames/s."""
 MAX_USED: Final = 160
-"""Maximum number of frames extracted: 230 MB at 800 x 600 in a temporary file."""
+"""Maximum number of frames that are kept around the strongest press."""
 MIN_FRAMES: Final = 20
 """Minimum length of a recording, frames. Chosen by hand."""
-HEAD: Final = 8
-"""First frames, always extracted because references are taken from them."""
+FIRST: Final = 48
+"""Number of first frames that are kept: a second or two."""
+MEMORY: Final = 256_000_000
+"""Bytes of the frames that are kept around the strongest press, at most `MAX_USED` of them."""
 CHANGE: Final = 0.04
 """Threshold for a contact: maximum relative change of light in the small picture. Chosen by hand, 1.6 times
 the repeatability of the gel that `difference` assumes."""
+
+
+class Kept:
+    """The first frames of a sensor, and those around the strongest press.
+
+    They are consecutive, because pipelines also judge by what changes from frame to frame: of every eighth
+    pair of frames with presses, `markerless` finds a contact in a tenth.
+    """
+
+    def __init__(self) -> None:
+        self._first: list[ColorImage] = []
+        self._window: deque[tuple[float, ColorImage]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._first) + len(self._window)
+
+    @property
+    def frames(self) -> list[ColorImage]:
+        """(H, W, 3) uint8 each, in order."""
+        return [*self._first, *(image for _, image in self._window)]
+
+    def add(self, image: ColorImage, *, at_rest: bool = False) -> None:
+        """Keep a frame, or let it go. at_rest : only as one of the first."""
+        if len(self._first) < FIRST:
+            self._first.append(image.copy())
+            return
+        if at_rest:
+            return
+        room = int(np.clip(MEMORY // image.nbytes, FIRST, MAX_USED))
+        changes = [change for change, _ in self._window]
+        change = change_between(self._first[0], image)
+        if len(changes) == room:
+            # The strongest press comes to lie in the middle, and stays there.
+            if change <= max(changes) and int(np.argmax(changes)) <= room // 2:
+                return
+            self._window.popleft()
+        self._window.append((change, image.copy()))
 
 
 @dataclass
@@ -38,8 +79,9 @@ class Recording:
     """The extracted part of a recording.
 
     source : as given by the user. path : `.npy` file of the frames. frames : number of frames. size : (width,
-    height), px, before downsampling. observation : some of the frames, for the doctor's measures. changes :
-    maximum relative change of light of each frame from the first.
+    height), px, before downsampling. observation : some of the frames, for the doctor's measures. pressed :
+    (H, W, 3), the frame that differs most from the first, after the pipeline's geometry. change : its maximum
+    relative change of light.
     """
 
     source: str
@@ -47,7 +89,8 @@ class Recording:
     frames: int
     size: tuple[int, int]
     observation: Observation
-    changes: list[float]
+    pressed: ColorImage
+    change: float
 
 
 def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
@@ -61,42 +104,39 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
     SourceError
         The source cannot be read, is live or too short, or shows no contact.
     """
-    frames = _frames(source, MAX_READ)
-    first = next(frames, None)
-    changes = [] if first is None else [0.0, *(change_between(first, image) for image in frames)]
-    if len(changes) < MIN_FRAMES:
-        raise SourceError(
-            f"{source}: {len(changes)} frames are too few to tune on; required {MIN_FRAMES} or more"
-        )
-    touched = int(np.argmax(changes))
-    if changes[touched] < CHANGE:
-        raise SourceError(
-            f"{source}: no contact in the first {len(changes)} frames (the light changes by at most "
-            f"{100 * changes[touched]:.1f} %); record some presses, with the gel untouched at first"
-        )
-    start = max(HEAD, min(touched - MAX_USED // 2, len(changes) - MAX_USED + HEAD))
-    indices = [*range(HEAD), *range(start, min(len(changes), start + MAX_USED - HEAD))]
-    path, transform = folder / "recording.npy", _geometry(pipeline)
-    used = [image for index, image in enumerate(_frames(source, indices[-1] + 1)) if index in indices]
-    np.save(path, used)
-    pairs = [
-        Pair(n, transform(used[n]), transform(used[n + 1]))
-        for n in range(0, len(used) - 1, max(1, len(used) // KEPT))
-    ]
-    observation = Observation(source, source, False, frames=len(used), pairs=pairs)
-    height, width = pairs[0].image.shape[:2]
-    return Recording(source, path, len(used), (width, height), observation, [changes[i] for i in indices])
+    kept, observation = Kept(), Observation(source, source, live=False)
 
+    def keep(arrival: Arrival) -> bool:
+        kept.add(arrival.image)
+        return observation.frames < MAX_READ
 
-def _frames(source: str, count: int) -> Iterator[ColorImage]:
-    """The first frames of a recording."""
     with closing(open_source(source)) as reader:
         if reader.live:
             raise SourceError(f"{source}: tune needs a recording; make one: tactflow record --out FILE.mcap")
-        for _ in range(count):
-            if (frame := reader.read()) is None:
-                return
-            yield frame[0].copy()
+        watch(reader, math.inf, observation, keep)
+    if observation.stopped:
+        raise SourceError(observation.stopped)
+    if observation.frames < MIN_FRAMES:
+        raise SourceError(
+            f"{source}: {observation.frames} frames are too few to tune on; required {MIN_FRAMES} or more"
+        )
+    frames = kept.frames
+    changes = [change_between(frames[0], image) for image in frames]
+    strongest = int(np.argmax(changes))
+    if changes[strongest] < CHANGE:
+        raise SourceError(
+            f"{source}: no contact in the first {observation.frames} frames (the light changes by at most "
+            f"{100 * changes[strongest]:.1f} %); record some presses, with the gel untouched at first"
+        )
+    path, transform = folder / "recording.npy", _geometry(pipeline)
+    np.save(path, frames)
+    observation.pairs[:] = [
+        Pair(number, transform(image), None if after is None else transform(after))
+        for number, image, after in observation.pairs
+    ]
+    pressed = transform(frames[strongest])
+    height, width = pressed.shape[:2]
+    return Recording(source, path, len(frames), (width, height), observation, pressed, changes[strongest])
 
 
 def change_between(first: ColorImage, now: ColorImage) -> float:

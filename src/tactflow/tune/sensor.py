@@ -126,8 +126,7 @@ def _contrast_ratio(observation: Observation, simulated: ColorImage, levels: tup
 
 def _light_of(recording: Recording) -> str:
     """The simulator's light that responds to contacts like the recording."""
-    pairs = recording.observation.pairs
-    pictures = pairs[0].image, max(pairs, key=lambda pair: recording.changes[pair.number]).image
+    pictures = recording.observation.pairs[0].image, recording.pressed
     side = max(8, min(pictures[0].shape[:2]) // 60)
     untouched, touched = (cv2.blur(picture, (side, side))[::4, ::4].astype(float) for picture in pictures)
     ratio = (touched / np.maximum(untouched, 25.0)).reshape(-1, 3)
@@ -147,7 +146,7 @@ def _depth(recording: Recording, plain: Look, untouched: ColorImage) -> float:
 
     untouched : simulated frame of the untouched gel.
     """
-    target = max(recording.changes)
+    target = recording.change
     changes = {}
     for depth in DEPTHS:
         scene = open_scene(f"press?{plain.query}&frames=60&noise=0&depth={depth}")
