@@ -9,16 +9,18 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.ports import ContactMask, MarkerMask, Touching, Unmarked, Valid
+from tactflow.ports import ContactMask, Deviations, MarkerMask, Touching, Unmarked, Valid
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.reference import ReferenceCheck
 
 
 class ContactPorts(NamedTuple):
-    """contact_mask : 255 in contact. touching : whether anything is."""
+    """contact_mask : 255 in contact. touching : whether anything is. deviations : what the mask comes from;
+    None where nothing touches, and for `colour`."""
 
     contact_mask: ContactMask
     touching: Touching
+    deviations: Deviations | None = None
 
 
 class Difference(Stage):
@@ -111,7 +113,7 @@ class Difference(Stage):
         result = self._detector.detect(unmarked, marker_mask)
         if not result.touching or self._check is None or not self._check.was_touched(unmarked, result.mask):
             self._doubted = 0
-            return ContactPorts(result.mask, result.touching)
+            return ContactPorts(result.mask, result.touching, result.deviations)
         self._doubted += 1
         if self._doubted == self.params.patience > 0:
             self.wants_reference = "reference_touched"

@@ -9,7 +9,8 @@ from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
-from tactflow.ports import ContactMask
+from tactflow.ports import ContactMask, Deviations
+from tactflow.vision.contact.certainty import with_probability
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.types import Contact, Evidence
 
@@ -57,6 +58,7 @@ class Hull(Stage):
         self,
         contact_mask: ContactMask,
         evidence: Evidence | None = None,
+        deviations: Deviations | None = None,
     ) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
         params = self.params
@@ -69,6 +71,8 @@ class Hull(Stage):
         )
         if not parts:
             return Absent("no_contact")
+        if deviations is not None:
+            parts = with_probability(parts, contact_mask, deviations)
         contact = parts[0]
         if len(parts) == 1:
             return contact
@@ -77,4 +81,5 @@ class Hull(Stage):
                 contact_mask, min_area=params.min_area, min_confidence=params.min_confidence
             )
             contact = whole or contact
-        return replace(contact, evidence=parts[0].evidence, separate=tuple(parts))
+        first = parts[0]
+        return replace(contact, evidence=first.evidence, probability=first.probability, separate=tuple(parts))

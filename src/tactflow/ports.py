@@ -31,6 +31,9 @@ Untouched = Annotated[NDArray[np.uint8], ArrayPort("untouched", ("H", "W", 3), "
 ContactMask = Annotated[NDArray[np.uint8], ArrayPort("contact_mask", ("H", "W"), "uint8", "0 or 255")]
 """255 where something touches the gel."""
 
+Deviations = Annotated[NDArray[np.float32], ArrayPort("deviations", (2, "h", "w"), "float32", "variances")]
+"""Squared change of each cell of 4 x 4 px, of its light and of its colour alone, in variances of noise."""
+
 Picture = Annotated[NDArray[np.uint8], ArrayPort("annotated", ("H", "W", 3), "uint8", "grey levels, BGR")]
 """The processed frame with the results drawn on it."""
 

@@ -11,13 +11,13 @@ from tactflow.bench.judge_dots import (
     DOTS,
     compare,
     find,
-    fit_probability,
     judge,
     main,
     spread_at_rest,
     without_dots,
 )
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
+from tactflow.bench.probability import fit_probability
 from tests.vision.dots import grid, render
 
 TRUTH = grid(5, 7, 30.0, corner=(40.0, 35.0))

@@ -33,10 +33,10 @@ def _touched() -> tuple[Image, Image]:
 def test_a_touched_gel_is_told_from_the_reference(method: str) -> None:
     untouched, touched = _touched()
     stage = _stage(method=method)
-    mask, touching = stage.process(untouched, _frame(untouched, 0, reference=True))
+    mask, touching, _ = stage.process(untouched, _frame(untouched, 0, reference=True))
     assert not touching
     assert not mask.any()
-    mask, touching = stage.process(touched, _frame(touched, 1))
+    mask, touching, _ = stage.process(touched, _frame(touched, 1))
     assert touching
     assert mask.shape == touched.shape[:2]
     assert set(np.unique(mask)) == {0, 255}

@@ -23,11 +23,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.label_file import FrameLabel, load_labels
+from tactflow.bench.probability import fitted
 from tactflow.bench.score import DIRECTED
 from tactflow.cli.terminal import say, table
 from tactflow.engine.errors import ConfigError, TactflowError
@@ -35,6 +37,7 @@ from tactflow.message.result import Result
 from tactflow.sources import open_source
 from tactflow.sources.files import load_image
 from tactflow.streaming import stream
+from tactflow.vision.contact.certainty import contact_evidence
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 
@@ -52,6 +55,8 @@ PLAIN: Final = (
     "wedge_grip",
 )
 """Recordings of gels without dots among those of `OUTLINES`: `default` gives way to `markerless` there."""
+WITHIN: Final = 0.2
+"""Part of a region that an outline covers, from which on the region is of that contact. Chosen by hand."""
 LARGE: Final = 500
 """px: pictures with a longer side are halved, as the documentation advises."""
 Pictures = list[NDArray[np.uint8]]
@@ -112,13 +117,27 @@ def compare(label: FrameLabel, result: Result) -> Judged:
 def judge(
     pipeline: str, labels: Iterable[FrameLabel], data: Path, report: Callable[[str], None] = say
 ) -> Iterator[Judged]:
-    """Run every recording that is there, and compare its labelled frames.
+    """Run every recording that is there, and compare its labelled frames; as for `labelled`.
+
+    Frames that a failing pipeline did not reach count as missed contacts.
+    """
+    for label, result in labelled(pipeline, labels, data, report):
+        if result is None:
+            yield Judged(label.lab, label.recording, bool(label.contact), False, hull=0.0, region=0.0)
+        else:
+            yield compare(label, result)
+
+
+def labelled(
+    pipeline: str, labels: Iterable[FrameLabel], data: Path, report: Callable[[str], None] = say
+) -> Iterator[tuple[FrameLabel, Result | None]]:
+    """Run every recording that is there: its labels, and results of these frames.
 
     pipeline : a file or the name of a shipped pipeline. "default" is replaced by "markerless" for the
         recordings in `PLAIN`.
     labels : those with `contact` None are left out. data : folder that holds the recordings.
-    report : called with what could not be judged, and why. Frames that a failing pipeline did not reach count
-        as missed contacts.
+    report : called with what could not be judged, and why. Frames that a failing pipeline did not reach have
+        no result.
 
     Raises
     ------
@@ -141,13 +160,36 @@ def judge(
         try:
             for result in _results(chosen, source, last=max(missing)):
                 if result.seq in missing and not result.frame.reference:
-                    yield compare(missing.pop(result.seq), result)
+                    yield missing.pop(result.seq), result
         except ConfigError:
             raise
         except TactflowError as error:
             report(f"{recording}: {str(error).splitlines()[0]}")
         for label in missing.values():
-            yield Judged(label.lab, label.recording, bool(label.contact), False, hull=0.0, region=0.0)
+            yield label, None
+
+
+def fit(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
+    """The weights of a contact's probability, and how true it is."""
+    labs, evidence, is_contact = [], [], []
+    for label, result in labelled("default", labels, data):
+        deviations = None if result is None else result.get("deviations")
+        if result is None or result.contact_mask is None or not isinstance(deviations, np.ndarray):
+            continue
+        mask, truth = result.contact_mask, _truth(label, result["mapping"])
+        _, regions = cv2.connectedComponents(mask)
+        for part in result.contacts:
+            x, y = part.hull[0].astype(int)
+            labs.append(label.lab)
+            is_contact.append(truth[regions == regions[y, x]].mean() > WITHIN)
+        evidence.append(contact_evidence(result.contacts, mask, deviations))
+    yield from fitted(np.array(labs), np.concatenate(evidence), np.array(is_contact))
+
+
+def _truth(label: FrameLabel, mapping: PixelMapping) -> NDArray[np.bool_]:
+    """(H, W): the outlined region, in processed pixels."""
+    outlines = [mapping.to_processed(outline) for outline in label.outlines or ()]
+    return np.asarray(metrics.filled_polygons(outlines, mapping.size[::-1]) > 0, np.bool_)
 
 
 def _run(label: FrameLabel) -> tuple[str, str]:
@@ -316,6 +358,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--labels", type=Path, default=OUTLINES, metavar="FILE", help="default: those of the package"
     )
+    parser.add_argument(
+        "--fit", action="store_true", help="fit the probability of a contact, and tell how true it is"
+    )
     parser.add_argument("--recording", metavar="START", default="", help="only those whose name starts so")
     options = parser.parse_args(arguments)
     try:
@@ -323,6 +368,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             label for label in load_labels(options.labels) if label.recording.startswith(options.recording)
         ]
         first = [label for label in labels if label.round == 1]
+        if options.fit:
+            print(*fit(first, options.data), sep="\n")
+            return 0
         results = {name: list(judge(name, first, options.data)) for name in options.pipelines}
         if not any(results.values()):
             raise ConfigError(f"--data {options.data}: has none of the recordings of {options.labels}")

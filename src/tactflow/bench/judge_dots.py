@@ -15,17 +15,17 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment, minimize
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from tactflow.bench.label_file import FrameLabel, load_labels
+from tactflow.bench.probability import fitted
 from tactflow.cli.terminal import say, table
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.sources import open_source
@@ -163,21 +163,8 @@ def labelled(
             yield label.lab, kind, changed, required, possible
 
 
-def fit_probability(evidence: Floats, is_dot: Flags) -> Floats:
-    """Constant and weights, (4,), of the log odds of being a dot, of evidence (N, 3): logistic
-    regression with a ridge."""
-    design = np.column_stack([np.ones(len(is_dot)), evidence])
-    sign = np.where(is_dot, -1.0, 1.0)
-
-    def loss(weights: Floats) -> float:
-        return float(np.logaddexp(0, sign * (design @ weights)).sum() + (weights[1:] ** 2).sum() / 2)
-
-    return np.asarray(minimize(loss, np.zeros(design.shape[1])).x, np.float64)
-
-
-def fitted(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
-    """The weights of a dot's probability, fitted to all labs; and how many of those that are called so
-    probable by a fit to the other labs are dots."""
+def fit(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
+    """The weights of a dot's probability, and how true it is."""
     labs, evidences, are_dots = [], [], []
     for name, _, picture, dots, uncertain in labelled(labels, data, kinds=("", "half size", "JPEG 30")):
         try:
@@ -190,20 +177,7 @@ def fitted(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
             evidences.append(found.evidence[judged])
             are_dots.append(which[judged] >= 0)
             labs.append(np.full(judged.sum(), name))
-    lab, evidence, is_dot = map(np.concatenate, (labs, evidences, are_dots))
-    yield f"constant and weights: {fit_probability(evidence, is_dot).round(2).tolist()}"
-    odds = np.zeros(len(lab))
-    for left_out in np.unique(lab):
-        others = lab != left_out
-        weights = fit_probability(evidence[others], is_dot[others])
-        odds[~others] = weights[0] + evidence[~others] @ weights[1:]
-    probability = 1 / (1 + np.exp(-odds))
-    rows = [("called", "places", "are dots")]
-    for low, high in pairwise((0, 0.5, 0.8, 0.9, 0.95, 0.99, 1)):
-        those = (probability > low) & (probability <= high)
-        share = f"{100 * is_dot[those].mean():.1f} %" if those.any() else "-"
-        rows.append((f"{100 * low:.0f} to {100 * high:.0f} %", str(those.sum()), share))
-    yield from table(rows)
+    yield from fitted(*map(np.concatenate, (labs, evidences, are_dots)))
 
 
 def _index(label: FrameLabel) -> int:
@@ -401,7 +375,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         if options.fit:
-            print(*fitted(load_labels(options.labels), options.data), sep="\n")
+            print(*fit(load_labels(options.labels), options.data), sep="\n")
             return 0
         judged = list(judge(load_labels(options.labels), options.data))
         if not judged:

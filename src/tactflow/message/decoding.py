@@ -70,6 +70,7 @@ def _contact(contact: Any) -> Contact:
         ellipse=_optional(_ellipse, contact["ellipse"]),
         confidence=float(contact.get("confidence", 0.0)),
         evidence=contact.get("evidence", "light"),
+        probability=contact.get("probability"),
     )
 
 

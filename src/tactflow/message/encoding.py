@@ -67,6 +67,8 @@ def _attributes(part: object, *names: str) -> dict[str, Any]:
 
 def _contact(contact: Contact, scale: Scale | None, depth: Depth | None, detail: bool) -> dict[str, Any]:
     message = _attributes(contact, "area", "center", "angle", "slope", "hull", "ellipse", "evidence")
+    if contact.probability is not None:
+        message["probability"] = contact.probability
     if contact.ellipse is not None:
         message["ellipse"] = _attributes(contact.ellipse, "center", "axes", "angle")
     if scale is not None:

@@ -49,6 +49,9 @@ class _ContactModel(_Strict):
     evidence: Evidence = Field(
         description="what shows it: a change of the light, motion of the markers (dots), or both"
     )
+    probability: float | None = Field(
+        None, ge=0, le=1, description="of being a contact; below 0.5 it is unsure (absent if not known)"
+    )
     confidence: float = Field(
         0.0, ge=0, le=1, description="of the direction: 0 a disc, towards 1 a line (detail)"
     )

@@ -60,7 +60,7 @@ class Contact:
     ellipse : fitted ellipse, or None where none can be fitted.
     confidence : of the direction, in [0, 1]: 0 for a disc, towards 1 for a line.
     region_area : number of pixels of the region, px^2.
-    evidence : what shows it.
+    evidence : what shows it. probability : of being a contact, 0 to 1; None where that is not known.
     separate : every separate contact of the frame, that with the most pixels first; empty where there is only
         this one.
 
@@ -78,6 +78,7 @@ class Contact:
     confidence: float = 0.0
     region_area: float = 0.0
     evidence: Evidence = "light"
+    probability: float | None = None
     separate: tuple[Contact, ...] = ()
 
 

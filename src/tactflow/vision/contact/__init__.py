@@ -12,7 +12,7 @@
 
 `fusion` joins that mask with what the markers show.
 
-`reference` tells whether the reference was touched.
+`reference` tells whether the reference was touched, `certainty` how probable a contact is.
 """
 
 from tactflow.vision.contact.detector import ContactDetector, ContactResult, chi_square_threshold

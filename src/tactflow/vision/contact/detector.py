@@ -83,11 +83,14 @@ class ContactResult:
 
     mask : (H, W) uint8, 255 in contact, else 0. touching : whether any pixel is in contact.
     strength : largest change anywhere, in standard deviations of the untouched gel (`noise` only; else 0).
+    deviations : (2, h, w) float32, squared changes of each cell, of its light and of its colour alone, in
+        variances of the untouched gel (`noise` only; else None).
     """
 
     mask: NDArray[np.uint8]
     touching: bool
     strength: float = 0.0
+    deviations: Floats32 | None = None
 
 
 @lru_cache(maxsize=16)
@@ -263,14 +266,15 @@ class ContactDetector:
             self._mask = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
         self._before = union(found, change.squared.shape)
+        deviations = np.stack([change.squared, change.colour])
         if faint and change.remaining < 1 - self._creep and self._mask is not None:
-            return ContactResult(self._mask.copy(), True, strength)
+            return ContactResult(self._mask.copy(), True, strength, deviations)
         mask = np.zeros(image.shape[:2], np.uint8)
         touching = False
         for component in found:
             touching |= self._draw(change, component, hidden, mask)
         self._mask = mask if touching else None
-        return ContactResult(mask, touching, strength)
+        return ContactResult(mask, touching, strength, deviations)
 
     def _draw(
         self, change: Change, component: Component, hidden: NDArray[np.uint8] | None, mask: NDArray[np.uint8]

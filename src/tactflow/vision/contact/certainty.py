@@ -1,0 +1,65 @@
+"""How probable it is that a region that has changed is a contact.
+
+Three things tell: an object that presses changes the slopes of the gel, and with it the colour of its light,
+while shadows and lamps change its brightness; what is small beside another change is more often a reflection
+or a wrinkle; and around a contact the markers move.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numpy as np
+
+from tactflow.vision.arrays import Floats, Floats32, Mask
+from tactflow.vision.contact.background import CELL
+from tactflow.vision.types import Contact
+
+WEIGHTS: Final = (0.2, 1.49, 1.2, 1.67)
+"""Constant and weights of `contact_evidence` in the log odds: `python -m tactflow.bench.judge --fit`."""
+LEAST_SHARE: Final = 1e-3
+"""Of the change of colour in all of a change, at least: its logarithm has to be finite."""
+
+
+def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32) -> Floats:
+    """What tells of each of several regions whether it is a contact.
+
+    Parameters
+    ----------
+    parts : the separate regions. mask : (H, W) uint8, not 0 inside them.
+    deviations : (2, h, w) float32, squared deviations of each cell, of its light and of its colour alone.
+
+    Returns
+    -------
+    (n, 3) : logarithm of the part that colour has in its largest change; logarithm of its pixels over those
+    of the largest region; 1 where markers moved as well, else 0.
+    """
+    (high, wide), largest = deviations.shape[1:], max(part.region_area for part in parts)
+    inside = np.asarray(cv2.resize(mask, (wide, high), interpolation=cv2.INTER_NEAREST), np.uint8)
+    evidence = np.empty((len(parts), 3))
+    for row, part in zip(evidence, parts, strict=True):
+        cells = np.zeros((high, wide), np.uint8)
+        cv2.fillConvexPoly(cells, (part.hull / CELL).astype(np.int32), (1.0,))
+        light, colour = (cv2.minMaxLoc(values, cells & inside)[1] for values in deviations)
+        row[:] = (
+            math.log(max(colour / max(light, 1e-9), LEAST_SHARE)),
+            math.log(part.region_area / largest),
+            part.evidence == "both",
+        )
+    return evidence
+
+
+def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32) -> list[Contact]:
+    """The regions with the probability that each is a contact. As for `contact_evidence`.
+
+    What only the markers show has no probability: there the light tells nothing.
+    """
+    odds = WEIGHTS[0] + contact_evidence(parts, mask, deviations) @ WEIGHTS[1:]
+    return [
+        part if part.evidence == "dots" else replace(part, probability=1 / (1 + math.exp(-value)))
+        for part, value in zip(parts, odds.tolist(), strict=True)
+    ]

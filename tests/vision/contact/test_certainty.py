@@ -1,0 +1,55 @@
+"""How probable it is that a region is a contact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import tactflow
+from tactflow.vision.contact.certainty import contact_evidence, with_probability
+from tactflow.vision.geometry.hull import contact_parts
+
+MASK = np.zeros((80, 120), np.uint8)
+MASK[8:40, 8:48] = MASK[48:64, 80:96] = 255
+PARTS = contact_parts(MASK)
+
+
+def changed(light: float, colour: float) -> np.ndarray:
+    """Squared deviations: of the first region as given, of the second one 100 and 100."""
+    deviations = np.zeros((2, 20, 30), np.float32)
+    deviations[:, 2:10, 2:12] = np.array([light, colour])[:, None, None]
+    deviations[:, 12:16, 20:24] = 100
+    return deviations
+
+
+def test_evidence_is_of_the_regions_own_cells() -> None:
+    evidence = contact_evidence(PARTS, MASK, changed(50.0, 25.0))
+    assert evidence == pytest.approx(np.array([[np.log(0.5), 0, 0], [0, np.log(256 / 1280), 0]]))
+    # Nothing is known of its colour: a finite number all the same.
+    assert np.isfinite(contact_evidence(PARTS, MASK, changed(50.0, 0.0))).all()
+
+
+def test_what_changes_colour_and_is_large_and_moves_markers_is_more_probable() -> None:
+    plain = with_probability(PARTS, MASK, changed(50.0, 50.0))
+    grey = with_probability(PARTS, MASK, changed(50.0, 1.0))
+    both = with_probability(contact_parts(MASK, evidence="both"), MASK, changed(50.0, 50.0))
+    probabilities = [[part.probability or 0.0 for part in parts] for parts in (grey, plain, both)]
+    assert probabilities[0][0] < 0.1 < 0.5 < probabilities[1][0] < probabilities[2][0] < 1
+    assert probabilities[1][1] < probabilities[1][0]
+    dots = with_probability(contact_parts(MASK, evidence="dots"), MASK, changed(50.0, 50.0))
+    assert {part.probability for part in dots} == {None}
+
+
+def test_a_simulated_contact_says_how_probable_it_is_and_so_does_its_message() -> None:
+    settings = {"sinks.zmq": None, "sinks.view": None}
+    results = list(tactflow.stream("default", source="sim:two?frames=50", settings=settings))
+    touched = [result for result in results if len(result.contacts) == 2]
+    assert touched
+    for result in touched:
+        assert result.contact is not None
+        assert result.contact.probability == result.contacts[0].probability
+        assert all(part.probability is not None and part.probability > 0.5 for part in result.contacts)
+        message = result.to_dict()
+        assert [part["probability"] for part in message["contacts"]] == [
+            part.probability for part in result.contacts
+        ]
