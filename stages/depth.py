@@ -8,13 +8,14 @@ from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask, Gradients, Unmarked, Untouched
+from tactflow.vision.depth.darkness import DarkSurface
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Depth as HeightMap
 from tactflow.vision.types import Scale
 
 
 class Depth(Stage):
-    """Heights from the colour of the gel, by the photometric part of the sensor's calibration, or from the
+    """Heights from the colour of the gel, or from its darkening, by the sensor's calibration, or from the
     gradients of a network.
 
     Nothing without a calibration, or with one that knows the scale alone and no network.
@@ -26,7 +27,7 @@ class Depth(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         self._known = None if calibration is None else Calibration.load(calibration)
-        self._surface: tuple[Scale, Surface] | None = None
+        self._surface: tuple[Scale, Surface | DarkSurface] | None = None
         self._rest: tuple[Untouched, Rest] | None = None
 
     def process(
@@ -39,16 +40,23 @@ class Depth(Stage):
     ) -> HeightMap | Absent:
         """The height map of the contact."""
         known = self._known
-        photometric = None if known is None else known.photometric
-        if known is None or (gradients is None and (known.slopes is None or photometric is None)):
+        if known is None or (gradients is None and known.slopes is None and known.darkness is None):
             return Absent("no_calibration")
         if not contact_mask.any():
             return Absent("no_contact")
-        if self._surface is None or self._surface[0] is not scale:
-            self._surface = (
-                scale,
-                Surface(known.slopes, scale, None if photometric is None else photometric.errors()),
-            )
         if self._rest is None or self._rest[0] is not untouched:
             self._rest = untouched, Rest(untouched)
-        return self._surface[1].depth(unmarked, self._rest[1], contact_mask, gradients)
+        if self._surface is None or self._surface[0] is not scale:
+            self._surface = scale, _surface_of(known, scale, gradients is not None)
+        surface = self._surface[1]
+        if isinstance(surface, Surface):
+            return surface.depth(unmarked, self._rest[1], contact_mask, gradients)
+        return surface.depth(unmarked, self._rest[1], contact_mask)
+
+
+def _surface_of(known: Calibration, scale: Scale, by_network: bool) -> Surface | DarkSurface:
+    """What makes the height maps of a calibration. by_network : whether slopes are given."""
+    if known.darkness is not None and not by_network:
+        return DarkSurface(known.darkness.model(), scale, known.darkness.stderr)
+    photometric = known.photometric
+    return Surface(known.slopes, scale, None if photometric is None else photometric.errors())

@@ -26,6 +26,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import ending_held_back
+from tactflow.vision.depth.darkness import DarknessModel
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
 from tactflow.vision.force import ForceModel, LinearForce
@@ -110,6 +111,23 @@ class PhotometricEntry(_Entry):
         return SurfaceErrors(own, self.volume_stderr, self.steepest, self.between)
 
 
+class DarknessEntry(_Entry):
+    """`darkness` of the file: depth of a gel that is darker the deeper it is pressed, see `DarknessModel`.
+
+    ball_radius : mm. presses : how many. darkening : relative. depth : mm, of each. stderr : of it, mm.
+    """
+
+    ball_radius: float = Field(gt=0)
+    presses: int
+    darkening: list[float]
+    depth: list[float]
+    stderr: float
+
+    def model(self) -> DarknessModel:
+        """The curve. Raises ValueError where its points are not increasing."""
+        return DarknessModel(self.darkening, self.depth)
+
+
 class LinearForceEntry(_Entry):
     """A force that is linear in features, and its errors on forces that the fit has not seen.
 
@@ -161,7 +179,8 @@ class Calibration(_Entry):
     raw_size, size : (width, height) of the raw and of the processed frame, px.
     corners : (4, 2), where the corner pixels of the processed frame lie in the raw one, px.
     scale_entry : millimetres per pixel. photometric, slopes : which slope has which colour, and how well;
-    None where that is not known. force : how the force follows from a contact; None where that is not known.
+    None where that is not known. darkness : which darkening is which depth, in place of slopes, for gels in
+    white light. force : how the force follows from a contact; None where that is not known.
     kind : the kind of sensor that it is the default of, for frames of the same shape and any size; None where
     it is of one sensor.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
@@ -182,6 +201,7 @@ class Calibration(_Entry):
     corners: Annotated[list[Pair], Field(min_length=4, max_length=4)]
     scale_entry: ScaleEntry = Field(alias="scale")
     photometric: PhotometricEntry | None = None
+    darkness: DarknessEntry | None = None
     force: ForceEntry | None = None
     look: NDArray[np.float32] = Field(exclude=True, repr=False)
     slopes: SlopeModel | None = Field(None, exclude=True, repr=False)
@@ -261,6 +281,8 @@ class Calibration(_Entry):
             loaded = cls(**document, look=look, slopes=slopes, information=information)
             if (slopes is None) != (loaded.photometric is None):
                 raise ValueError("its .npz is of another file")
+            if loaded.darkness is not None:
+                loaded.darkness.model()
             return loaded
         except OSError as error:
             raise ConfigError(f"calibration {path}: {error.filename}: {error.strerror}") from None

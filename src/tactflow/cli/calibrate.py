@@ -8,16 +8,18 @@ from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import yaml
 
 from tactflow.api import Settings, ended_by_signals, load, make_runner
 from tactflow.calibration import force, presses, target
+from tactflow.calibration.darkness import darkness_error, fit_darkness
 from tactflow.calibration.file import (
     UNLIKE,
     Calibration,
+    DarknessEntry,
     ForceEntry,
     LinearForceEntry,
     PhotometricEntry,
@@ -56,6 +58,8 @@ ENOUGH: Final = 30
 """Presses after which a live session ends by itself."""
 ENOUGH_TO_REFINE: Final = 9
 """The same with --refine: the errors on two Minis are then those of a calibration of their own."""
+ENOUGH_OF_DARKNESS: Final = 1
+"""The same with --darkness: one curve holds all over the gel."""
 # Gels and balls have 1 to 100.
 _millimetres = number(float, 1e-3, 1e4, "millimetres from 0.001 to 10000")
 
@@ -122,6 +126,12 @@ def _add_kind(parser: argparse.ArgumentParser) -> None:
         "is given",
     )
     option(
+        "--darkness",
+        action="store_true",
+        help="learn the depth from how much darker the gel becomes, for sensors in white light such as "
+        "9DTact; one press of the ball is enough",
+    )
+    option(
         "--kind",
         metavar="NAME",
         help="make the default for all sensors of a kind, such as 'GelSight Mini', with the errors that it "
@@ -167,7 +177,8 @@ def run(args: argparse.Namespace) -> int:
     TactflowError
         If options are wrong, or the recording gives no calibration.
     """
-    args.presses = args.presses or (ENOUGH_TO_REFINE if args.refine else ENOUGH)
+    enough = ENOUGH_OF_DARKNESS if args.darkness else ENOUGH_TO_REFINE if args.refine else ENOUGH
+    args.presses = args.presses or enough
     verb, *words = args.what if args.what[:1] in (["check"], ["force"], ["lens"]) else ["make", *args.what]
     with notes():
         if verb == "lens":
@@ -186,6 +197,8 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     ways = [args.pitch, args.area].count(None)
     if ways == 0 or (ways == 2 and not args.refine):
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
+    if args.darkness and (args.refine or args.kind or args.ball_radius is None):
+        raise ConfigError("calibrate --darkness: required --ball-radius MM, and neither --refine nor --kind")
     base = _base(args, pipeline)
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
@@ -262,23 +275,11 @@ def _learned(
             "in none (rings are not, for one), or the picture is stretched. Measure a length instead: --area "
             "WIDTH HEIGHT takes what the whole processed picture shows, --target a printed grid"
         )
-    fitted = None
+    learned: dict[str, Any] = {}
     if args.ball_radius is not None:
         say(f"{len(session.presses)} presses; learning from them ...")
-        apparent = None
-        if base is not None and base.slopes is not None:
-            apparent = apparent_radius(session, scale, args.ball_radius, base)
-        if args.refine:
-            assert base is not None
-            fitted = refine_photometry(session, scale, args.ball_radius, base)
-        else:
-            fitted = fit_photometry(session, scale, args.ball_radius)
-        if (question := doubt(session, scale, args.ball_radius, apparent)) is not None:
-            say(question)
-        for press, kept, misfit in zip(session.presses, fitted.kept, fitted.misfit, strict=True):
-            if not kept:
-                say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
-        say(_photometric_words(fitted.found.model_dump()))
+        learn = _darkness if args.darkness else _slopes
+        learned = learn(args, session, scale, base)
     made = Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
@@ -286,19 +287,56 @@ def _learned(
         size=session.mapping.size,
         corners=raw_corners(session.mapping),
         scale=ScaleEntry.of(scale, found_by),
-        photometric=None if fitted is None else fitted.found,
         look=small_picture(session.untouched),
-        slopes=None if fitted is None else fitted.model,
-        information=None if fitted is None else fitted.information,
+        **learned,
     )
     return made if args.kind is None else made.for_kind(args.kind)
 
 
+def _slopes(
+    args: argparse.Namespace, session: Session, scale: Scale, base: Calibration | None
+) -> dict[str, Any]:
+    """What presses say of slopes, for `Calibration`."""
+    apparent = None
+    if base is not None and base.slopes is not None:
+        apparent = apparent_radius(session, scale, args.ball_radius, base)
+    if args.refine:
+        assert base is not None
+        fitted = refine_photometry(session, scale, args.ball_radius, base)
+    else:
+        fitted = fit_photometry(session, scale, args.ball_radius)
+    if (question := doubt(session, scale, args.ball_radius, apparent)) is not None:
+        say(question)
+    for press, kept, misfit in zip(session.presses, fitted.kept, fitted.misfit, strict=True):
+        if not kept:
+            say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
+    say(_photometric_words(fitted.found.model_dump()))
+    return {"photometric": fitted.found, "slopes": fitted.model, "information": fitted.information}
+
+
+def _darkness(
+    args: argparse.Namespace, session: Session, scale: Scale, _: Calibration | None
+) -> dict[str, Any]:
+    """What presses say of darkening, for `Calibration`."""
+    fitted = fit_darkness(session, scale, args.ball_radius)
+    if (question := doubt(session, scale, args.ball_radius)) is not None:
+        say(question)
+    for press, kept in zip(session.presses, fitted.kept, strict=True):
+        if not kept:
+            say(f"the press of frame {press.seq} is left out: too small, or larger than the ball")
+    found = fitted.found
+    say(
+        f"depth up to {found.depth[-1]:.2f} mm, where the gel is {100 * found.darkening[-1]:.0f} % darker; "
+        f"standard error {found.stderr:.3f} mm"
+    )
+    return {"darkness": found}
+
+
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    then = calibration.photometric
-    _instruct(args, None if then is None else then.ball_radius)
-    guide = None if then is None else Guide(args.presses, say)
+    then, pressed = calibration.photometric, calibration.photometric or calibration.darkness
+    _instruct(args, None if pressed is None else pressed.ball_radius)
+    guide = None if pressed is None else Guide(args.presses, say)
     session = _find_presses(_load(args, pipeline), guide)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
@@ -312,6 +350,8 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
         show(["it also differs with another sensor or light, or where something touches it at the start"])
     if then is not None:
         fits.append(_check_presses(calibration, then, session))
+    elif calibration.darkness is not None:
+        fits.append(_check_darkness(calibration, calibration.darkness, session))
     if args.csv is not None:
         fits.append(_check_force(args, path, calibration.force, pipeline))
     show(["it still fits" if all(fits) else "it does not fit; if none of this explains it, calibrate again"])
@@ -334,6 +374,17 @@ def _check_presses(calibration: Calibration, then: PhotometricEntry, session: Se
         others = f"few presses, a ball whose radius is not {radius}, or no untouched gel at first"
         show([f"normals up to {limit:.1f} degrees off fit; {others} also give larger errors"])
     return now["normal_error"] <= limit
+
+
+def _check_darkness(calibration: Calibration, then: DarknessEntry, session: Session) -> bool:
+    """Print how well the depth by darkening fits the presses of today; True where there are none."""
+    radius = f"{then.ball_radius:g} mm"
+    if not session.presses:
+        show([f"no presses today: to check the depth, press a ball of radius {radius} on the gel"])
+        return True
+    now, limit = darkness_error(session, then, calibration.scale), WORSE * then.stderr
+    show([f"presses today, {len(session.presses)}: depth {now:.3f} mm RMS off; up to {limit:.3f} mm fits"])
+    return now <= limit
 
 
 def _check_force(
@@ -590,9 +641,10 @@ def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = 
     if ball_radius is None:
         say("Leave the gel untouched.")
         return
+    number = "One press" if args.presses == 1 else f"{args.presses} presses"
     say(
         "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, all "
-        f"over the gel and to several depths. {args.presses} presses will do; Ctrl-C ends earlier{ended}."
+        f"over the gel and to several depths. {number} will do; Ctrl-C ends earlier{ended}."
     )
 
 

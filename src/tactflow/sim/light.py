@@ -34,6 +34,7 @@ class Light:
     brightening : change of all channels in a contact of full depth, grey levels.
     onset : depth range of this change beyond the contact's edge, relative to full depth.
     halo : brightening just outside a contact of full depth, grey levels.
+    absorption : of a gel that is darker the deeper it is pressed, part of the light per raw px of depth.
     """
 
     azimuth: tuple[float, float, float]
@@ -44,6 +45,7 @@ class Light:
     brightening: float
     onset: float = 0.05
     halo: float = 0.0
+    absorption: float = 0.0
 
     def tilt(self) -> NDArray[np.float32]:
         """(3, 2) float32: relative change of each channel per unit slope in x and y."""
@@ -63,6 +65,8 @@ LIGHTS = {
     "dark_channel": Light((325.0, 80.0, 205.0), (115.0, 132.0, 12.0), 0.4, (0.5, 1.9, 9.0), 0.25, 0.0),
     # White light through a black coating; a contact darkens, with a bright halo around it.
     "darkening": Light((325.0, 80.0, 205.0), (150.0, 152.0, 154.0), 0.12, 0.10, 0.5, -75.0, 0.2, 26.0),
+    # White light that a dark layer below a translucent one absorbs, the more the thinner the latter.
+    "absorbing": Light((325.0, 80.0, 205.0), (150.0, 152.0, 154.0), 0.12, 0.0, 0.5, 0.0, absorption=0.02),
 }  # fmt: skip
 
 
@@ -107,6 +111,9 @@ def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
     depth : (h, w) float32, depth of the surface, px, sampled every `step` px.
     """
     slope_x, slope_y = _slopes(depth, step)
+    if light.absorption:
+        passing = np.exp(depth * np.float32(-light.absorption))
+        return np.asarray(cv2.merge([passing, passing, passing]), dtype=np.float32)
     upright = (1.0 - light.ambient) / np.sqrt(slope_x * slope_x + slope_y * slope_y + np.float32(1.0))
     channels = []
     for gain_x, gain_y in light.tilt():

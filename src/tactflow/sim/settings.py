@@ -53,9 +53,9 @@ class Settings(BaseModel):
     dirty: float = _number(0, 0, 2, "specks of dirt per marker")
     vanish: float = _number(0, 0, 0.9, "fraction of markers that are invisible during a contact")
     speckle: float = _number(0, 0, 1, "contrast of random blotches that move with the gel")
-    light: Literal["photometric", "bright", "mixed", "dark_channel", "darkening"] = Field(
+    light: Literal["photometric", "bright", "mixed", "dark_channel", "darkening", "absorbing"] = Field(
         "photometric",
-        description="type of sensor (photometric|bright|mixed|dark_channel|darkening)",
+        description="type of sensor (photometric|bright|mixed|dark_channel|darkening|absorbing)",
     )
     drift: float = _number(
         0, -0.5, 0.5, "rise of the brightness while the lights warm up (time constant 5 s), relative"

@@ -8,6 +8,7 @@ where the picture ends.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import cv2
@@ -26,7 +27,7 @@ DEPTH_SHAPE: Final = 1.5
 """Error of the depth of shapes that are no ball, over that of balls, on whose roundness a calibration relies.
 This and the five below were chosen on 324 contacts of nine simulated scenes under three lights, with three
 calibrations, so that of round and of sharp ones about 68 % of the errors lie within one standard error and
-95 % within two; docs/depth_table.py tries them on 162 others."""
+95 % within two."""
 DEPTH_ROUNDED: Final = 0.005
 """Part of the depth that averaging may take off, of any contact."""
 DEPTH_STEEP: Final = 0.24
@@ -124,20 +125,16 @@ class Surface:
         """
         slope, steep, window = self._slopes(image, rest, mask, gradients)
         low = self._integrated(slope, window, rest.window)
-        heights = np.zeros(mask.shape, np.float32)
-        size = (2 * window.width, 2 * window.height)
-        cv2.resize(low, size, heights[window.whole], interpolation=cv2.INTER_LINEAR)
-        greatest = float(low.max())
-        cell = self._scale.area(4.0)
-        volume = float(low.sum()) * cell
-        pressed = float(low[mask[window.whole][::2, ::2] > 0].sum()) * cell
-        depth_error = volume_error = None
-        if self._errors is not None and gradients is None:
+
+        def errors(greatest: float, volume: float) -> tuple[float | None, float | None]:
+            if self._errors is None or gradients is not None:
+                return None, None
             root, balls = math.sqrt(steep), self._errors
             shape, steep_part = DEPTH_SHAPE * balls.depth, DEPTH_STEEP * root
             depth_error = greatest * math.hypot(shape, balls.between, DEPTH_ROUNDED, steep_part)
-            volume_error = volume * math.hypot(balls.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
-        return Depth(heights, greatest, depth_error, volume, volume_error, pressed)
+            return depth_error, volume * math.hypot(balls.volume, VOLUME_ROUNDED, VOLUME_STEEP * root)
+
+        return measured(low, window, mask, self._scale, errors)
 
     def heights(self, image: Bytes, rest: Rest, mask: Bytes) -> Floats32:
         """(h, w) float32: how far the gel is pushed in, mm >= 0, at half resolution; see `depth`."""
@@ -188,6 +185,27 @@ class Surface:
             border = np.concatenate([heights[0], heights[-1], heights[:, 0], heights[:, -1]])
             heights -= np.median(border)
         return np.maximum(heights, 0, out=heights)
+
+
+def measured(
+    low: Floats32,
+    window: Window,
+    mask: Bytes,
+    scale: Scale,
+    errors: Callable[[float, float], tuple[float | None, float | None]],
+) -> Depth:
+    """Height map, greatest depth and volumes, from heights (h, w) of a window at half resolution, mm.
+
+    mask : (H, W) uint8, 255 in contact. errors : standard errors of greatest depth and volume, from these.
+    """
+    heights = np.zeros(mask.shape, np.float32)
+    size = (2 * window.width, 2 * window.height)
+    cv2.resize(low, size, heights[window.whole], interpolation=cv2.INTER_LINEAR)
+    greatest, cell = float(low.max()), scale.area(4.0)
+    volume = float(low.sum()) * cell
+    pressed = float(low[mask[window.whole][::2, ::2] > 0].sum()) * cell
+    depth_error, volume_error = errors(greatest, volume)
+    return Depth(heights, greatest, depth_error, volume, volume_error, pressed)
 
 
 def _steep_part(slope: Floats32, steepest: float | None) -> float:
