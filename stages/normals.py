@@ -23,7 +23,10 @@ class SurfaceNormals(Stage):
     def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
         """Prepare. calibration : the file."""
         super().__init__(params)
-        self._slopes = None if calibration is None else Calibration.load(calibration).slopes
+        known = None if calibration is None else Calibration.load(calibration)
+        photometric = None if known is None else known.photometric
+        self._slopes = None if known is None else known.slopes
+        self._errors = None if photometric is None else photometric.errors()
         self._rest: tuple[Untouched, Rest] | None = None
 
     def process(
@@ -41,4 +44,6 @@ class SurfaceNormals(Stage):
             return Absent("no_contact")
         if self._rest is None or self._rest[0] is not untouched:
             self._rest = untouched, Rest(untouched)
-        return Surface(self._slopes, scale).normals(unmarked, self._rest[1], contact_mask, gradients)
+        return Surface(self._slopes, scale, self._errors).normals(
+            unmarked, self._rest[1], contact_mask, gradients
+        )

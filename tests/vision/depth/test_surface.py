@@ -152,6 +152,31 @@ def test_slopes_are_those_of_normals_that_are_a_polynomial_of_colour_and_place_a
     assert np.hypot(*found).max() <= STEEPEST / np.sqrt(1 - STEEPEST**2) + 1e-4
 
 
+def test_beyond_the_steepest_normal_of_the_balls_normals_are_in_proportion_to_the_colour() -> None:
+    steepest = 0.4
+    change = np.random.default_rng(2).normal(0, 0.3, (40, 60, 3)).astype(np.float32)
+    everywhere = np.ones((5, 60), np.uint8)
+
+    def normals(model: SlopeModel, change: np.ndarray, steepest: float) -> np.ndarray:
+        slope = model.slopes(change.astype(np.float32), *coordinates((60, 40)), everywhere, steepest)
+        return np.asarray(slope / np.sqrt(1 + (slope**2).sum(axis=0)))
+
+    whole = normals(SlopeModel(ANY), change, STEEPEST)
+    found = normals(SlopeModel(ANY), change, steepest)
+    length = np.hypot(*found)
+    beyond = (length > 1.01 * steepest) & (length < 0.99 * STEEPEST)
+    assert np.allclose(found[:, length < steepest], whole[:, length < steepest], atol=1e-4)
+    assert beyond.mean() > 0.1
+    part = steepest / np.maximum(length, steepest)
+    there = normals(SlopeModel(ANY), change * part[..., None], STEEPEST)
+    assert np.abs(there - found * part)[:, beyond].max() < 2e-3
+    linear = ANY.copy()
+    linear[:, 3:] = 0
+    for limit in (steepest, STEEPEST):
+        same = normals(SlopeModel(linear), change, limit)
+        assert np.allclose(same, normals(SlopeModel(linear), change, STEEPEST), atol=1e-3)
+
+
 def test_coefficients_of_another_shape_are_refused() -> None:
     with pytest.raises(ValueError, match="required finite coefficients"):
         SlopeModel(np.zeros((3, 3, 2)))

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Floats32
-from tactflow.vision.depth.slopes import Bytes, SlopeModel, coordinates
+from tactflow.vision.depth.slopes import STEEPEST, Bytes, SlopeModel, coordinates
 from tactflow.vision.depth.surroundings import CELL, Resting, Window, resting, surroundings
 from tactflow.vision.types import Depth, Scale
 
@@ -172,8 +172,11 @@ class Surface:
         change = colour_change(image, rest, window, at_rest.light)
         assert self._model is not None, "without a model, gradients are given"
         rows, columns = window.part
-        slope = self._model.slopes(change, rest.x[columns], rest.y[rows], around.near)
-        steep = 0.0 if self._errors is None else _steep_part(slope, self._errors.steepest)
+        steepest = None if self._errors is None else self._errors.steepest
+        slope = self._model.slopes(
+            change, rest.x[columns], rest.y[rows], around.near, STEEPEST if steepest is None else steepest
+        )
+        steep = _steep_part(slope, steepest)
         return slope, steep, window
 
     def _integrated(self, slope: Floats32, window: Window, whole: Window) -> Floats32:
