@@ -52,7 +52,7 @@ class DarknessModel:
 
     def __call__(self, darkening: NDArray[np.floating]) -> Floats32:
         """Depth, mm, of pixels (...); 0 where they became brighter."""
-        return np.interp(darkening, self._darkening, self._depth).astype(np.float32)
+        return np.asarray(np.interp(darkening, self._darkening, self._depth), np.float32)
 
 
 class DarkSurface:
