@@ -66,8 +66,8 @@ SPOT_STRENGTH: Final = 0.25
 SAME_SPOT: Final = 0.3
 """Distance within which a mark is at a spot, pitches. Chosen by hand."""
 
-LEAVING_LOG_ODDS: Final = -3.0
-"""Logarithm of the odds that a mark moves with the gel, below which it leaves: strong evidence (Kass and
+LEAVING_EVIDENCE: Final = 5.0
+"""Evidence that a mark stays while those around it move, from which on it leaves: very strong (Kass and
 Raftery, "Bayes factors", 1995)."""
 
 JOINING_PROBABILITY: Final = 0.95
@@ -168,7 +168,7 @@ class MarkerTracker:
         self._position = self._origin.copy()
         self._seen = np.ones(self._count, bool)
         self._age = 0
-        self._evidence = MotionEvidence(self._origin, self._pitch)
+        self._evidence = MotionEvidence(self._origin, self._pitch, REST * self._pitch)
         self._left: Indices = np.zeros(0, np.int64)
         self._has_moved = False
 
@@ -207,22 +207,20 @@ class MarkerTracker:
             self._looked_again = True
             if self._join(image):
                 return self.track(image)
-        probability = None if self._prior is None else _probability(self._prior + self._evidence.log_odds)
+        probability = None if self._prior is None else _probability(self._prior - self._evidence.against)
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
 
     def _weigh_motion(self, position: Floats, stderr: NDArray[Any], seen: Flags) -> bool:
         """Have marks that do not move with the gel leave `seen`; returns whether the gel rests."""
-        displacement = position - self._origin
-        far = np.asarray(np.abs(displacement).max(axis=1) > REST * self._pitch)
-        if far.any():
+        moves = self._evidence.add(position - self._origin, stderr, seen)
+        if moves:
             self._has_moved = True
-            self._evidence.add(displacement, stderr, seen)
-            motion = self._evidence.log_odds
-            if self._prior is not None and motion.min(initial=0) < LEAVING_LOG_ODDS:
-                self._left = np.flatnonzero((motion < LEAVING_LOG_ODDS) & (self._prior + motion < 0))
+            against = self._evidence.against
+            if self._prior is not None and against.max() > LEAVING_EVIDENCE:
+                self._left = np.flatnonzero((against > LEAVING_EVIDENCE) & (against > self._prior))
             seen[self._left] = False
         whole = np.count_nonzero(seen) > WHOLE * (self._count - len(self._left))
-        return bool(whole and not far[seen].any())
+        return bool(whole and not moves)
 
     def _join(self, image: NDArray[np.uint8]) -> bool:
         """Take up marks of a frame at rest that the reference did not show; returns whether there are any."""
@@ -249,7 +247,9 @@ class MarkerTracker:
         self._origin, self._count = origin, len(origin)
         self._graph = MarkerGraph(origin, lattice.neighbour_graph(origin, lattice.LONGEST_LINK * self._pitch))
         self._interpolator = Interpolator(origin, self._pitch)
-        self._evidence = self._evidence.extended(origin, self._pitch)
+        against = self._evidence.against
+        self._evidence = MotionEvidence(origin, self._pitch, REST * self._pitch)
+        self._evidence.against[: len(against)] = against
         self._prior = np.concatenate([self._prior, _log_odds(found.probability[joins])])
         self._position = np.concatenate([self._position, centers])
         self._seen = np.concatenate([self._seen, known[~known]])
