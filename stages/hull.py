@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask, Deviations
-from tactflow.vision.contact.certainty import with_probability
+from tactflow.vision.contact.certainty import with_probability, without_doubtful
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.types import Contact, Evidence
 
@@ -28,8 +28,9 @@ class Hull(Stage):
         )
         merge: Literal["all", "largest", "near"] = Field(
             "all",
-            description="all: everything that touches is one contact; largest: the one with the most pixels; "
-            "near: the same, where those up to max_gap apart are one. The separate ones are reported as well",
+            description="all: everything that touches is one contact, without what is improbable beside it; "
+            "largest: the one with the most pixels; near: the same, where those up to max_gap apart are one. "
+            "The separate ones are reported as well",
         )
         max_gap: float | None = Field(
             None,
@@ -77,9 +78,8 @@ class Hull(Stage):
         if len(parts) == 1:
             return contact
         if params.merge == "all" and params.max_gap is None:
-            whole = contact_geometry(
-                contact_mask, min_area=params.min_area, min_confidence=params.min_confidence
-            )
+            mask = without_doubtful(parts, contact_mask)
+            whole = contact_geometry(mask, min_area=params.min_area, min_confidence=params.min_confidence)
             contact = whole or contact
         first = parts[0]
         return replace(contact, evidence=first.evidence, probability=first.probability, separate=tuple(parts))

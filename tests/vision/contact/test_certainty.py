@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.vision.contact.certainty import contact_evidence, with_probability
+from tactflow.vision.contact.certainty import contact_evidence, with_probability, without_doubtful
 from tactflow.vision.geometry.hull import contact_parts
 
 MASK = np.zeros((80, 120), np.uint8)
@@ -53,3 +53,27 @@ def test_a_simulated_contact_says_how_probable_it_is_and_so_does_its_message() -
         assert [part["probability"] for part in message["contacts"]] == [
             part.probability for part in result.contacts
         ]
+
+
+def test_what_is_improbable_beside_another_does_not_count_and_is_reported() -> None:
+    small = MASK.copy()
+    small[48:64, 80:96] = 0
+    grey = changed(50.0, 50.0)
+    grey[1, 12:16, 20:24] = 1
+    assert np.array_equal(without_doubtful(with_probability(PARTS, MASK, grey), MASK), small)
+    sure = with_probability(contact_parts(MASK, evidence="both"), MASK, changed(50.0, 50.0))
+    assert without_doubtful(sure, MASK) is MASK
+    # One alone is kept, however improbable.
+    alone = with_probability(contact_parts(small), small, changed(50.0, 0.01))
+    assert without_doubtful(alone, small) is small
+
+
+def test_the_reflection_of_a_contact_does_not_widen_its_hull() -> None:
+    scene, seen = tactflow.open_scene("box?frames=24&stray=0.8"), 0
+    settings = {"sinks.zmq": None, "sinks.view": None}
+    for result in tactflow.stream("default", source="sim:box?frames=24&stray=0.8", settings=settings):
+        if len(result.contacts) == 2 and result.contact is not None:
+            truth = scene.truth(result.seq, result["mapping"])
+            assert np.hypot(*np.subtract(result.contact.center, truth.center)) < 1
+            seen += 1
+    assert seen > 2

@@ -21,6 +21,8 @@ from tactflow.vision.types import Contact
 
 WEIGHTS: Final = (0.2, 1.49, 1.2, 1.67)
 """Constant and weights of `contact_evidence` in the log odds: `python -m tactflow.bench.judge --fit`."""
+DOUBTFUL: Final = 0.25
+"""Probability below which a region beside another does not count: three to one against it."""
 LEAST_SHARE: Final = 1e-3
 """Of the change of colour in all of a change, at least: its logarithm has to be finite."""
 
@@ -63,3 +65,23 @@ def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
         part if part.evidence == "dots" else replace(part, probability=1 / (1 + math.exp(-value)))
         for part, value in zip(parts, odds.tolist(), strict=True)
     ]
+
+
+def without_doubtful(parts: Sequence[Contact], mask: Mask) -> Mask:
+    """The mask without improbable regions, or itself if all count; the most probable one always does.
+
+    parts : every region of the mask, (H, W) uint8, 0 or 255.
+    """
+    best = max(parts, key=_probability)
+    doubtful = [part for part in parts if part is not best and _probability(part) < DOUBTFUL]
+    if not doubtful:
+        return mask
+    kept = mask.copy()
+    for part in doubtful:
+        x, y = part.hull[0]
+        cv2.floodFill(kept, None, (int(x), int(y)), (0.0,), flags=8)
+    return kept
+
+
+def _probability(part: Contact) -> float:
+    return 1.0 if part.probability is None else part.probability
