@@ -161,3 +161,17 @@ def test_outlines_of_real_gels_are_found(shared_data: Path) -> None:
     assert len(judged) == 37
     assert all(one.found for one in judged)
     assert np.median([one.hull for one in judged]) > 0.65
+
+
+def test_the_worst_frames_are_drawn(labelled: tuple[Path, list[FrameLabel]], tmp_path: Path) -> None:
+    data, labels = labelled
+    save_labels(tmp_path / "labels.json", labels)
+    words = ["--data", str(data), "--labels", str(tmp_path / "labels.json"), "--picture"]
+    assert main([*words, str(tmp_path / "worst.png")]) == 0
+    picture = cv2.imread(str(tmp_path / "worst.png"))
+    assert picture is not None
+    assert picture.shape == (240, 5 * 240, 3)
+    drawn = (picture == (0, 255, 0)).all(axis=2).any(axis=0).reshape(5, 240).any(axis=1)
+    assert drawn.sum() == sum(bool(label.outlines) for label in labels) > 1
+    assert main([*words, str(tmp_path / "worst.nothing")]) == 2
+    assert main([*words, str(tmp_path / "no" / "worst.png")]) == 2

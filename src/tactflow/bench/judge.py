@@ -55,6 +55,12 @@ PLAIN: Final = (
     "wedge_grip",
 )
 """Recordings of gels without dots among those of `OUTLINES`: `default` gives way to `markerless` there."""
+WORST: Final = 20
+ACROSS: Final = 5
+"""Frames of a picture of the worst ones, and its columns."""
+TILE: Final = 240
+"""Side of each of them, px."""
+GREEN, RED, WHITE = (0, 255, 0), (0, 0, 255), (255, 255, 255)
 WITHIN: Final = 0.2
 """Part of a region that an outline covers, from which on the region is of that contact. Chosen by hand."""
 LARGE: Final = 500
@@ -129,7 +135,11 @@ def judge(
 
 
 def labelled(
-    pipeline: str, labels: Iterable[FrameLabel], data: Path, report: Callable[[str], None] = say
+    pipeline: str,
+    labels: Iterable[FrameLabel],
+    data: Path,
+    report: Callable[[str], None] = say,
+    images: bool = False,
 ) -> Iterator[tuple[FrameLabel, Result | None]]:
     """Run every recording that is there: its labels, and results of these frames.
 
@@ -137,7 +147,7 @@ def labelled(
         recordings in `PLAIN`.
     labels : those with `contact` None are left out. data : folder that holds the recordings.
     report : called with what could not be judged, and why. Frames that a failing pipeline did not reach have
-        no result.
+        no result. images : whether the results hold the pictures.
 
     Raises
     ------
@@ -158,7 +168,7 @@ def labelled(
         else:
             missing = {_index(label): label for label in wanted}
         try:
-            for result in _results(chosen, source, last=max(missing)):
+            for result in _results(chosen, source, max(missing), images):
                 if result.seq in missing and not result.frame.reference:
                     yield missing.pop(result.seq), result
         except ConfigError:
@@ -167,6 +177,48 @@ def labelled(
             report(f"{recording}: {str(error).splitlines()[0]}")
         for label in missing.values():
             yield label, None
+
+
+def draw_worst(pipeline: str, labels: Sequence[FrameLabel], data: Path, path: Path) -> None:
+    """Write a picture of the frames whose hulls overlap least with the outlines: these green, hulls red.
+
+    Raises ConfigError if there are no outlined frames, or the file cannot be written.
+    """
+    worst: list[tuple[float, int, NDArray[np.uint8]]] = []
+    outlined = [label for label in labels if label.outlines]
+    for number, (label, result) in enumerate(labelled(pipeline, outlined, data, images=True)):
+        if result is not None and result.image is not None:
+            overlap = compare(label, result).hull
+            worst.append((overlap, number, _tile(label, result, f"{label.lab} {overlap:.2f}")))
+            worst = sorted(worst, key=lambda one: one[:2])[:WORST]
+    if not worst:
+        raise ConfigError(f"--picture: {data} has no recording with an outlined frame")
+    tiles = [tile for *_, tile in worst]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % ACROSS)
+    rows = [np.hstack(tiles[first : first + ACROSS]) for first in range(0, len(tiles), ACROSS)]
+    try:
+        written = cv2.imwrite(str(path), np.vstack(rows))
+    except cv2.error:
+        written = False
+    if not written:
+        raise ConfigError(f"--picture {path}: cannot be written; required a .png or .jpg in a folder")
+
+
+def _tile(label: FrameLabel, result: Result, text: str) -> NDArray[np.uint8]:
+    """(TILE, TILE, 3) uint8: a frame with its outlines and its hull."""
+    image, mapping = result.image, result["mapping"]
+    assert image is not None
+    factor = TILE / max(image.shape[:2])
+    small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    found = [] if result.contact is None else [result.contact.hull]
+    drawn = [mapping.to_processed(outline) for outline in label.outlines or ()]
+    for polygons, colour in ((found, RED), (drawn, GREEN)):
+        corners = [np.rint(np.asarray(polygon) * factor).astype(np.int32) for polygon in polygons]
+        cv2.polylines(small, corners, True, colour)
+    cv2.putText(small, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, WHITE, 1, cv2.LINE_AA)
+    tile = np.zeros((TILE, TILE, 3), np.uint8)
+    tile[: small.shape[0], : small.shape[1]] = small
+    return tile
 
 
 def fit(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
@@ -215,7 +267,7 @@ def _picture(folder: Path, name: str) -> NDArray[np.uint8]:
     return load_image(str(found))
 
 
-def _results(pipeline: str, source: Path | Pictures, last: int) -> Iterator[Result]:
+def _results(pipeline: str, source: Path | Pictures, last: int, images: bool) -> Iterator[Result]:
     if isinstance(source, Path):
         with closing(open_source(str(source))) as reader:
             first = reader.peek()
@@ -223,7 +275,8 @@ def _results(pipeline: str, source: Path | Pictures, last: int) -> Iterator[Resu
     else:
         size = max(source[0].shape)
     settings = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 2 if size > LARGE else 1}
-    with closing(stream(pipeline, source=source, settings=settings, max_frames=last + 1)) as results:
+    running = stream(pipeline, source=source, settings=settings, max_frames=last + 1, images=images)
+    with closing(running) as results:
         yield from results
 
 
@@ -361,6 +414,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--fit", action="store_true", help="fit the probability of a contact, and tell how true it is"
     )
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE", help=f"draw the {WORST} worst frames of the first pipeline"
+    )
     parser.add_argument("--recording", metavar="START", default="", help="only those whose name starts so")
     options = parser.parse_args(arguments)
     try:
@@ -370,6 +426,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         first = [label for label in labels if label.round == 1]
         if options.fit:
             print(*fit(first, options.data), sep="\n")
+            return 0
+        if options.picture is not None:
+            draw_worst(options.pipelines[0], first, options.data, options.picture)
             return 0
         results = {name: list(judge(name, first, options.data)) for name in options.pipelines}
         if not any(results.values()):
