@@ -95,7 +95,8 @@ def test_every_length_angle_and_force_has_its_unit() -> None:
         "pose_covariance",
     }
     assert {name for name, found in units.items() if not found} == {
-        *("seq", "pose_since", "contact_slope", "contact_confidence", "flow_count", "features_values"),
+        *("seq", "pose_since", "contact_slope", "contact_confidence", "contact_probability"),
+        *("flow_count", "features_values"),
         *("contact_normal_x", "contact_normal_y", "contact_normal_z"),
         *("flow_divergence", "flow_divergence_stderr", "flow_shear_1", "flow_shear_2", "flow_shear_stderr"),
         *("slip_slipping", "slip_stick_ratio", "force_in_range"),

@@ -22,8 +22,8 @@ def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFix
     assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT", "IT", "DOES"]
     assert [row.split()[:2] for row in rows] == [[c.name, c.kind] for c in catalogue()[0]]
     hull = next(row for row in rows if row.startswith("hull "))
-    ports = ["contact_mask,", "evidence?", "contact"]
-    assert hull.split()[:6] == ["hull", "stage", *ports, "built-in"]
+    ports = ["contact_mask,", "evidence?,", "deviations?", "contact"]
+    assert hull.split()[:7] == ["hull", "stage", *ports, "built-in"]
 
 
 def test_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ from tactflow.vision.contact.background_kernels import (
 )
 from tactflow.vision.contact.contact_outline import WindowChange
 from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
-from tactflow.vision.contact.response import EVEN, light_response
+from tactflow.vision.contact.response import light_response
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
@@ -40,9 +40,6 @@ NOISE_CORRELATION: Final = 2.0
 leave little noise between neighbours, and more over distances. Chosen by hand."""
 CELL_VALID: Final = 128
 """Mean of a valid area, 0 to 255, over a cell that counts, at least: half of it."""
-CUT: Final = 0.5
-"""Change at the picture's border, over the largest one of a contact, from which on the border cuts it. Chosen
-by hand, near the part at which `contact_outline` takes a change for the contact's."""
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
@@ -203,8 +200,7 @@ class BackgroundModel:
     ) -> WindowChange:
         """How strongly a window has changed, in standard deviations.
 
-        Slopes of all directions count alike, as far as `light_response` can tell how they show: not where the
-        picture ends before the contact does.
+        Slopes of all directions count alike, as far as `light_response` can tell how they show.
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
         count. side : of the result's pixels, px: 2 for half resolution, 1 for the frame's own.
         """
@@ -224,8 +220,7 @@ class BackgroundModel:
             untouched.pattern,
             scaled,
         )
-        cut = _cut_by_border(scaled, inside, rows, columns, change.squared.shape)
-        response = EVEN if cut else light_response(scaled, inside)
+        response = light_response(scaled, inside)
         strength, brightness = np.empty((2, high, wide), np.float32)
         change_strength(scaled, inside.view(np.uint8), *response, strength, brightness)
         return WindowChange(strength, brightness)
@@ -281,26 +276,6 @@ class BackgroundModel:
 def _interleaved(planes: Floats32) -> Floats32:
     """(h, 3 w) float32 of (3, h, w)."""
     return np.ascontiguousarray(planes.transpose(1, 2, 0), np.float32).reshape(planes.shape[1], -1)
-
-
-def _cut_by_border(
-    change: Floats32, inside: NDArray[np.bool_], rows: slice, columns: slice, shape: tuple[int, ...]
-) -> bool:
-    """Whether a contact, not only what is left of its change further out, reaches the picture's border.
-
-    change : (n h, 3 n w), of the window. inside : (h, w), which of its cells count. rows, columns : the
-    window, cells. shape : of the picture, cells.
-    """
-    each, pixels = len(change) // len(inside), change.reshape(len(change), -1, 3)
-    enough = CUT * cv2.norm(change, cv2.NORM_INF)
-    ends = [(rows.start == 0, 0, 0), (rows.stop == shape[0], 0, -1)]
-    ends += [(columns.start == 0, 1, 0), (columns.stop == shape[1], 1, -1)]
-    for reached, axis, end in ends:
-        if reached:
-            line = np.abs(pixels.take(end, axis)).max(axis=1)
-            if line[inside.take(end, axis).repeat(each)].max(initial=0) > enough:
-                return True
-    return False
 
 
 def _planes(picture: NDArray[np.uint8]) -> Floats32:

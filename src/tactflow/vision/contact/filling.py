@@ -2,8 +2,7 @@
 
 A mask of what has changed becomes a `Region` by `enclosed`: `outlined` fills the holes of its parts, `traced`
 finds their outlines, `fill_pockets` adds what they enclose together with the border of the frame. A region
-that is not solid then (`is_solid`) may be a ring with a gap: `fill_bay` fills the largest bay where there is
-a faint change, `close_gaps` bridges a gap.
+that is not solid then (`is_solid`) may be a ring with a gap, which `close_gaps` bridges.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ narrower than the ring is thick, or than a marker, is closed. Chosen by hand."""
 
 POCKET: Final = 0.8
 """Part of an area between a region and the frame's border that the region's hull covers if it belongs to the
-region; and of a bay that has changed, or is enclosed by what has, if the bay does. Chosen by hand."""
+region. Chosen by hand."""
 
 SQUARE: Final = np.ones((3, 3), np.uint8)
 """A pixel and its neighbours."""
