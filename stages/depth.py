@@ -18,7 +18,7 @@ class Depth(Stage):
     """Heights from the colour of the gel, or from its darkening, by the sensor's calibration, or from the
     gradients of a network.
 
-    Nothing without a calibration, or with one that knows the scale alone and no network.
+    Absent without a calibration, or with one that knows the scale alone and no network.
     """
 
     memory = "pure"
@@ -27,7 +27,7 @@ class Depth(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         self._known = None if calibration is None else Calibration.load(calibration)
-        self._surface: tuple[Scale, Surface | DarkSurface] | None = None
+        self._surface: tuple[Scale, bool, Surface | DarkSurface] | None = None
         self._rest: tuple[Untouched, Rest] | None = None
 
     def process(
@@ -46,9 +46,10 @@ class Depth(Stage):
             return Absent("no_contact")
         if self._rest is None or self._rest[0] is not untouched:
             self._rest = untouched, Rest(untouched)
-        if self._surface is None or self._surface[0] is not scale:
-            self._surface = scale, _surface_of(known, scale, gradients is not None)
-        surface = self._surface[1]
+        given = gradients is not None
+        if self._surface is None or self._surface[0] is not scale or self._surface[1] != given:
+            self._surface = scale, given, _surface_of(known, scale, given)
+        surface = self._surface[2]
         if isinstance(surface, Surface):
             return surface.depth(unmarked, self._rest[1], contact_mask, gradients)
         return surface.depth(unmarked, self._rest[1], contact_mask)

@@ -28,7 +28,7 @@ class Hull(Stage):
         )
         merge: Literal["all", "largest", "near"] = Field(
             "all",
-            description="all: everything that touches is one contact, without what is improbable beside it; "
+            description="all: all regions are one contact, but for improbable ones beside a more probable; "
             "largest: the one with the most pixels; near: the same, where those up to max_gap apart are one. "
             "The separate ones are reported as well",
         )
@@ -78,8 +78,9 @@ class Hull(Stage):
         if len(parts) == 1:
             return contact
         if params.merge == "all" and params.max_gap is None:
-            mask = without_doubtful(parts, contact_mask)
+            probable, mask = without_doubtful(parts, contact_mask)
+            contact = probable[0]
             whole = contact_geometry(mask, min_area=params.min_area, min_confidence=params.min_confidence)
-            contact = whole or contact
-        first = parts[0]
-        return replace(contact, evidence=first.evidence, probability=first.probability, separate=tuple(parts))
+            if whole is not None:
+                contact = replace(whole, evidence=contact.evidence, probability=contact.probability)
+        return replace(contact, separate=tuple(parts))

@@ -15,7 +15,7 @@ from tactflow.vision.types import Scale
 class SurfaceNormals(Stage):
     """Unit normals of the gel's surface, from its colour or from the gradients of a network, as in `depth`.
 
-    Nothing without a calibration, or with one that knows the scale alone and no network.
+    Absent without a calibration of slopes and without a network.
     """
 
     memory = "pure"

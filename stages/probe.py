@@ -22,7 +22,7 @@ class ProbePorts(NamedTuple):
 
 class Probe(Stage):
     """Looks at samples of the raw frame. With `when: changed`, stages repeat their results while nothing can
-    have changed; with `when: suspect`, as long as nothing touches the gel either."""
+    have changed; with `when: suspect`, also while only the dots may have moved."""
 
     memory = "stateful"
     watches = "touching"
@@ -31,9 +31,9 @@ class Probe(Stage):
         """How careful to be."""
 
         repeatability: float = Field(
-            0.025, ge=0, le=1, description="as of difference: set both to the same value"
+            0.025, ge=0, le=1, description="same as in difference; keep the two equal"
         )
-        tint: float = Field(0.01, ge=0, le=1, description="as of difference: set both to the same value")
+        tint: float = Field(0.01, ge=0, le=1, description="same as in difference; keep the two equal")
         false_alarms: float = Field(
             0.01, gt=0, le=0.5, description="share of still frames in which dots are looked at all the same"
         )

@@ -47,6 +47,7 @@ class TactflowCamera(Camera):
         # Not the camera itself, which is disconnected when nobody refers to it any more.
         self._reader = object()
         self._shape: tuple[int, ...] = ()
+        self._origins: NDArray[np.float64] | None = None
 
     def __str__(self) -> str:
         return f"{type(self).__name__}({self.config.source}, {self.config.output.value})"
@@ -82,7 +83,7 @@ class TactflowCamera(Camera):
             or no frame came in time. DeviceAlreadyConnectedError : as it says.
         """
         try:
-            self._run = SharedRun.join(self.config, self._reader)
+            self._run, self._origins = SharedRun.join(self.config, self._reader), None
             if warmup or self.width is None or self.height is None:
                 self._check_first_frame()
         except (RuntimeError, TactflowError, TimeoutError, ValueError) as error:
@@ -185,9 +186,12 @@ class TactflowCamera(Camera):
             case Output.MARKERS:
                 markers = _required(result, "markers", "a stage tracker")
                 columns = [markers.origin, markers.displacement, markers.status[:, None]]
-                # A dataset has one shape: markers found after the first frame are left out.
-                count = self._shape[0] if self._shape else None
-                return np.hstack(columns).astype(np.float32)[:count]
+                if self._origins is None:
+                    self._origins = markers.origin.copy()
+                # A dataset has one shape: markers that have joined those of the first frame are left out.
+                count = len(self._origins)
+                joined = np.array_equal(markers.origin[:count], self._origins)
+                return np.hstack(columns).astype(np.float32)[: count if joined else None]
 
     def _in_order(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A copy that the caller may write to, (H, W, 3), in the colors' order that is configured."""

@@ -106,7 +106,7 @@ def test_every_length_angle_and_force_has_its_unit() -> None:
 @pytest.mark.parametrize("name", SUFFIXES)
 def test_it_plays_again_with_the_same_results(name: str, exported: tuple[Path, list[Result]]) -> None:
     out, results = exported
-    source = f"{out / name / f'episode_000{SUFFIXES[name]}'}?dataset=frames&times=t"
+    source = str(out / name / f"episode_000{SUFFIXES[name]}")
     again = list(tactflow.stream(source=source, settings={"sinks": {}}, images=True))
     assert len(again) == len(results)
     for one, other in zip(again, results, strict=True):

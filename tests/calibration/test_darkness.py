@@ -49,11 +49,24 @@ def test_one_press_of_a_ball_gives_the_depth_of_others_within_the_stated_error()
     for number, depth in enumerate((0.3, 0.4, 0.55), 2):
         press = pressed(number, depth, (60.0, 70.0))
         found = surface.depth(press.image, rest, press.mask)
-        assert found.greatest == pytest.approx(depth, abs=0.05)
+        assert found.greatest == pytest.approx(depth, abs=0.02)
         assert found.greatest_stderr == fitted.found.stderr
         cap = np.pi * depth**2 * (RADIUS - depth / 3)
         assert found.volume == pytest.approx(cap, rel=0.12)
         assert found.pressed <= found.volume
+
+
+def test_deeper_than_any_press_the_error_is_not_known() -> None:
+    fitted = fit_darkness(session(pressed(1, 0.6)), SCALE, RADIUS)
+    deeper = pressed(2, 0.8)
+    found = DarkSurface(fitted.model, SCALE, fitted.found.stderr).depth(deeper.image, Rest(GEL), deeper.mask)
+    assert found.greatest == pytest.approx(fitted.model.deepest)
+    assert (found.greatest_stderr, found.volume_stderr) == (None, None)
+
+
+def test_a_lighter_press_beside_a_deep_one_does_not_spoil_the_stated_error() -> None:
+    fitted = fit_darkness(session(pressed(1, 0.6), pressed(2, 0.15)), SCALE, RADIUS)
+    assert fitted.found.stderr < 0.02
 
 
 def test_several_presses_are_judged_by_the_others() -> None:

@@ -21,6 +21,8 @@ SETTINGS = {
     "times": "name of their times (numbers with a point are s, whole ones ns)",
     "order": "rgb (bgr if not given)",
 }
+EXPORTED = {"dataset": "/frames", "times": "/t"}
+"""What `tactflow export` writes, and what is read of a file that has both if nothing else is asked for."""
 BLOCK = 64 << 20
 """Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
 LARGEST_CHUNK = 1 << 30
@@ -33,9 +35,9 @@ class ArrayDataset(FrameReader):
     """Frames of one array of an HDF5 file or a Zarr folder.
 
     spec : `file.h5?dataset=/frames`; `times=/t` names their times, else frame i is taken at i / fps;
-    `order=rgb` if the colors are in that order. directory, fps : as for `open_source`. Raises SourceError if
-    there is no such file or array (it lists those that are there), it holds no frames, or a package is
-    missing.
+    `order=rgb` if the colors are in that order. An export of tactflow needs none of these. directory, fps :
+    as for `open_source`. Raises SourceError if there is no such file or array (it lists those that are
+    there), it holds no frames, or a package is missing.
     """
 
     # HDF5 and the codecs of both formats raise all kinds of errors.
@@ -49,6 +51,8 @@ class ArrayDataset(FrameReader):
         super().__init__(f"{path}, {settings.get('dataset', '')}")
         self._swapped = settings.get("order") == "rgb"
         arrays, self._close = _open(path)
+        if not settings and set(EXPORTED.values()) <= arrays.keys():
+            settings = EXPORTED
         try:
             self._array = _choose(spec, settings.get("dataset"), arrays, "dataset")
             _check(self._array, self.name)

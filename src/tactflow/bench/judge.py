@@ -221,12 +221,14 @@ def _tile(label: FrameLabel, result: Result, text: str) -> NDArray[np.uint8]:
     return tile
 
 
-def fit(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
+def fit(pipeline: str, labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
     """The weights of a contact's probability, and how true it is."""
     labs, evidence, is_contact = [], [], []
-    for label, result in labelled("default", labels, data):
+    for label, result in labelled(pipeline, labels, data):
         deviations = None if result is None else result.get("deviations")
         if result is None or result.contact_mask is None or not isinstance(deviations, np.ndarray):
+            continue
+        if not result.contacts:
             continue
         mask, truth = result.contact_mask, _truth(label, result["mapping"])
         _, regions = cv2.connectedComponents(mask)
@@ -235,6 +237,8 @@ def fit(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
             labs.append(label.lab)
             is_contact.append(truth[regions == regions[y, x]].mean() > WITHIN)
         evidence.append(contact_evidence(result.contacts, mask, deviations))
+    if not evidence:
+        raise ConfigError(f"--data {data}: has none of the labelled recordings")
     yield from fitted(np.array(labs), np.concatenate(evidence), np.array(is_contact))
 
 
@@ -425,7 +429,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ]
         first = [label for label in labels if label.round == 1]
         if options.fit:
-            print(*fit(first, options.data), sep="\n")
+            print(*fit(options.pipelines[0], first, options.data), sep="\n")
             return 0
         if options.picture is not None:
             draw_worst(options.pipelines[0], first, options.data, options.picture)

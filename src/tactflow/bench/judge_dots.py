@@ -177,6 +177,8 @@ def fit(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
             evidences.append(found.evidence[judged])
             are_dots.append(which[judged] >= 0)
             labs.append(np.full(judged.sum(), name))
+    if not evidences:
+        raise ConfigError(f"--data {data}: has none of the labelled recordings")
     yield from fitted(*map(np.concatenate, (labs, evidences, are_dots)))
 
 

@@ -98,7 +98,7 @@ def darkness_error(session: Session, entry: DarknessEntry, scale: Scale) -> floa
 
 
 def _rings(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> list[Ring]:
-    """What a press says, from its middle outwards; nothing where no ball has such a contact."""
+    """Rings of a press, from the middle outwards; none if the contact is too large for the ball."""
     contact = press.radius * (scale.x * scale.y) ** 0.5
     if contact > TOO_LARGE * ball_radius:
         return []
@@ -148,13 +148,21 @@ def _curve(rings: Sequence[Ring], halves: tuple[int, ...]) -> tuple[Floats, Floa
 
 
 def _held_out(presses: Sequence[Sequence[Ring]]) -> Floats:
-    """(n,): RMS error of the depth of each press, mm, by a curve that has not seen it."""
+    """(n,): RMS error of the depth of each press, mm, by a curve that has not seen it.
+
+    It is judged as deep as the other presses reach; where that is less than a few rings, each of its halves
+    is judged by the other.
+    """
     errors = []
     for number, press in enumerate(presses):
         others = [ring for i, rings in enumerate(presses) if i != number for ring in rings]
-        # Each half of a single press by the other.
-        learned = [_curve(others, (0, 1))] * 2 if others else [_curve(press, (half,)) for half in (1, 0)]
-        halves = [_rms(press, DarknessModel(*curve), half) for half, curve in enumerate(learned)]
+        deepest = max((ring.depth for ring in others), default=0.0)
+        judged = [ring for ring in press if ring.depth <= deepest]
+        if len(judged) >= FEWEST_RINGS:
+            learned = [_curve(others, (0, 1))] * 2
+        else:
+            judged, learned = list(press), [_curve(press, (half,)) for half in (1, 0)]
+        halves = [_rms(judged, DarknessModel(*curve), half) for half, curve in enumerate(learned)]
         errors.append(float(np.sqrt(np.mean(np.square(halves)))))
     return np.array(errors)
 

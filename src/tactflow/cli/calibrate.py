@@ -108,7 +108,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--presses",
         type=positive,
         metavar="N",
-        help=f"end a live session after N presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE})",
+        help=f"end a live session after N presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE}, "
+        f"with --darkness {ENOUGH_OF_DARKNESS})",
     )
     option("--view", action="store_true", help="show the live page, which says where to press next")
     _add_kind(parser)
@@ -383,6 +384,10 @@ def _check_darkness(calibration: Calibration, then: DarknessEntry, session: Sess
         show([f"no presses today: to check the depth, press a ball of radius {radius} on the gel"])
         return True
     now, limit = darkness_error(session, then, calibration.scale), WORSE * then.stderr
+    if not np.isfinite(now):
+        count = len(session.presses)
+        show([f"none of the {count} presses today can be used: press a ball of radius {radius}"])
+        return False
     show([f"presses today, {len(session.presses)}: depth {now:.3f} mm RMS off; up to {limit:.3f} mm fits"])
     return now <= limit
 

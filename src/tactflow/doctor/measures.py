@@ -81,7 +81,7 @@ def spatial_noise(image: ColorImage) -> float:
     """Standard deviation of the noise of a single frame, grey levels; texture adds to it.
 
     image : (H, W, 3) uint8. The difference of two Laplacians cancels slopes and edges along the axes (J.
-    Immerkaer, "Fast noise variance estimation", Computer Vision and ColorImage Understanding 64, 1996).
+    Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding 64, 1996).
     """
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     return _calm_deviation(np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel), np.float32)) / 6.0
@@ -168,7 +168,7 @@ def jpeg_step(gray: Gray) -> float | None:
 
     gray : (H, W) float32, whole grey levels of one frame, not cropped. The coefficients of its blocks are
     multiples of the step (Z. Fan and R. L. de Queiroz, "Identification of bitmap compression history", IEEE
-    Trans. ColorImage Processing 12, 2003).
+    Trans. Image Processing 12, 2003).
     """
     height, width = (side - side % BLOCK for side in gray.shape)
     blocks = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)

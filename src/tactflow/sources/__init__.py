@@ -19,7 +19,7 @@ from tactflow.sources.base import Arrival, FrameReader, StampedReader
 from tactflow.sources.devices import Camera, CameraRequest, Stream
 from tactflow.sources.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_image, open_file
 from tactflow.sources.memory import MemoryFrames
-from tactflow.sources.paths import locate, split_prefix
+from tactflow.sources.paths import find_path, locate, split_prefix
 from tactflow.sources.watch import Watch, Watched
 from tactflow.system.files import is_utf8
 from tactflow.system.plugins import plugins
@@ -135,6 +135,7 @@ def _open_recording(spec: str, directory: Path | None, fps: float | None) -> Fra
     name, _, query = (spec, "", "") if locate(spec, directory) else spec.partition("?")
     is_pattern = glob.has_magic(name) and locate(name, directory) is None
     if name.lower().endswith(".mcap") and not query.startswith("topic=") and not is_pattern:
+        find_path(name, directory)
         problem = missing_packages()
         if problem is not None:
             raise SourceError(f"{spec}: {problem}")

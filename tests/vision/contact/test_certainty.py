@@ -60,12 +60,23 @@ def test_what_is_improbable_beside_another_does_not_count_and_is_reported() -> N
     small[48:64, 80:96] = 0
     grey = changed(50.0, 50.0)
     grey[1, 12:16, 20:24] = 1
-    assert np.array_equal(without_doubtful(with_probability(PARTS, MASK, grey), MASK), small)
+    probable, kept = without_doubtful(with_probability(PARTS, MASK, grey), MASK)
+    assert np.array_equal(kept, small)
+    assert [part.region_area for part in probable] == [PARTS[0].region_area]
     sure = with_probability(contact_parts(MASK, evidence="both"), MASK, changed(50.0, 50.0))
-    assert without_doubtful(sure, MASK) is MASK
+    assert without_doubtful(sure, MASK)[1] is MASK
     # One alone is kept, however improbable.
     alone = with_probability(contact_parts(small), small, changed(50.0, 0.01))
-    assert without_doubtful(alone, small) is small
+    assert without_doubtful(alone, small)[1] is small
+
+
+def test_the_contact_beside_a_large_shadow_has_its_own_probability() -> None:
+    shadow = changed(100.0, 1.0)
+    contact = tactflow.stage("hull").process(MASK, None, shadow)
+    first, second = contact.separate
+    assert first.region_area > second.region_area
+    assert first.probability < second.probability
+    assert (contact.center, contact.probability) == (second.center, second.probability)
 
 
 def test_the_reflection_of_a_contact_does_not_widen_its_hull() -> None:

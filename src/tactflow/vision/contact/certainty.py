@@ -28,7 +28,7 @@ LEAST_SHARE: Final = 1e-3
 
 
 def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32) -> Floats:
-    """What tells of each of several regions whether it is a contact.
+    """Evidence that each of several regions is a contact.
 
     Parameters
     ----------
@@ -67,20 +67,21 @@ def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
     ]
 
 
-def without_doubtful(parts: Sequence[Contact], mask: Mask) -> Mask:
-    """The mask without improbable regions, or itself if all count; the most probable one always does.
+def without_doubtful(parts: Sequence[Contact], mask: Mask) -> tuple[list[Contact], Mask]:
+    """Remove improbable regions, from the list and from the mask; the most probable one always stays.
 
-    parts : every region of the mask, (H, W) uint8, 0 or 255.
+    parts : every region of the mask, (H, W) uint8, 0 or 255, which is returned itself if all of them stay.
     """
     best = max(parts, key=_probability)
-    doubtful = [part for part in parts if part is not best and _probability(part) < DOUBTFUL]
-    if not doubtful:
-        return mask
+    probable = [part for part in parts if part is best or _probability(part) >= DOUBTFUL]
+    if len(probable) == len(parts):
+        return probable, mask
     kept = mask.copy()
-    for part in doubtful:
-        x, y = part.hull[0]
-        cv2.floodFill(kept, None, (int(x), int(y)), (0.0,), flags=8)
-    return kept
+    for part in parts:
+        if not any(part is other for other in probable):
+            x, y = part.hull[0]
+            cv2.floodFill(kept, None, (int(x), int(y)), (0.0,), flags=8)
+    return probable, kept
 
 
 def _probability(part: Contact) -> float:

@@ -42,8 +42,8 @@ from tactflow.vision.contact.resolution import draw_level, window_mask
 ContactMethod = Literal["noise", "colour"]
 
 CONNECTED: Final = 0.25
-"""Part of the threshold, squared deviations, from which a cell belongs to a contact beside it: half the
-threshold in standard deviations. Chosen by hand."""
+"""Low hysteresis threshold, as a fraction of the detection threshold on squared deviations: half of it in
+standard deviations. Chosen by hand."""
 STAY: Final = 0.7
 """Part of the threshold, in standard deviations, that is enough to stay in contact. Chosen by hand."""
 FORGET: Final = 0.96

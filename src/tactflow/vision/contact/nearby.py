@@ -13,7 +13,7 @@ from tactflow.vision.compiled import kernel
 OUTER: Final = 0.55
 """Fraction of the largest change nearby at which a change of slope is cut. Lower takes in more of the
 surroundings of a contact and of gel that wrinkles; higher opens the ring where the light is faint. Chosen on
-mini_ball, handmade_dots, gelslim_ball and the simulator: 0.4 to 0.5 overlap as well within 0.04."""
+mini_ball, handmade_dots, gelslim_ball and the simulator: 0.5 to 0.6 overlap as well within 0.02."""
 
 FAINT: Final = 0.3
 """Fraction of the largest change of the whole contact that the largest one nearby counts for at least.

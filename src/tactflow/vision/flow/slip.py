@@ -104,6 +104,9 @@ class SlipTest:
         if now is None:
             self.reset()
             return None
+        if self._start is not None and self._start.share.shape != now.share.shape:
+            # Markers that joined have changed the grid of the field.
+            self.reset()
         start = self._start
         if start is None or abs(now.area - start.area) > GROWN * start.area:
             start = self._start = now
