@@ -236,6 +236,17 @@ def edges(session: Session, names: list[str], base: Calibration, data: Path) -> 
     )
 
 
+def simulated_calibration(folder: Path) -> Path:
+    """The calibration file of the simulated sensor in a folder, made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    calibration = folder / "calibration" / "main.yaml"
+    if not calibration.exists():
+        command = [sys.executable, "-m", "tactflow", "calibrate", "--from", "sim:ball?frames=600"]
+        command += ["--pitch", "1.724", "--ball-radius", "2.375", "--fresh"]
+        subprocess.run(command, cwd=folder, check=True)
+    return calibration
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="judge the pose of objects")
@@ -244,12 +255,7 @@ def main() -> None:
     parser.add_argument("--only", help="rows whose name has this in it")
     args = parser.parse_args()
     keep = args.keep or Path(tempfile.mkdtemp())
-    keep.mkdir(parents=True, exist_ok=True)
-    calibration = keep / "calibration" / "main.yaml"
-    if not calibration.exists():
-        command = [sys.executable, "-m", "tactflow", "calibrate", "--from", "sim:ball?frames=600"]
-        command += ["--pitch", "1.724", "--ball-radius", "2.375", "--fresh"]
-        subprocess.run(command, cwd=keep, check=True)
+    calibration = simulated_calibration(keep)
     print(f"{'':24} frames  lost      mm     deg   seen  cover         ms")
     for label, query in SCENARIOS.items():
         if not args.only or args.only in label:

@@ -10,8 +10,6 @@ light in which a channel saturates: angle between its faces, of the gel's surfac
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tactflow
+from benchmarks.pose import simulated_calibration
 from tactflow.message.result import Result
 from tactflow.sim import light, shapes
 from tactflow.sim.gel import MM
@@ -114,12 +113,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder with the calibration of an earlier run")
     args = parser.parse_args()
     keep = args.keep or Path(tempfile.mkdtemp())
-    keep.mkdir(parents=True, exist_ok=True)
-    calibration = keep / "calibration" / "main.yaml"
-    if not calibration.exists():
-        command = [sys.executable, "-m", "tactflow", "calibrate", "--from", "sim:ball?frames=600"]
-        command += ["--pitch", "1.724", "--ball-radius", "2.375", "--fresh"]
-        subprocess.run(command, cwd=keep, check=True)
+    calibration = simulated_calibration(keep)
     for name in PLACES:
         print(f"{name + ' at the border':24} {at_border(name, calibration)}", flush=True)
     usual = light.LIGHTS["photometric"].level

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import MAD_TO_SIGMA, Floats32
 
 COLUMNS: Final = 40
 """Cells across a picture, about. Chosen by hand: a cell is smaller than most contacts."""
@@ -287,7 +287,7 @@ class Settling:
         """Where the light of a state ends, and how far from there it is still the same: (channels,) each."""
         gains = np.array([self._gains[i] for i in state[-self._calm :]])
         level = np.median(gains, axis=0)
-        spread = 1.4826 * np.median(np.abs(gains - level), axis=0)
+        spread = np.float32(MAD_TO_SIGMA) * np.median(np.abs(gains - level), axis=0)
         return level, np.maximum(np.float32(STEADY), np.float32(SCATTER) * spread)
 
     def _calm_frames(self, state: list[int]) -> list[int]:
