@@ -45,7 +45,7 @@ def session(*presses: Press) -> Session:
 def test_one_press_of_a_ball_gives_the_depth_of_others_within_the_stated_error() -> None:
     fitted = fit_darkness(session(pressed(1, 0.6)), SCALE, RADIUS)
     assert fitted.found.stderr < 0.03
-    surface, rest = DarkSurface(fitted.model, SCALE, fitted.found.stderr), Rest(GEL)
+    surface, rest = DarkSurface(fitted.found.model(), SCALE, fitted.found.stderr), Rest(GEL)
     for number, depth in enumerate((0.3, 0.4, 0.55), 2):
         press = pressed(number, depth, (60.0, 70.0))
         found = surface.depth(press.image, rest, press.mask)
@@ -59,8 +59,10 @@ def test_one_press_of_a_ball_gives_the_depth_of_others_within_the_stated_error()
 def test_deeper_than_any_press_the_error_is_not_known() -> None:
     fitted = fit_darkness(session(pressed(1, 0.6)), SCALE, RADIUS)
     deeper = pressed(2, 0.8)
-    found = DarkSurface(fitted.model, SCALE, fitted.found.stderr).depth(deeper.image, Rest(GEL), deeper.mask)
-    assert found.greatest == pytest.approx(fitted.model.deepest)
+    found = DarkSurface(fitted.found.model(), SCALE, fitted.found.stderr).depth(
+        deeper.image, Rest(GEL), deeper.mask
+    )
+    assert found.greatest == pytest.approx(fitted.found.model().deepest)
     assert (found.greatest_stderr, found.volume_stderr) == (None, None)
 
 

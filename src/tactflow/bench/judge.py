@@ -101,8 +101,7 @@ def compare(label: FrameLabel, result: Result) -> Judged:
     judged = Judged(label.lab, label.recording, bool(label.contact), contact is not None)
     if not label.outlines:
         return judged
-    shape = mapping.size[::-1]
-    truth = metrics.filled_polygons([mapping.to_processed(outline) for outline in label.outlines], shape)
+    shape, truth = mapping.size[::-1], _truth(label, mapping)
     if contact is None or result.contact_mask is None:
         return replace(judged, hull=0.0, region=0.0)
     drawn = contact_geometry(truth)
@@ -211,8 +210,7 @@ def _tile(label: FrameLabel, result: Result, text: str) -> NDArray[np.uint8]:
     factor = TILE / max(image.shape[:2])
     small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     found = [] if result.contact is None else [result.contact.hull]
-    drawn = [mapping.to_processed(outline) for outline in label.outlines or ()]
-    for polygons, colour in ((found, RED), (drawn, GREEN)):
+    for polygons, colour in ((found, RED), (_outlines(label, mapping), GREEN)):
         corners = [np.rint(np.asarray(polygon) * factor).astype(np.int32) for polygon in polygons]
         cv2.polylines(small, corners, True, colour)
     cv2.putText(small, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, WHITE, 1, cv2.LINE_AA)
@@ -235,17 +233,21 @@ def fit(pipeline: str, labels: Sequence[FrameLabel], data: Path) -> Iterator[str
         for part in result.contacts:
             x, y = part.hull[0].astype(int)
             labs.append(label.lab)
-            is_contact.append(truth[regions == regions[y, x]].mean() > WITHIN)
+            is_contact.append(np.mean(truth[regions == regions[y, x]] > 0) > WITHIN)
         evidence.append(contact_evidence(result.contacts, mask, deviations))
     if not evidence:
         raise ConfigError(f"--data {data}: has none of the labelled recordings")
     yield from fitted(np.array(labs), np.concatenate(evidence), np.array(is_contact))
 
 
-def _truth(label: FrameLabel, mapping: PixelMapping) -> NDArray[np.bool_]:
-    """(H, W): the outlined region, in processed pixels."""
-    outlines = [mapping.to_processed(outline) for outline in label.outlines or ()]
-    return np.asarray(metrics.filled_polygons(outlines, mapping.size[::-1]) > 0, np.bool_)
+def _outlines(label: FrameLabel, mapping: PixelMapping) -> list[NDArray[np.float64]]:
+    """The outlines of a label, processed px, (n, 2) each."""
+    return [mapping.to_processed(outline) for outline in label.outlines or ()]
+
+
+def _truth(label: FrameLabel, mapping: PixelMapping) -> NDArray[np.uint8]:
+    """(H, W): the outlined region of a processed frame, not 0 inside."""
+    return metrics.filled_polygons(_outlines(label, mapping), mapping.size[::-1])
 
 
 def _run(label: FrameLabel) -> tuple[str, str]:

@@ -43,11 +43,10 @@ class Ring(NamedTuple):
 class Darkness:
     """A fit.
 
-    model : depth from darkening. found : numbers for the calibration file. kept : (n,) bool, which presses
+    found : numbers for the calibration file. kept : (n,) bool, which presses
     were used. misfit : (n,) float64, RMS error of the depth of each press, mm; infinite where it is unusable.
     """
 
-    model: DarknessModel
     found: DarknessEntry
     kept: NDArray[np.bool_]
     misfit: Floats
@@ -86,7 +85,7 @@ def fit_darkness(session: Session, scale: Scale, ball_radius: float) -> Darkness
         depth=depth.tolist(),
         stderr=float(np.sqrt(np.mean(errors**2))),
     )
-    return Darkness(found.model(), found, kept, misfit)
+    return Darkness(found, kept, misfit)
 
 
 def darkness_error(session: Session, entry: DarknessEntry, scale: Scale) -> float:
@@ -103,6 +102,7 @@ def _rings(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> list[R
     if contact > TOO_LARGE * ball_radius:
         return []
     contact = min(contact, ball_radius)
+    fall = float(np.sqrt(ball_radius**2 - contact**2))
     window = surroundings(press.mask, rest.window).window
     light = rest.around(press.image, press.mask).light
     darkening = -colour_change(press.image, rest, window, light).mean(axis=2)
@@ -118,7 +118,6 @@ def _rings(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> list[R
         if min(half.size for half in halves) == 0:
             continue
         ball = np.sqrt(ball_radius**2 - distance[ring] ** 2).mean()
-        fall = float(np.sqrt(ball_radius**2 - contact**2))
         rings.append(Ring(float(ball) - fall, (float(halves[0].mean()), float(halves[1].mean()))))
     return rings
 

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32, check_color_image
 from tactflow.vision.compiled import kernel
+from tactflow.vision.contact.background import Derived
 from tactflow.vision.contact.background_kernels import weigh_change
 from tactflow.vision.contact.components import WIDE_DEVIATION
-from tactflow.vision.contact.illumination import IlluminationModel, positions
+from tactflow.vision.contact.illumination import positions
 
 TILES: Final = 24
 """Tiles along the longer side of a frame: a contact of 4 % of its width fills one. A smaller
@@ -206,23 +207,16 @@ class _LightTest:
     def __init__(self, untouched: Floats32, repeatability: float, tint: float) -> None:
         slopes = [_slopes(plane) for plane in untouched]
         steady = NOISE**2 + STRAY**2 * np.square(slopes).sum(axis=1)
-        variance = np.asarray(steady + (repeatability * untouched) ** 2, np.float32)
-        self._untouched = untouched
-        self._weight = np.asarray(1 / np.sqrt(variance), np.float32)
-        length = np.square(untouched * self._weight).sum(axis=0) + np.float32(1e-6)
-        self._brightness = np.asarray(1 / length, np.float32)
-        tinted = np.asarray(steady + (tint * untouched) ** 2, np.float32)
-        self._colour = np.asarray((variance / tinted).min(axis=0), np.float32)
-        self._lamps = IlluminationModel(untouched, variance)
+        self._known = Derived.of(untouched, steady, repeatability, tint)
         self._before = np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)
 
     def departure(self, light: Floats32) -> Floats32:
         """(rows, columns) float32: how far the light of a frame, (3, rows, columns), departs."""
         _, high, wide = light.shape
         planes = np.empty((3, high, wide), np.float32)
-        model = self._untouched, self._weight, self._brightness, self._colour
-        places = positions(wide), positions(high)
-        weigh_change(light, self._lamps.fit(light), *places, *model, *self._before, *planes)
+        known, places = self._known, (positions(wide), positions(high))
+        model = known.mean, known.weight, known.brightness, known.colour_factor
+        weigh_change(light, known.illumination.fit(light), *places, *model, *self._before, *planes)
         return np.asarray(np.sqrt(planes[2] / np.float32(WIDE_DEVIATION)), np.float32)
 
 

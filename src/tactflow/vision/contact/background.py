@@ -82,8 +82,8 @@ class _Untouched:
 
 
 @dataclass(frozen=True, slots=True)
-class _Derived:
-    """What follows from the frames learned: (3, h, w) float32 of cells.
+class Derived:
+    """What follows from what is known of the untouched gel: (3, h, w) float32 of cells.
 
     weight : one over the standard deviation. brightness : (h, w), one over the squared length of the mean, so
     weighed. colour_factor : (h, w), how much more a change of colour counts than one of brightness.
@@ -94,6 +94,34 @@ class _Derived:
     weight: Floats32
     brightness: Floats32
     colour_factor: Floats32
+
+    @classmethod
+    def of(
+        cls,
+        mean: NDArray[np.floating],
+        steady: NDArray[np.floating],
+        repeatability: float,
+        tint: float,
+        gel: NDArray[np.bool_] | None = None,
+    ) -> Derived:
+        """mean : grey levels. steady : variance of what does not grow with the light, of the same shape.
+        repeatability, tint : as of `ContactDetector`. gel : (h, w) bool, cells that show it; None: all do.
+        """
+        variance = steady + (repeatability * mean) ** 2
+        illumination = IlluminationModel(mean, np.asarray(variance, np.float32), gel)
+        weight = 1 / np.sqrt(variance)
+        # One factor for all channels, so that a change in proportion to the brightness is none of colour.
+        factor = (variance / (steady + (tint * mean) ** 2)).min(axis=0)
+        length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
+        if gel is not None:
+            weight = weight * gel
+        return cls(
+            illumination=illumination,
+            mean=np.ascontiguousarray(mean, np.float32),
+            weight=np.asarray(weight, np.float32),
+            brightness=np.asarray(1 / length**2, np.float32),
+            colour_factor=np.asarray(factor, np.float32),
+        )
 
 
 class BackgroundModel:
@@ -136,7 +164,7 @@ class BackgroundModel:
         self._gel = _gel_cells(half, valid)
         self._frames = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
-        self._known: _Derived | None = None
+        self._known: Derived | None = None
         self._untouched: dict[int, _Untouched] = {}
 
     def add(self, image: NDArray[np.uint8]) -> None:
@@ -225,27 +253,13 @@ class BackgroundModel:
         change_strength(scaled, inside.view(np.uint8), *response, strength, brightness)
         return WindowChange(strength, brightness)
 
-    def _derived(self) -> _Derived:
+    def _derived(self) -> Derived:
         if self._known is not None:
             return self._known
         mean, count = self._mean, self._frames
         noise = (PRIOR_FRAMES * self._noise**2 + self._squares) / (PRIOR_FRAMES + count - 1)
         steady = noise * (1 + 1 / count) + (self._shift / CELL * _steepness(mean)) ** 2
-        variance = steady + (self._repeatability * mean) ** 2
-        illumination = IlluminationModel(mean, np.asarray(variance, np.float32), self._gel)
-        weight = 1 / np.sqrt(variance)
-        # One factor for all channels, so that a change in proportion to the brightness is none of colour.
-        factor = (variance / (steady + (self._tint * mean) ** 2)).min(axis=0)
-        length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
-        if self._gel is not None:
-            weight = weight * self._gel
-        self._known = _Derived(
-            illumination=illumination,
-            mean=np.ascontiguousarray(mean, np.float32),
-            weight=np.asarray(weight, np.float32),
-            brightness=np.asarray(1 / length**2, np.float32),
-            colour_factor=np.asarray(factor, np.float32),
-        )
+        self._known = Derived.of(mean, steady, self._repeatability, self._tint, self._gel)
         return self._known
 
     def _compared_with(self) -> dict[int, _Untouched]:

@@ -12,35 +12,35 @@ from tactflow.vision.compiled import kernel
 
 OUTER: Final = 0.55
 """Fraction of the largest change nearby at which a change of slope is cut. Lower takes in more of the
-surroundings of a contact and of gel that wrinkles; higher opens the ring where the light is faint. Chosen on
-mini_ball, handmade_dots, gelslim_ball and the simulator: 0.5 to 0.6 overlap as well within 0.02."""
+surroundings of a contact and of gel that wrinkles; higher opens the ring where the light is faint. On
+outlines of fifteen labs 0.5 to 0.6 overlap as well within 0.02 (`tactflow.bench.judge`)."""
 
 FAINT: Final = 0.3
 """Fraction of the largest change of the whole contact that the largest one nearby counts for at least.
 Chosen by hand."""
 
 
-def largest_nearby(values: Floats32, part: float = 1.0) -> Floats32:
+def largest_nearby(values: Floats32) -> Floats32:
     """(h, w): the largest value around, smoothed; no less than `FAINT` of the largest anywhere.
 
-    "Around" reaches as far as the radius of a disc of as many pixels as have clearly changed, or a part of
-    it: it holds a side of the contact, but not its other end.
+    "Around" reaches as far as the radius of a disc of as many pixels as have clearly changed: it holds a side
+    of the contact, but not its other end.
     """
     high, wide = values.shape
     rows, columns = -(-high // 2), -(-wide // 2)
     coarse, nearby = np.empty((rows, columns), np.float32), np.empty((2 * rows, 2 * columns), np.float32)
-    reach, least = halve_smoothed(values, part, coarse)
+    reach, least = halve_smoothed(values, coarse)
     spread_largest(coarse, reach, least, nearby)
     return nearby[:high, :wide]
 
 
-@kernel("Tuple((int64, float64))(float32[:, ::1], float64, float32[:, ::1])")
-def halve_smoothed(values: Floats32, part: float, halved: Floats32) -> tuple[int, float]:
+@kernel("Tuple((int64, float64))(float32[:, ::1], float32[:, ::1])")
+def halve_smoothed(values: Floats32, halved: Floats32) -> tuple[int, float]:
     """Means over 3 x 3 pixels, and over 2 x 2 of them.
 
     Returns how far "around" reaches, two pixels, and the least that counts.
 
-    values : (h, w). part : of the radius. halved : (h / 2, w / 2), rounded up, filled; the last line counts
+    values : (h, w). halved : (h / 2, w / 2), rounded up, filled; the last line counts
     twice then.
     """
     (high, wide), (rows, columns) = values.shape, halved.shape
@@ -71,7 +71,7 @@ def halve_smoothed(values: Floats32, part: float, halved: Floats32) -> tuple[int
     for y in range(high):
         for x in range(wide):
             count += values[y, x] > limit
-    return round(part * math.sqrt(count / math.pi) / 2), FAINT * peak
+    return round(math.sqrt(count / math.pi) / 2), FAINT * peak
 
 
 @kernel("void(float32[:, ::1], int64, float64, float32[:, ::1])")
