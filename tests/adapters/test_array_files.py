@@ -126,14 +126,14 @@ def black(count: int, markers: int = 0) -> list[Result]:
 def test_what_is_missing_differs_from_every_number_and_black_frames_are_frames(
     kind: type[Hdf5 | Zarr], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Many chunks, the last of which is not full.
-    monkeypatch.setattr(array_files, "CHUNK_ROWS", 4)
+    # Several chunks, the last of which is not full.
+    monkeypatch.setattr(array_files, "ROWS", 4)
     path = tmp_path / ("black.h5" if kind is Hdf5 else "black.zarr")
     file = kind(path)
     assert write(file, "black", [*black(5), *black(3, 2), *black(5, 3)]) == 13
     file.close()
     found = opened(path)
-    assert found["frames"].chunks[0] == 4
+    assert found["t"].chunks[0] == 4
     assert found["markers_position"].shape == (13, 3, 2)
     assert np.isfinite(found["markers_position"][:, :, 0]).sum(1).tolist() == [0] * 5 + [2] * 3 + [3] * 5
     assert found["markers_status"][6].tolist() == [0, 0, 255]

@@ -29,7 +29,6 @@ from tactflow.ports import (
 )
 from tactflow.system.extras import missing
 from tactflow.system.files import expanded
-from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import Depth, Features, Force, Markers
 
@@ -38,9 +37,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tactflow")
 
-Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
-_READ: Final = "Array(uint8, 2, 'C', readonly=True)"
 Side = int | None
 """Length of an axis; None where only a frame tells, or any will do."""
 
@@ -308,7 +305,11 @@ class Network(Stage):
 
 
 class _Geometry(NamedTuple):
-    """Where a picture lies in what the network sees: its own size, and the part that it fills. px."""
+    """Where a picture lies in the network's input, px.
+
+    size : of the picture. inner : of the picture after resizing. corner : its upper left corner in the input.
+    outer : size of the input.
+    """
 
     size: tuple[int, int]
     inner: tuple[int, int]
@@ -317,17 +318,15 @@ class _Geometry(NamedTuple):
 
 
 class _Feed:
-    """Makes what one input of the network gets, in memory that the next frame uses again."""
+    """Prepares one input of the network."""
 
     def __init__(self, params: InputParams) -> None:
         self.params = params
-        self._past: deque[NDArray[Any]] = deque(maxlen=(params.frames - 1) * params.stride + 1)
+        self._past: deque[Floats] = deque(maxlen=(params.frames - 1) * params.stride + 1)
         self._where = ""
         self._sides: tuple[Side, ...] = ()
         self._size = params.size
         self._dtype: type[Any] = np.float32
-        self._shape: tuple[int, ...] = ()
-        self._background: Untouched | None = None
 
     def fit(self, where: str, shape: Sequence[Any], dtype: str) -> None:
         """Compare with the input of the file. Raises StageError with both shapes if they do not fit."""
@@ -342,127 +341,88 @@ class _Feed:
             height, width = self._sides[-2:] if p.layout == "chw" else self._sides[-3:-1]
             self._size = None if height is None or width is None else (width, height)
         width, height = self._size or (None, None)
-        self._compare(p.shape(p.channels, height, width))
+        self._check_shape(p.shape(p.channels, height, width))
         if p.channels is not None:
-            self._coefficients(p.channels - 2 * p.coordinates)
+            self._check_normalisation(p.channels - 2 * p.coordinates)
 
-    def _compare(self, shape: tuple[Side, ...]) -> None:
+    def _check_shape(self, shape: tuple[Side, ...]) -> None:
         if not _agree(self._sides, shape):
             raise StageError(
                 f"{self._where} takes {_shown(self._sides)}, but the settings give {_shown(shape)} "
                 "(without a batch); see port, size, frames and layout of this input"
             )
 
+    def _check_normalisation(self, channels: int) -> None:
+        for name, numbers in (("mean", self.params.mean), ("std", self.params.std)):
+            if len(numbers) not in (1, channels):
+                raise StageError(f"{self._where}: {name} has {len(numbers)} numbers for {channels} channels")
+
     def reset(self) -> None:
         """Forget earlier frames."""
         self._past.clear()
 
     def __call__(self, value: Any, background: Untouched | None) -> NDArray[Any]:
-        """What the network gets of this frame."""
+        """The input tensor for this frame. value : of the port. background : the untouched gel."""
         p, array = self.params, _array(value)
-        if array.shape != self._shape:
-            self._prepare(array)
+        size = (array.shape[1], array.shape[0])
+        self._geometry = _placed(size, self._size or size, p.pad)
+        self._past.append(self._arranged(self._planes(array, background)))
+        newest = len(self._past) - 1
+        frames = [self._past[max(0, newest - back * p.stride)] for back in range(p.frames)]
+        frames = frames if p.newest_first else frames[::-1]
+        in_time = p.join == "time"
+        tensor = np.stack(frames) if in_time else np.concatenate(frames, 0 if p.layout == "chw" else -1)
+        self._check_shape(tensor.shape)
+        if len(self._sides) > tensor.ndim:
+            tensor = tensor[None]
+        if self._dtype is np.uint8:
+            tensor = np.clip(np.rint(tensor), 0, 255)
+        return tensor.astype(self._dtype, copy=False)
+
+    def _planes(self, array: NDArray[Any], background: Untouched | None) -> list[Floats]:
+        """The channels of the network's picture, (h, w) float32 each, normalised."""
+        p, parts = self.params, [self._resized(array)]
         if p.background != "none":
             if background is None or background.shape != array.shape:
                 shape = None if background is None else background.shape
                 raise StageError(f"{self._where}: required an untouched gel of {array.shape}, got {shape}")
-            if background is not self._background:
-                self._background, self._rest = background, self._resized(background)
-        oldest = self._past[0] if len(self._past) == self._past.maxlen and self._owned else None
-        self._past.append(self._resized(array, oldest))
-        places = [max(0, len(self._past) - 1 - back * p.stride) for back in range(p.frames)]
-        for place, part in zip(places if p.newest_first else places[::-1], self._parts, strict=True):
-            self._write(self._past[place], part)
-        if self._dtype is np.float32:
-            return self._tensor
-        if self._dtype is np.uint8:
-            return np.clip(np.rint(self._tensor), 0, 255).astype(np.uint8)
-        return self._tensor.astype(self._dtype)
+            rest = self._resized(background)
+            is_difference = p.background != "concat"
+            parts = [cv2.subtract(*parts, rest, dtype=cv2.CV_32F)] if is_difference else [*parts, rest]
+        planes = [plane for part in parts for plane in cv2.split(part)]
+        self._check_normalisation(len(planes))
+        scale = p.scale
+        if p.background == "subtract_half":
+            planes = [np.clip(_linear(plane, scale, 0.5), 0, 1) for plane in planes]
+            scale = 1.0
+        mean, std = np.resize(p.mean, len(planes)), np.resize(p.std, len(planes))
+        return [_linear(plane, scale / s, -m / s) for plane, m, s in zip(planes, mean, std, strict=True)]
 
-    def _prepare(self, array: NDArray[Any]) -> None:
-        """Make room for frames like this one."""
-        p, (height, width) = self.params, array.shape[:2]
-        self._geometry = _placed((width, height), self._size or (width, height), p.pad)
-        self.reset()
-        self._background, self._shape = None, array.shape
-        resized = self._resized(array)
-        # Whether resized pictures are ours to write to.
-        self._owned = resized is not array
-        height, width, count = np.atleast_3d(resized).shape
-        channels = count * (2 if p.background == "concat" else 1)
-        shape = p.shape(channels + 2 * p.coordinates, height, width)
-        self._compare(shape)
-        affine = self._coefficients(channels)
-        groups = [affine[:, first : first + count] for first in range(0, channels, count)]
-        # In the order of the picture, which is blue, green, red.
-        self._is_reversed = p.colour == "rgb" and count == 3
-        self._affines = [(group[:, ::-1] if self._is_reversed else group).copy() for group in groups]
-        self._rest = self._nothing = np.zeros(resized.shape, resized.dtype)
-        batch = (1,) if len(self._sides) > len(shape) else ()
-        self._tensor = np.empty((*batch, *(side or 0 for side in shape)), np.float32)
-        axes = (-1, height, width) if p.layout == "chw" else (height, width, -1)
-        self._parts = self._tensor.reshape(p.frames, *axes)
-        planes = np.empty((1, channels + 2 * p.coordinates, height, width), np.float32)
-        self._planes = planes = self._parts if p.layout == "chw" else planes
-        if p.coordinates:
-            planes[:, -2] = np.arange(width, dtype=np.float32) / width
-            planes[:, -1] = np.arange(height, dtype=np.float32)[:, None] / height
+    def _arranged(self, planes: list[Floats]) -> Floats:
+        """The channels, and coordinates if asked for, along the axes of `layout`."""
+        height, width = planes[0].shape
+        if self.params.coordinates:
+            across = np.arange(width, dtype=np.float32) / np.float32(width)
+            down = np.arange(height, dtype=np.float32) / np.float32(height)
+            planes = [*planes, *np.meshgrid(across, down)]
+        if self.params.layout == "chw":
+            return np.stack(planes)
+        values = np.atleast_3d(cv2.merge(planes))
+        return values.reshape(height * width, -1) if self.params.layout == "pixels" else values
 
-    def _coefficients(self, count: int) -> Floats:
-        """(4, count) of the network's channels: factor, offset, least and greatest value."""
-        p = self.params
-        for name, numbers in (("mean", p.mean), ("std", p.std)):
-            if len(numbers) not in (1, count):
-                raise StageError(f"{self._where}: {name} has {len(numbers)} numbers for {count} channels")
-        half = p.background == "subtract_half"
-        bounds = (0.0, 1.0) if half else (-np.inf, np.inf)
-        mean, std = np.resize(p.mean, count), np.resize(p.std, count)
-        factor = np.full(count, p.scale) / std
-        return np.array([factor, *((value - mean) / std for value in (0.5 * half, *bounds))], np.float32)
-
-    def _resized(self, array: NDArray[Any], into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """A picture in the network's size, grey if asked for. into : memory that may be used."""
+    def _resized(self, array: NDArray[Any]) -> NDArray[Any]:
+        """The array at the network's size, with the colours in its order."""
         p, geometry = self.params, self._geometry
-        given = array
-        if p.colour == "grey" and array.ndim == 3 and array.shape[2] == 3:
-            array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY)
+        if array.ndim == 3 and array.shape[2] == 3 and p.colour != "bgr":
+            array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY if p.colour == "grey" else cv2.COLOR_BGR2RGB)
         if geometry.inner != geometry.size:
             method = cv2.INTER_AREA if p.interpolation == "area" else cv2.INTER_LINEAR
-            array = cv2.resize(array, geometry.inner, into, interpolation=method)
+            array = cv2.resize(array, geometry.inner, interpolation=method)
         if geometry.inner != geometry.outer:
             (left, top), (width, height) = geometry.corner, geometry.inner
             right, bottom = geometry.outer[0] - left - width, geometry.outer[1] - top - height
-            array = cv2.copyMakeBorder(array, top, bottom, left, right, cv2.BORDER_CONSTANT, into)
-        # Others may write to theirs before it is needed again.
-        return array.copy() if array is given and p.frames > 1 else array
-
-    def _write(self, picture: NDArray[Any], part: Floats) -> None:
-        """Fill the part of the tensor that belongs to one frame."""
-        p = self.params
-        if p.layout == "pixels" and part.shape[2] == 5 and p.coordinates and picture.dtype == np.uint8:
-            _pixels(*_lines(picture, self._rest), self._is_reversed, self._affines[0], part)
-            return
-        planes = part if p.layout == "chw" else self._planes[0]
-        rest = self._nothing if p.background == "concat" else self._rest
-        for index, affine in enumerate(self._affines):
-            count = affine.shape[1]
-            own = planes[index * count : (index + 1) * count]
-            self._convert(self._rest if index else picture, rest, affine, own)
-        if p.layout != "chw":
-            cv2.merge(list(planes), part)
-
-    def _convert(self, picture: NDArray[Any], rest: NDArray[Any], affine: Floats, planes: Floats) -> None:
-        """Fill planes (C, h, w) with (picture - rest) * factor + offset, within its limits."""
-        if picture.dtype == np.uint8 and len(planes) == 3:
-            _planes(*_lines(picture, rest), self._is_reversed, affine, planes)
-            return
-        planes = planes[::-1] if self._is_reversed else planes
-        channels = zip(cv2.split(picture), cv2.split(rest), affine.T, strict=True)
-        for plane, (channel, less, own) in zip(planes, channels, strict=True):
-            factor, offset, least, greatest = map(float, own)
-            cv2.addWeighted(channel, factor, less, -factor, offset, plane, cv2.CV_32F)
-            if np.isfinite(least):
-                np.clip(plane, least, greatest, plane)
+            array = cv2.copyMakeBorder(array, top, bottom, left, right, cv2.BORDER_CONSTANT)
+        return array
 
     def picture(self, array: Floats, channels: int) -> Floats:
         """(H, W, channels) float32: an output of the size of the network's picture, at that of the port."""
@@ -481,71 +441,18 @@ class _Feed:
         return inner.reshape(*geometry.size[::-1], channels)
 
 
-def _lines(picture: NDArray[Any], rest: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """(h, 3 w) each."""
-    return picture.reshape(len(picture), -1), rest.reshape(len(rest), -1)
+def _linear(plane: NDArray[Any], factor: float, offset: float) -> Floats:
+    """plane * factor + offset as float32."""
+    return np.asarray(cv2.addWeighted(plane, factor, plane, 0.0, offset, dtype=cv2.CV_32F), np.float32)
 
 
 def _placed(size: tuple[int, int], outer: tuple[int, int], pad: bool) -> _Geometry:
-    """Where a picture of a size lies in what the network sees. pad : whether it keeps its aspect."""
+    """Where a picture of a size lies in the network's input. pad : whether it keeps its aspect."""
     inner = outer
     if pad:
         ratio = min(outer[0] / size[0], outer[1] / size[1])
         inner = max(1, round(size[0] * ratio)), max(1, round(size[1] * ratio))
     return _Geometry(size, inner, ((outer[0] - inner[0]) // 2, (outer[1] - inner[1]) // 2), outer)
-
-
-@kernel(f"void({_READ}, {_READ}, boolean, float32[:, ::1], float32[:, :, ::1])")
-def _planes(picture: Bytes, rest: Bytes, rgb: bool, affine: Floats, planes: Floats) -> None:
-    """Fill `planes`, (3, h, w), from `picture` and `rest`, (h, 3 w). affine : as of `_Feed._coefficients`."""
-    change = np.empty(picture.shape[1], np.int16)
-    first, last = (2, 0) if rgb else (0, 2)
-    for y in range(picture.shape[0]):
-        _line(picture[y], rest[y], affine, change, planes[first, y], planes[1, y], planes[last, y])
-
-
-@kernel(f"void({_READ}, {_READ}, boolean, float32[:, ::1], float32[:, :, ::1])")
-def _pixels(picture: Bytes, rest: Bytes, rgb: bool, affine: Floats, pixels: Floats) -> None:
-    """Fill `pixels`, (h, w, 5): the three colors as in `_planes`, then x / w and y / h."""
-    height, width, _ = pixels.shape
-    change, line = np.empty(picture.shape[1], np.int16), np.empty((4, width), np.float32)
-    first, last = (2, 0) if rgb else (0, 2)
-    for x in range(width):
-        line[3, x] = np.float32(x) / np.float32(width)
-    for y in range(height):
-        _line(picture[y], rest[y], affine, change, line[first], line[1], line[last])
-        row, down = pixels[y].reshape(-1), np.float32(y) / np.float32(height)
-        # All five, for a gap would keep whole vectors from being written.
-        for x in range(width):
-            row[5 * x] = line[0, x]
-            row[5 * x + 1] = line[1, x]
-            row[5 * x + 2] = line[2, x]
-            row[5 * x + 3] = line[3, x]
-            row[5 * x + 4] = down
-
-
-@helper
-def _line(
-    picture: Bytes,
-    rest: Bytes,
-    affine: Floats,
-    change: NDArray[np.int16],
-    blue: Floats,
-    green: Floats,
-    red: Floats,
-) -> None:
-    """Fill one line, (w,), of each color. change : (3 w,), memory that stays in the cache."""
-    for x in range(change.size):
-        change[x] = np.int16(picture[x]) - np.int16(rest[x])
-    factor, offset, least, greatest = affine[0], affine[1], affine[2], affine[3]
-    f0, f1, f2 = factor[0], factor[1], factor[2]
-    o0, o1, o2 = offset[0], offset[1], offset[2]
-    l0, l1, l2 = least[0], least[1], least[2]
-    g0, g1, g2 = greatest[0], greatest[1], greatest[2]
-    for x in range(blue.size):
-        blue[x] = min(max(np.float32(change[3 * x]) * f0 + o0, l0), g0)
-        green[x] = min(max(np.float32(change[3 * x + 1]) * f1 + o1, l1), g1)
-        red[x] = min(max(np.float32(change[3 * x + 2]) * f2 + o2, l2), g2)
 
 
 def _ports(name: str, params: OutputParams) -> list[Port]:
