@@ -12,10 +12,7 @@ from tactflow.cli.main import main
 from tactflow.doctor import Sensor, measure_together, rates
 from tactflow.engine.errors import SourceError
 from tactflow.sources import CameraRequest, FrameReader
-from tactflow.sources.usb import UsbBus, UsbCamera, read_alternates
-from tests.sources.test_usb import descriptors
-
-ALTERNATES = tuple(read_alternates(descriptors(), 480.0))
+from tactflow.sources.usb import UsbCamera, UsbHub
 
 
 class Clock:
@@ -56,11 +53,7 @@ def cameras(monkeypatch: pytest.MonkeyPatch) -> None:
         return Camera(spec, camera)
 
     monkeypatch.setattr(rates, "open_source", opened)
-    monkeypatch.setattr(rates, "usb_buses", lambda _: [])
-
-
-def camera(device: str) -> UsbCamera:
-    return UsbCamera(device, "Gel", "usb1", "1-1", 480.0, ALTERNATES)
+    monkeypatch.setattr(rates, "usb_hubs", lambda _: [])
 
 
 def test_a_sensor_that_gives_what_was_asked_needs_no_advice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,14 +82,17 @@ def test_a_slow_sensor_is_told_with_what_holds_it_down(
     assert together.advice[0].startswith(f"left {words}")
 
 
-def test_a_crowded_hub_is_named_in_place_of_each_slow_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus = UsbBus("usb1", 480.0, (camera("/dev/video0"), camera("/dev/video2")))
-    monkeypatch.setattr(rates, "usb_buses", lambda _: [bus])
+def test_a_hub_that_slow_sensors_share_is_named_in_place_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = [UsbCamera(f"/dev/video{number}", "Gel", f"1-{number}", "480") for number in (0, 2)]
+    monkeypatch.setattr(rates, "usb_hubs", lambda _: [UsbHub("usb1", "480", cameras)])
+    sensors = [Sensor("left", "0", CameraRequest()), Sensor("right", "2", CameraRequest())]
+    monkeypatch.setattr(rates, "time", Clock(1 / 120))
+    assert not measure_together(sensors, 30.0).advice
     monkeypatch.setattr(rates, "time", Clock(1 / 15))
-    sensors = [Sensor("left", "0", CameraRequest()), Sensor("right", "2", CameraRequest(format="YUYV"))]
-    (said,) = measure_together(sensors, 30.0).advice
-    assert said.startswith("left and right share a 480 Mbit/s hub (usb1) and reserve 344 Mbit/s")
-    assert said.endswith("move one to another root hub, or ask for MJPG or fewer pixels")
+    (line,) = measure_together(sensors, 30.0).advice
+    assert line.startswith(
+        "left and right share the USB hub usb1 of 480 Mbit/s: move one to another root hub"
+    )
 
 
 def test_a_mistake_in_a_reader_ends_the_measurement() -> None:

@@ -13,7 +13,7 @@ import orjson
 from tactflow.cli.options import add_json
 from tactflow.cli.terminal import say, show
 from tactflow.sources.cameras import CameraInfo, list_cameras
-from tactflow.sources.usb import UsbBus, usb_buses
+from tactflow.sources.usb import UsbHub, usb_hubs
 
 NO_CAMERA = """no camera is plugged in (there is no /dev/video*)
   plug it in and look at the last lines of: sudo dmesg
@@ -38,15 +38,16 @@ def run(args: argparse.Namespace) -> int:
     cameras = list_cameras(args.dev)
     if not cameras:
         say(NO_CAMERA)
-    buses = usb_buses([camera.device for camera in cameras], args.sys)
+    hubs = usb_hubs([camera.device for camera in cameras], args.sys)
     for camera in cameras:
         if args.json:
-            usb = next((c for bus in buses for c in bus.cameras if c.device == camera.device), None)
+            hub = next((h for h in hubs if camera.device in [c.device for c in h.cameras]), None)
+            usb = None if hub is None else {"hub": hub.root, "speed": hub.speed}
             print(orjson.dumps(asdict(camera) | {"usb": usb}).decode())
         else:
             show(describe(camera))
-    for bus in () if args.json else buses:
-        show(describe_bus(bus))
+    for hub in () if args.json else hubs:
+        show(describe_hub(hub))
     return 0
 
 
@@ -66,14 +67,8 @@ def describe(camera: CameraInfo) -> Iterator[str]:
         yield f"    {form}: {sizes_text or 'any size within a range'}"
 
 
-def describe_bus(bus: UsbBus, *, advise: bool = True) -> Iterator[str]:
-    """A root hub in words: what each camera on it reserves, and what to do where that does not fit."""
-    speed = "unknown speed" if bus.speed is None else f"{bus.speed:.0f} Mbit/s, {bus.budget:.0f} to reserve"
-    yield f"USB hub {bus.root}: {speed}"
-    for camera in bus.cameras:
-        may, now = camera.reserves(), camera.reserved
-        what = "gets what is left" if camera.bulk else "reserves an unknown part"
-        if may:
-            what = f"reserves {may:.0f} Mbit/s now" if now else f"may reserve {may:.0f} Mbit/s"
-        yield f"    {camera.device} ({camera.name}, port {camera.port}, {camera.speed:.0f} Mbit/s) {what}"
-    yield from (f"    {line}" for line in (bus.advice() if advise else ()))
+def describe_hub(hub: UsbHub) -> Iterator[str]:
+    """A USB root hub in words, and the cameras that share it."""
+    yield f"USB hub {hub.root}: {hub.speed} Mbit/s"
+    for camera in hub.cameras:
+        yield f"    {camera.device} ({camera.name}, port {camera.port}, {camera.speed} Mbit/s)"

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactflow.cli.cameras import describe_bus
+from tactflow.cli.cameras import describe_hub
 from tactflow.cli.options import add_json, seconds
 from tactflow.cli.terminal import progress_bar, show, show_json, table
 from tactflow.config.load import load_pipeline, sensor_names
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         metavar="PIPELINE",
         help="read all sensors of a pipeline file together: the frame rates that it asks for, that the "
-        "drivers promise and that arrive, and what the USB has room for",
+        "drivers promise and that arrive, and the USB hubs that they share",
     )
     parser.add_argument(
         "--seconds",
@@ -126,7 +126,7 @@ def _run_together(args: argparse.Namespace) -> int:
             (r.sensor, _rate(r.asked), _rate(r.promised), _rate(r.got), r.description or "cannot be opened")
             for r in together.rates
         ]
-        show([*table(rows), *(line for bus in together.buses for line in describe_bus(bus, advise=False))])
+        show([*table(rows), *(line for hub in together.hubs for line in describe_hub(hub))])
         show([f"  {line}" for line in together.advice] or ["every sensor delivers what was asked of it"])
     return StageError.exit_code if together.fault else 0
 

@@ -13,7 +13,8 @@ from typing import Any, Final
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources import CameraRequest, open_source
-from tactflow.sources.usb import Mode, UsbBus, usb_buses
+from tactflow.sources.usb import UsbHub, usb_hubs
+from tactflow.system.spelling import joined
 
 LOW: Final = 0.9
 """Part of the rate asked for, or else promised, below which a sensor is too slow."""
@@ -64,10 +65,10 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Together:
-    """All sensors at once. rates : of each. buses : as they were while all ran. advice : sentences."""
+    """All sensors at once. rates : of each. hubs : that their cameras hang on. advice : sentences."""
 
     rates: Sequence[Rate]
-    buses: Sequence[UsbBus]
+    hubs: Sequence[UsbHub]
     advice: Sequence[str]
 
     @property
@@ -91,13 +92,13 @@ def measure_together(sensors: Sequence[Sensor], seconds: float) -> Together:
                 ready.acquire()
             go.set()
             wait(readers, seconds)
-            buses = usb_buses([_device(sensor.source) for sensor in sensors])
         finally:
             stop.set()
             go.set()
     for reader in readers:
         reader.result()
-    return Together(rates, buses, _advice(sensors, rates, buses))
+    hubs = usb_hubs([_device(sensor.source) for sensor in sensors])
+    return Together(rates, hubs, _advice(sensors, rates, hubs))
 
 
 def _device(source: str) -> str:
@@ -128,25 +129,23 @@ def _count(
     rate.got = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
 
 
-def _advice(sensors: Sequence[Sensor], rates: Sequence[Rate], buses: Sequence[UsbBus]) -> list[str]:
-    """What to do: about hubs that are full, and about slow sensors whose hub is not."""
-    devices = {sensor.name: _device(sensor.source) for sensor in sensors}
-    names = {device: name for name, device in devices.items()}
-    modes: dict[str, Mode] = {}
-    for sensor, rate in zip(sensors, rates, strict=True):
-        fps = rate.asked or rate.promised
-        if rate.size is not None and fps is not None:
-            form = rate.description.rpartition(", ")[2]
-            modes[devices[sensor.name]] = Mode(*rate.size, fps, form)
-    lines, crowded = [], set[str]()
-    for bus in buses:
-        said = list(bus.advice(modes, names))
-        lines += said
-        crowded |= {camera.device for camera in bus.cameras} if said else set()
+def _advice(sensors: Sequence[Sensor], rates: Sequence[Rate], hubs: Sequence[UsbHub]) -> list[str]:
+    """What to do about slow sensors: about the hub that they share with others, or about each."""
+    names = {_device(sensor.source): sensor.name for sensor in sensors}
+    slow = {rate.sensor for rate in rates if rate.share < LOW}
+    lines, sharing = [], set[str]()
+    for hub in hubs:
+        here = [names[camera.device] for camera in hub.cameras]
+        if len(here) > 1 and slow.intersection(here):
+            sharing.update(here)
+            lines.append(
+                f"{joined(here)} share the USB hub {hub.root} of {hub.speed} Mbit/s: move one to another "
+                "root hub, or ask for MJPG, fewer pixels or fewer frames"
+            )
     for rate in rates:
         if rate.problem:
             lines.append(f"{rate.sensor}: {rate.problem}")
-        elif rate.share < LOW and devices[rate.sensor] not in crowded:
+        elif rate.sensor in slow - sharing:
             lines.append(f"{rate.sensor} {_slow(rate)}")
     return lines
 
@@ -157,6 +156,6 @@ def _slow(rate: Rate) -> str:
     if rate.asked and rate.promised and rate.promised < LOW * rate.asked:
         return f"{text}, as its driver promises {rate.promised:g}: ask for fewer pixels or format MJPG"
     return (
-        f"{text}, and no USB hub is too full: give it a fixed short exposure with more light, or the "
+        f"{text}, and it shares no USB hub: give it a fixed short exposure with more light, or the "
         "processor less to do"
     )
