@@ -199,7 +199,7 @@ class _ArrayFile:
         shape = tuple(map(max, zip(*(row.shape for row in rows), strict=True)))
         block = np.full((len(rows), *shape), fill, dtype)
         for index, row in enumerate(rows):
-            block[(index, *map(slice, row.shape))] = row
+            block[(index, *_first(row.shape))] = row
         if name not in self._arrays:
             chunks = tuple(max(length, 1) for length in block.shape)
             self._arrays[name] = self._create(name, fill, shape=(0, *shape), dtype=dtype, chunks=chunks)
@@ -208,11 +208,16 @@ class _ArrayFile:
         begin, *before = array.shape
         array.resize((begin + len(rows), *map(max, before, shape)))
         if block.size:
-            array[(slice(begin, begin + len(rows)), *map(slice, shape))] = block
+            array[(slice(begin, begin + len(rows)), *_first(shape))] = block
 
     def _create(self, name: str, fill: float, **options: Any) -> Any:
         """Make an array that can grow. options : its shape, dtype and chunks."""
         raise NotImplementedError
+
+
+def _first(shape: tuple[int, ...]) -> list[slice]:
+    """The first elements along each axis."""
+    return [slice(length) for length in shape]
 
 
 class Hdf5(_ArrayFile):

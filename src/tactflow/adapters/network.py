@@ -381,14 +381,15 @@ class _Feed:
 
     def _planes(self, array: NDArray[Any], background: Untouched | None) -> list[Floats]:
         """The channels of the network's picture, (h, w) float32 each, normalised."""
-        p, parts = self.params, [self._resized(array)]
+        p, picture = self.params, self._resized(array)
+        parts = [picture]
         if p.background != "none":
             if background is None or background.shape != array.shape:
                 shape = None if background is None else background.shape
                 raise StageError(f"{self._where}: required an untouched gel of {array.shape}, got {shape}")
             rest = self._resized(background)
-            is_difference = p.background != "concat"
-            parts = [cv2.subtract(*parts, rest, dtype=cv2.CV_32F)] if is_difference else [*parts, rest]
+            is_added = p.background == "concat"
+            parts = [picture, rest] if is_added else [cv2.subtract(picture, rest, dtype=cv2.CV_32F)]
         planes = [plane for part in parts for plane in cv2.split(part)]
         self._check_normalisation(len(planes))
         scale = p.scale
@@ -407,7 +408,7 @@ class _Feed:
             planes = [*planes, *np.meshgrid(across, down)]
         if self.params.layout == "chw":
             return np.stack(planes)
-        values = np.atleast_3d(cv2.merge(planes))
+        values = np.dstack(planes)
         return values.reshape(height * width, -1) if self.params.layout == "pixels" else values
 
     def _resized(self, array: NDArray[Any]) -> NDArray[Any]:
