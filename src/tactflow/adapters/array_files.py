@@ -199,7 +199,7 @@ class _ArrayFile:
         shape = tuple(map(max, zip(*(row.shape for row in rows), strict=True)))
         block = np.full((len(rows), *shape), fill, dtype)
         for index, row in enumerate(rows):
-            block[(index, *_first(row.shape))] = row
+            block[(slice(index, index + 1), *_first(row.shape))] = row
         if name not in self._arrays:
             chunks = tuple(max(length, 1) for length in block.shape)
             self._arrays[name] = self._create(name, fill, shape=(0, *shape), dtype=dtype, chunks=chunks)
