@@ -7,15 +7,14 @@ import platform
 import re
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 
 import cv2
 
-from tactflow.bench.lockstep import on_recording
 from tactflow.bench.methods import measure_methods
 from tactflow.bench.pipelines import CLASSIC, Bench
 from tactflow.bench.results import BenchResult
@@ -37,23 +36,17 @@ Pipelines = Mapping[str, Pipeline]
 """Name -> pipeline; `DEFAULT` and `CLASSIC` are among them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What to measure.
+def run_bench(
+    files: Mapping[str, Path],
+    *,
+    quick: bool = False,
+    scenes: Collection[str] | None = None,
+    progress: Progress = lambda *_: None,
+) -> BenchResult:
+    """Measure pipelines, and every method of their stages.
 
-    files : pipeline name -> file. `DEFAULT` and `CLASSIC` must be among them.
-    quick : a short run. scenes : only these, or None for all.
-    pictures : folder for a picture of each pipeline's worst frame in each scene, or None.
-    """
-
-    files: Mapping[str, Path]
-    quick: bool = False
-    scenes: frozenset[str] | None = None
-    pictures: Path | None = None
-
-
-def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
-    """Measure everything of a plan.
+    files : pipeline name -> file; `DEFAULT` and `CLASSIC` must be among them. quick : a short run.
+    scenes : only these, or None for all.
 
     Raises
     ------
@@ -61,16 +54,16 @@ def run_bench(plan: Plan, progress: Progress = lambda *_: None) -> BenchResult:
         If a pipeline file is wrong or a scene is unknown.
     """
     began = time.perf_counter()
-    whole, alone = (QUICK, QUICK_STAGES) if plan.quick else ((*FULL, *TROUBLES), FULL_STAGES)
+    whole, alone = (QUICK, QUICK_STAGES) if quick else ((*FULL, *TROUBLES), FULL_STAGES)
     known = [case.label for case in whole]
-    scenes = frozenset(known) if plan.scenes is None else plan.scenes
+    scenes = frozenset(known if scenes is None else scenes)
     if unknown := sorted(scenes.difference(known)):
         measured = ", ".join(known)
         raise ConfigError(f"--scene {', '.join(unknown)}: not among the scenes measured: {measured}")
-    loaded = {name: load_pipeline(path) for name, path in plan.files.items()}
-    result, unit = BenchResult(quick=plan.quick, machine=machine()), CopyUnit()
+    loaded = {name: load_pipeline(path) for name, path in files.items()}
+    result, unit = BenchResult(quick=quick, machine=machine()), CopyUnit()
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
-        bench = Bench(result, unit, Path(folder), plan.pictures)
+        bench = Bench(result, unit, Path(folder))
         steps = [
             (f"pipelines on {case.label}", partial(measure_scene, bench, loaded, case))
             for case in whole
@@ -96,9 +89,6 @@ def measure_scene(bench: Bench, loaded: Pipelines, case: Case) -> None:
         if case in TROUBLES:
             # The script takes half of a run's time and was not made for any of this.
             suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
-        if scene.scene.settings.speckle:
-            speckled = on_recording(loaded[DEFAULT], scene.path)
-            bench.measure_refusal(DEFAULT, speckled, case.label)
         bench.measure(suited, scene)
 
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.lockstep import TimedResult
-from tactflow.bench.pictures import WorstFrame
 from tactflow.bench.quantities import Tally
 from tactflow.bench.scenes import Rendered
 from tactflow.sim import Truth
@@ -148,11 +147,11 @@ class MarkerScore:
 class PipelineScore:
     """Compares the results of a whole pipeline on one scene.
 
-    tally : gets the errors; may be shared by several scenes. worst : the frame with the worst contact.
+    tally : gets the errors; may be shared by several scenes.
     """
 
     def __init__(self, rendered: Rendered, tally: Tally) -> None:
-        self.tally, self.worst = tally, WorstFrame()
+        self.tally = tally
         self._rendered = rendered
         self._markers = MarkerScore(tally)
 
@@ -167,10 +166,6 @@ class PipelineScore:
             add_geometry(self.tally, contact, truth)
             if result.contact_mask is not None:
                 add_mask(self.tally, result.contact_mask, truth)
-        if deep and truth.touching:
-            mask = truth.contact_mask
-            overlap = 0.0 if contact is None else metrics.polygon_iou(contact.hull, truth.hull, mask.shape)
-            self.worst.add(overlap, result, mask)
         if result.markers is not None:
             self._markers.add(result.markers, truth)
         add_flow(self.tally, result.flow, truth)

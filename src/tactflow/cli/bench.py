@@ -9,7 +9,7 @@ from pathlib import Path
 from tactflow.bench.pipelines import CLASSIC
 from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import load_errors, regressions
-from tactflow.bench.run import DEFAULT, MARKERLESS, Plan, run_bench
+from tactflow.bench.run import DEFAULT, MARKERLESS, run_bench
 from tactflow.bench.tables import sections
 from tactflow.cli.options import refuse_output, writing
 from tactflow.cli.terminal import notes, progress_bar, say, show
@@ -47,12 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--html", type=Path, metavar="PATH", help="write the report with plots here, as one HTML file")
     add(
-        "--pictures",
-        type=Path,
-        metavar="DIR",
-        help="write a picture of every pipeline's worst frame in every scene, the truth beside the answer",
-    )
-    add(
         "--against",
         type=Path,
         metavar="FILE",
@@ -69,9 +63,13 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) is not None:
             refuse_output(f"--{name}", getattr(args, name), overwrite=True)
     scenes = frozenset(args.scene) if args.scene else None
-    plan = Plan(_files(args.pipelines), args.quick, scenes, args.pictures)
     with notes("ERROR"), progress_bar("rendering") as update:
-        result = run_bench(plan, lambda what, n, total: update(description=what, completed=n, total=total))
+        result = run_bench(
+            _files(args.pipelines),
+            quick=args.quick,
+            scenes=scenes,
+            progress=lambda what, n, total: update(description=what, completed=n, total=total),
+        )
     show(markdown(sections(result)))
     _write(args.json, result.save)
     _write(args.html, lambda path: write_bench_report(result, path))
