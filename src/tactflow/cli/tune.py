@@ -36,12 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-error", type=_above_0, metavar="PX", help="largest error, pixels of the camera's picture"
     )
     parser.add_argument("--max-ms", type=_above_0, metavar="MS", help="CPU time of a frame with contact")
-    parser.add_argument(
-        "--error",
-        default="any",
-        choices=("any", "center", "dots", "flow"),
-        help="which error counts: contact's centre, displacement of dots, mean flow; default: the largest",
-    )
     add_sensor(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
@@ -74,9 +68,8 @@ def run(args: argparse.Namespace) -> int:
         if args.pipeline is None and dots is None:
             file = find_pipeline("markerless")
             say(f"no dots are found: starting from {file.name}")
-        known = candidates(file, recording.size, None if dots is None else dots.pitch, args.sensor)
-        goal = Goal(args.error, args.max_error, args.max_ms)
-        tuned = search(known, recording, folder, goal, say)
+        trials = candidates(file, recording.size, None if dots is None else dots.pitch, args.sensor)
+        tuned = search(trials, recording, folder, Goal(args.max_error, args.max_ms), say)
     if args.json:
         show_json(report.as_json(tuned))
     else:

@@ -19,14 +19,12 @@ from tactflow.bench.timing import Times
 from tactflow.engine.graph import Pipeline
 from tactflow.tune.recording import Recording
 
-ANY: Final = "any"
 ERRORS: Final = {
-    ANY: "largest of the following",
     "center": "centre of the contact, mean",
     "dots": "displacement of the dots, RMS",
     "flow": "mean flow in the contact, mean",
 }
-"""Kinds of error, px of the camera image before downsampling. `ANY` is the largest that a pipeline has."""
+"""Kinds of error, px of the camera image before downsampling."""
 SOUND: Final = {
     "missed_half_depth": (3.0, "% of contacts at half depth missed:"),
     "false_contacts": (2.0, "% of idle frames called contact:"),
@@ -66,14 +64,17 @@ class Interval:
 
 @dataclass
 class Trial:
-    """Evaluation of a candidate.
+    """A pipeline that is tried, and what was measured.
 
+    settings : values that differ from the user's file, as `stages.preprocess.downsample` -> value.
     errors : by kind (`ERRORS`), px of the camera image. quantities : errors by their names in the bench,
     processed pixels. ms : median CPU time of a frame with contact. failure : error message if it does not
     run. unsound : the quantity that exceeds its tolerance (`SOUND`), or "". checks : by name (`CHECKS`).
     """
 
     name: str
+    settings: Mapping[str, Any]
+    pipeline: Pipeline
     errors: dict[str, Interval] = field(default_factory=dict[str, Interval])
     quantities: dict[str, float] = field(default_factory=dict[str, float])
     ms: Interval = field(default_factory=Interval)
@@ -81,19 +82,20 @@ class Trial:
     unsound: str = ""
     checks: dict[str, float] = field(default_factory=dict[str, float])
 
-    def of(self, kind: str) -> float:
-        """The error of a kind, inf if it is missing."""
-        error = self.errors.get(kind)
-        return math.inf if error is None or self.failure else error.value
+    @property
+    def error(self) -> Interval:
+        """The largest error; infinite if none is known."""
+        return max(self.errors.values(), key=lambda error: error.value, default=Interval(math.inf))
 
     @property
     def usable(self) -> bool:
-        """Whether the candidate runs and is sound."""
-        return self.failure is None and not self.unsound
+        """Whether the pipeline runs, is sound, and has an error."""
+        return self.failure is None and not self.unsound and math.isfinite(self.error.value)
 
 
-def judge(pipelines: Mapping[str, Pipeline], recordings: Sequence[Rendered]) -> list[Trial]:
-    """Measure errors and times of pipelines on simulated recordings, in turns."""
+def judge(trials: Sequence[Trial], recordings: Sequence[Rendered]) -> None:
+    """Set the errors, times and failures of trials on simulated recordings, in turns."""
+    pipelines = {trial.name: trial.pipeline for trial in trials}
     tallies = {name: Tally() for name in pipelines}
     times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
     scales = dict.fromkeys(pipelines, 1.0)
@@ -114,12 +116,12 @@ def judge(pipelines: Mapping[str, Pipeline], recordings: Sequence[Rendered]) -> 
         for name, kinds in took.items():
             for kind, samples in kinds.items():
                 times[name][kind] += samples
-    return [
-        Trial(name, failure=failures[name])
-        if name in failures
-        else _trial(name, tallies[name], scales[name], times[name])
-        for name in pipelines
-    ]
+    for trial in trials:
+        trial.failure = failures.get(trial.name)
+        if trial.failure is None:
+            trial.quantities = tallies[trial.name].errors()
+            _set_errors(trial, tallies[trial.name], scales[trial.name])
+            _set_time(trial, times[trial.name])
 
 
 def _on_sensor(pipeline: Pipeline) -> Pipeline:
@@ -132,8 +134,8 @@ def _on_sensor(pipeline: Pipeline) -> Pipeline:
     )
 
 
-def _trial(name: str, tally: Tally, scale: float, times: Times) -> Trial:
-    trial = Trial(name, quantities=tally.errors())
+def _set_errors(trial: Trial, tally: Tally, scale: float) -> None:
+    """Set the errors by kind. scale : px of the camera image per processed pixel."""
     values = tally.values
     per_frame = {
         "center": np.array(values["center_error"]).ravel(),
@@ -143,13 +145,9 @@ def _trial(name: str, tally: Tally, scale: float, times: Times) -> Trial:
     for kind, errors in per_frame.items():
         if len(errors):
             trial.errors[kind] = _interval(scale * errors, rms if kind == "dots" else np.mean)
-    if trial.errors:
-        trial.errors[ANY] = max(trial.errors.values(), key=lambda interval: interval.value)
-    set_time(trial, times)
-    return trial
 
 
-def set_time(trial: Trial, times: Times) -> None:
+def _set_time(trial: Trial, times: Times) -> None:
     """Set the time of frames with contact, or of all but references if there are none."""
     counted = {kind: np.array(samples) * 1e3 for kind, samples in times.items() if kind != "reference"}
     if counted:
@@ -180,14 +178,13 @@ def mark_unsound(trials: Sequence[Trial]) -> None:
                 trial.unsound = f"{description} {value:.3g} (best {sign * best:.3g})"
 
 
-def measure_on_recording(
-    pipelines: Mapping[str, Pipeline], trials: Sequence[Trial], recording: Recording
-) -> None:
-    """Run pipelines on the recording, in turns; set the times, checks and failures of their trials.
+def measure_on_recording(trials: Sequence[Trial], recording: Recording) -> None:
+    """Set the times, checks and failures of trials on the recording, in turns.
 
-    pipelines : name -> pipeline; the first, the most expensive, is the baseline of the checks.
+    trials : the first that runs, the most expensive, is the baseline of the checks.
     """
-    centers: dict[str, list[NDArray[np.float64] | None]] = {name: [] for name in pipelines}
+    running = [trial for trial in trials if trial.failure is None]
+    centers: dict[str, list[NDArray[np.float64] | None]] = {trial.name: [] for trial in running}
 
     def observe(name: str, result: TimedResult) -> str:
         contact, mapping = result.contact, result.mapping
@@ -195,14 +192,15 @@ def measure_on_recording(
         centers[name].append(center if center is None or mapping is None else mapping.to_raw(center))
         return "idle" if contact is None else "contact"
 
-    ready = {name: on_recording(pipeline, recording.path) for name, pipeline in pipelines.items()}
+    ready = {trial.name: on_recording(trial.pipeline, recording.path) for trial in running}
     times, failures = take_turns(ready, observe)
-    done = [name for name in pipelines if name not in failures]
-    for trial in trials:
-        trial.failure = trial.failure or failures.get(trial.name)
-        if trial.name in done:
-            set_time(trial, times[trial.name])
-            trial.checks = _compared(centers[trial.name], centers[done[0]])
+    baseline = None
+    for trial in running:
+        trial.failure = failures.get(trial.name)
+        if trial.failure is None:
+            baseline = baseline or centers[trial.name]
+            _set_time(trial, times[trial.name])
+            trial.checks = _compared(centers[trial.name], baseline)
 
 
 def _compared(

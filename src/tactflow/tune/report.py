@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import yaml
 
 from tactflow.engine.errors import ConfigError
 from tactflow.report import COLORS, Section, Table, figure, markdown, picture, write_report
-from tactflow.tune.measure import ANY, CHECKS, ERRORS, Interval, Trial
+from tactflow.tune.measure import CHECKS, ERRORS, Interval
 from tactflow.tune.search import Tuned
 from tactflow.tune.space import ORIGINAL
 
@@ -24,25 +23,24 @@ def sections(tuned: Tuned) -> list[Section]:
         "errors: px of the camera image, simulated; time: CPU of a frame with contact, on the recording",
         *tuned.notes,
     ]
-    kinds = [kind for kind in ERRORS if kind != ANY and any(kind in trial.errors for trial in tuned.trials)]
+    kinds = [kind for kind in ERRORS if any(kind in trial.errors for trial in tuned.trials)]
     rows = []
     for trial in tuned.trials:
         cells = [_cell(trial.ms, 2), *(_cell(trial.errors.get(kind), 3) for kind in kinds)]
         remark = (trial.failure or trial.unsound).partition("\n")[0]
-        rows.append([_role(tuned, trial), trial.name, *cells, remark])
+        rows.append(["CHOSEN" if trial is tuned.chosen else "", trial.name, *cells, remark])
     columns = ["", "pipeline", "time, ms", *(f"{kind}, px" for kind in kinds), "remarks"]
     legend = "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds)
     legend = f"In brackets: 90 % intervals. {legend}"
-    found = [
+    parts = [
         Section("How", "\n\n".join(facts)),
         Section("Time and error", legend, tables=[Table(columns, rows)]),
     ]
-    for trial in tuned.trials:
-        if trial.checks and _role(tuned, trial) == "CHOSEN":
-            checks = [[CHECKS[name], f"{value:.3g}"] for name, value in trial.checks.items()]
-            table = Table(["check", "value"], checks)
-            found.append(Section("The chosen pipeline on the recording", tables=[table]))
-    return found
+    if tuned.chosen is not None:
+        checks = [[CHECKS[name], f"{value:.3g}"] for name, value in tuned.chosen.checks.items()]
+        table = Table(["check", "value"], checks)
+        parts.append(Section("The chosen pipeline on the recording", tables=[table]))
+    return parts
 
 
 def lines(tuned: Tuned) -> Iterator[str]:
@@ -56,23 +54,15 @@ def _cell(interval: Interval | None, digits: int) -> str:
     return f"{interval.value:.{digits}f} ({interval.low:.{digits}f}-{interval.high:.{digits}f})"
 
 
-def _role(tuned: Tuned, trial: Trial) -> str:
-    if tuned.chosen is not None and trial.name == tuned.chosen.name:
-        return "CHOSEN"
-    return "fails" if trial.failure else "front" if trial.name in tuned.front else ""
-
-
 def as_json(tuned: Tuned) -> dict[str, Any]:
-    """The report as JSON-compatible values."""
+    """The report as values for JSON."""
+    keys = ("name", "settings", "errors", "quantities", "ms", "failure", "unsound", "checks")
     return {
         "source": tuned.recording.source,
-        "sensor": asdict(tuned.look),
-        "error": tuned.goal.kind,
+        "sensor": tuned.look,
         "chosen": None if tuned.chosen is None else tuned.chosen.name,
-        "settings": None if tuned.chosen is None else tuned.chosen.settings,
-        "front": tuned.front,
-        "words": tuned.notes,
-        "candidates": [asdict(trial) for trial in tuned.trials],
+        "notes": tuned.notes,
+        "candidates": [{key: getattr(trial, key) for key in keys} for trial in tuned.trials],
     }
 
 
@@ -132,8 +122,8 @@ def _set(document: dict[str, Any], key: str, value: Any) -> None:
 def write_page(path: Path, tuned: Tuned) -> Path:
     """Write a page with a plot of time against error and the sections. Raises ConfigError without
     matplotlib."""
-    error = f"Error: {ERRORS[tuned.goal.kind]}. Bars are 90 % intervals."
-    plot = Section("The choice", error, [picture(_plot(tuned))])
+    text = "The largest error of each pipeline. Bars are 90 % intervals."
+    plot = Section("The choice", text, [picture(_plot(tuned))])
     return write_report(path, f"Pipelines for {tuned.recording.source}", [plot, *sections(tuned)])
 
 
@@ -143,17 +133,15 @@ def _plot(tuned: Tuned) -> Any:
     axes.set(xscale="log", yscale="log")
     axes.set_xlabel("CPU time of a frame with contact, ms")
     axes.set_ylabel("error, px of the camera image")
-    colors = {ORIGINAL: COLORS[1]}
-    if tuned.chosen is not None:
-        colors[tuned.chosen.name] = COLORS[2]
     for trial in tuned.trials:
-        if not 0 < trial.of(tuned.goal.kind) < math.inf or not trial.ms.value > 0:
+        ms, error = trial.ms, trial.error
+        if trial.failure or not 0 < error.value < math.inf or not ms.value > 0:
             continue
-        ms, error = trial.ms, trial.errors[tuned.goal.kind]
+        named = trial is tuned.chosen or trial.name == ORIGINAL
+        color = COLORS[2] if trial is tuned.chosen else COLORS[1] if named else COLORS[6]
         bars = [[[i.value - i.low], [i.high - i.value]] for i in (error, ms)]
-        color = colors.get(trial.name, COLORS[6])
         axes.errorbar(ms.value, error.value, *bars, fmt="o", color=color, elinewidth=1)
-        if trial.name in colors:
+        if named:
             place = (ms.value, error.value)
             axes.annotate(trial.name, place, (5, 5), textcoords="offset points", fontsize=8)
     if tuned.goal.max_ms is not None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import from_settings
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Pipeline
+from tactflow.tune.measure import Trial
 
 ORIGINAL: Final = "as given"
 """Name of the user's own pipeline, whatever its settings."""
@@ -31,17 +31,9 @@ ns take 300 times as long as `normalized` and are no more accurate, and without 
 contact's centre is three to eight times as large (scene `press`)."""
 
 
-class Candidate(NamedTuple):
-    """A pipeline to try, and the settings that it changes in the user's file."""
-
-    name: str
-    settings: Mapping[str, Any]
-    pipeline: Pipeline
-
-
 def candidates(
     file: Path, size: tuple[int, int], pitch: float | None, sensor: str | None = None
-) -> list[Candidate]:
+) -> list[Trial]:
     """The original, and all combinations of the alternatives for its stages, most expensive first.
 
     Combinations that the pipeline file does not allow are left out.
@@ -81,9 +73,9 @@ def candidates(
         except ConfigError:
             continue
         if pipeline.nodes == original.nodes:
-            found.append(Candidate(ORIGINAL, {}, original))
+            found.append(Trial(ORIGINAL, {}, original))
         else:
-            found.append(Candidate(", ".join(names), settings, pipeline))
+            found.append(Trial(", ".join(names), settings, pipeline))
     if not any(candidate.name == ORIGINAL for candidate in found):
-        found.insert(1, Candidate(ORIGINAL, {}, original))
+        found.insert(1, Trial(ORIGINAL, {}, original))
     return found
