@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import yaml
 import zmq
 
-from tactflow.cli.main import main
+from tactflow.cli.main import main, make_parser
 from tests.clock import PATIENCE
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -70,6 +71,19 @@ def test_every_command_and_stage_that_the_pages_name_is_there(capsys: pytest.Cap
     assert {"capture", "hull", "hold"} <= stages
     for stage in stages:
         assert stage in listed
+
+
+PAGES = sorted([*REPOSITORY.glob("[RC]*.md"), *(REPOSITORY / "docs").glob("*.md")])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_command_line_of_the_pages_is_valid(page: Path) -> None:
+    blocks = re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    for line in re.split("\n|&&", "".join(blocks).replace("\\\n", " ")):
+        words = shlex.split(line.replace("$SLURM_ARRAY_TASK_ID", "3"), comments=True)
+        if words[:1] == ["tactflow"]:
+            end = next((number for number, word in enumerate(words) if word in ("&", ">", "|")), None)
+            make_parser(words[1]).parse_args(words[1:end])
 
 
 def test_the_subscriber_example_prints_results(tmp_path: Path) -> None:

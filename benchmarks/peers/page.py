@@ -74,9 +74,7 @@ def text(numbers: Numbers, picture: str) -> str:
     others = {
         "machine": [", ".join(f"{key} {value}" for key, value in numbers["machine"].items())],
         "picture": [picture],
-        "settings": ["; ".join(settings(numbers))],
         "attempts": attempts(numbers["attempts"]),
-        "failures": ["; ".join(failures(numbers["failures"]))],
     }
     values = Values({name: "\n".join(lines) for name, lines in (tables | others).items()})
     values.numbers = numbers
@@ -122,32 +120,11 @@ def table(numbers: Numbers, columns: Sequence[Column], methods: Sequence[str]) -
         yield f"| {method} | " + " | ".join(cells) + " |"
 
 
-def settings(numbers: Numbers) -> Iterator[str]:
-    """The settings that were found for random sensors."""
-    for quantity in ("dots", "contact"):
-        for method, errors in numbers[f"{quantity}_wide"]["all"].items():
-            if errors["settings"]:
-                found = ", ".join(f"{key} {value}" for key, value in errors["settings"].items())
-                yield f"{method} ({found})"
-
-
 def attempts(tried: Sequence[Mapping[str, str]]) -> Iterator[str]:
     """Lines of a table of packages that were tried in vain."""
     yield from ("| package | what it says |", "| --- | --- |")
-    for one in tried:
-        yield f"| {one['package']} {one['version']} | {one['error']} |"
-
-
-def failures(parts: Numbers) -> Iterator[str]:
-    """Errors, counted by method and kind."""
-    counts: dict[str, int] = {}
-    for methods in parts.values():
-        for method, messages in methods.items():
-            for message, count in messages.items():
-                kind = "no dots were found" if "NoMarkersError" in message else message
-                what = f"{method}: {kind}"
-                counts[what] = counts.get(what, 0) + count
-    yield from (f"{what}, {count} times" for what, count in counts.items())
+    for attempt in tried:
+        yield f"| {attempt['package']} {attempt['version']} | {attempt['error']} |"
 
 
 def plot(numbers: Numbers, path: Path) -> None:

@@ -19,12 +19,6 @@ def worse(result: BenchResult, stored: BenchResult, scenes: set[str] | None = No
     return regressions(result, {m.key: m.errors for m in stored.measured}, scenes)
 
 
-def test_times_and_counts_are_no_errors() -> None:
-    (measurement,) = run(displacement_rms=0.02).measurements("tracker")
-    assert measurement.values == {"displacement_rms": 0.02, "contact_ms": 2.0, "frames": 3}
-    assert measurement.errors == {"displacement_rms": 0.02}
-
-
 def test_values_of_many_frames_become_one_number() -> None:
     tally = Tally()
     for value in ([3.0, 4.0], [0.0], []):

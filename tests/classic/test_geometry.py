@@ -14,7 +14,7 @@ from tactflow.classic.functions import (
     get_convex_hull_area,
     mean_flow,
 )
-from tactflow.vision.types import Contact, Flow, Markers
+from tactflow.vision.types import Contact, Markers
 
 Mask = NDArray[np.uint8]
 
@@ -99,7 +99,3 @@ def test_the_mean_flow_is_that_of_the_scripts_loop(dilate: int) -> None:
     assert flow.count == counter > 10
     assert flow.mean == pytest.approx((change[0] / counter, change[1] / counter), abs=1e-12)
     assert flow.rotation is None
-
-
-def test_without_contact_there_is_no_flow() -> None:
-    assert mean_flow(moved(GRID + 1), np.zeros((160, 200), np.uint8), 5) == Flow(None, 0)

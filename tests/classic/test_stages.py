@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from tactflow.classic import functions
 from tactflow.classic.stages import ConvexHull, Difference, FlowMask, MaskMarker, Tracker
-from tactflow.config.load import load_pipeline
 from tactflow.engine.frame import Absent, Frame
 from tactflow.vision.types import Contact
 from tests.vision.dots import grid, render
 
-PIPELINE = Path(__file__).resolve().parents[2] / "pipelines" / "classic.yaml"
 GREY = np.full((40, 60, 3), 100, np.uint8)
 
 
@@ -25,18 +21,6 @@ def touched() -> np.ndarray:
     image = GREY.copy()
     image[10:30, 10:40] += 20
     return image
-
-
-def test_the_pipeline_is_the_script_in_the_places_of_the_built_in_stages() -> None:
-    nodes = load_pipeline(PIPELINE).nodes
-    classes = {name: node.component.cls for name, node in nodes.items()}
-    assert classes["marker_mask"] is MaskMarker
-    assert classes["difference"] is Difference
-    assert classes["hull"] is ConvexHull
-    assert classes["tracker"] is Tracker
-    assert classes["flow_in_mask"] is FlowMask
-    assert nodes["preprocess"].params.model_dump()["method"] == "pyramid"
-    assert nodes["inpaint"].params.model_dump() == {"method": "telea", "radius": 7.0}
 
 
 def test_the_difference_is_taken_from_the_last_reference_until_a_reset() -> None:

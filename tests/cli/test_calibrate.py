@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import cv2
@@ -163,10 +162,7 @@ def test_a_scale_from_dots_in_no_square_grid_is_told(
         (["--from", "sim:idle?frames=3", "--pitch", "2", "--ball-radius", "2"], "nothing touched the gel"),
         (["--from", "sim:idle?frames=3", "--pitch", "2", "--out", "a.txt"], "ends in .yaml"),
         (["--from", "sim:idle?frames=3", "--area", "0", "20"], "--area: required millimetres from 0.001"),
-        (["--from", "sim:idle?frames=3", "--area", "1e300", "20"], "got '1e300'"),
-        (["--from", "sim:idle?frames=3", "--pitch", "inf"], "--pitch: required millimetres"),
         (["check", "nowhere.yaml", "--from", "sim:idle"], "nowhere.yaml"),
-        (["check"], "required a calibration file"),
         (["force"], "required a calibration file"),
         (["force", "nowhere.yaml", "--from", "sim:idle"], "nowhere.yaml"),
     ],
@@ -184,15 +180,6 @@ def test_what_gives_no_calibration_is_refused_in_words(
     assert not list(tmp_path.rglob("*.yaml"))
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="its shell quotes otherwise")
-def test_what_is_said_to_be_typed_can_be_typed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert calibrate("--from", "sim:idle?frames=2", "--pitch", "1.724", "--out", "my gel/left.yaml") == 0
-    assert "--set 'calibration=my gel/left.yaml'" in capsys.readouterr().err
-
-
 def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -203,9 +190,6 @@ def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
     assert "--set calibration=film.yaml" in told
     assert calibrate("check", "film.yaml", "--from", "sim:ball?frames=2") == 0
     assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in capsys.readouterr().err
-    # As a camera, for ten minutes: a scale needs no presses to be checked either.
-    assert calibrate("check", "film.yaml", "--from", "sim:idle?frames=36000", "--realtime") == 0
-    assert "Leave the gel untouched." in capsys.readouterr().err
     # As a camera, for ten minutes, unless it ends when it knows what it needs.
     live = ["--from", "sim:idle?frames=36000", "--realtime", "--pitch", "1.724", "--out", "camera.yaml"]
     assert calibrate(*live) == 0

@@ -147,13 +147,3 @@ def test_the_graph_shows_segments_edges_gates_queues_and_pruned_stages(
     assert f'{ids["unused"]}["unused"]:::pruned' in lines
     assert any('"queue: drop_oldest, 2"' in line for line in lines)
     assert lines.count("end") == sum(line.startswith("subgraph") for line in lines)
-
-
-@pytest.mark.usefixtures("pipeline")
-def test_check_counts_and_warns_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check"]) == 0
-    out, err = capsys.readouterr()
-    assert out == "pipeline.yaml: OK (6 stages, 2 sinks, 3 segments, 1 warning)\n"
-    assert (
-        err == "tactflow: warning: pipeline.yaml:4:3  unused: not run, because no sink needs what it makes\n"
-    )

@@ -50,12 +50,6 @@ def test_the_last_press_is_undone_and_the_session_ends_with_enough() -> None:
     assert guide(finder([*session.presses, press(70, 20), press(70, 70)]))
 
 
-def test_a_session_that_goes_on_says_where_it_stands() -> None:
-    said: list[str] = []
-    Guide(3, said.append)(finder([press(45, 45)]))
-    assert said == ["saved presses so far: 1"]
-
-
 def test_presses_of_a_recording_beyond_those_that_are_wanted_are_counted_alone() -> None:
     said: list[str] = []
     guide = Guide(1, said.append)

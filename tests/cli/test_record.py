@@ -13,7 +13,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from mcap.exceptions import McapError
@@ -78,13 +77,6 @@ def test_replay_is_equal_across_a_new_reference(tmp_path: Path) -> None:
     assert any(result["markers"] for result in results)
     epochs = {frame.epoch for frame in frames_of(tmp_path / "a.mcap")}
     assert epochs == {0, 1}
-
-
-def test_replay_is_equal_with_a_reference_from_an_image_file(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "gel.png"), open_scene("press?frames=2").frame(0))
-    reference = ("--set", f"stages.capture.reference={tmp_path / 'gel.png'}")
-    record_and_replay(tmp_path, "--source", "sim:press?frames=40", *reference)
-    assert [frame.seq for frame in frames_of(tmp_path / "a.mcap")] == [-1, *range(40)]
 
 
 def frames_of(path: Path) -> list[Arrival]:

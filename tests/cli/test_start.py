@@ -101,11 +101,6 @@ def test_a_gel_whose_presses_no_pipeline_finds_is_not_set_up(
     assert not (tmp_path / "made.yaml").exists()
 
 
-def test_a_source_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert propose(str(tmp_path / "none.mp4"), tmp_path / "made.yaml") == 4
-    assert "none.mp4" in capsys.readouterr().err
-
-
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="cameras have no list outside Linux")
 def test_without_a_camera_it_is_said_what_to_do(tmp_path: Path) -> None:
     args = make_parser("start").parse_args(["start", "--out", str(tmp_path / "made.yaml")])

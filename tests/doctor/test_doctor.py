@@ -106,14 +106,6 @@ def test_spots_in_no_regular_grid_are_dots_only_where_the_next_frame_shows_them(
     assert (observe(str(path), 10.0).dots is not None) == found
 
 
-def test_a_single_clipped_pixel_is_no_share_to_speak_of(clean: list[Image], tmp_path: Path) -> None:
-    frames = [image.copy() for image in clean]
-    for image in frames:
-        image[150, 200] = 255
-    findings = examine(observe(str(written(tmp_path / "recording.avi", frames, 60.0)), 60.0))
-    assert [f.says for f in findings if f.name == "clipping"] == ["0 % of the gel is clipped"]
-
-
 def test_missing_and_repeated_frames_of_a_camera_are_counted(
     clean: list[Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,11 +153,6 @@ def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
     (focus,) = [check for check in told["checks"] if check["name"] == "focus"]
     assert (focus["verdict"], focus["unit"]) == ("fault", "px")
     assert focus["says"] in table
-
-
-def test_a_source_that_is_not_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--source", "nowhere.avi"]) == 4
-    assert "no such file" in capsys.readouterr().err
 
 
 def test_one_ctrl_c_ends_the_look_at_the_source_and_the_next_one_ends_the_command(

@@ -56,15 +56,6 @@ def cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rates, "usb_hubs", lambda _: [])
 
 
-def test_a_sensor_that_gives_what_was_asked_needs_no_advice(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rates, "time", Clock(1 / 30))
-    together = measure_together([Sensor("left", "0", CameraRequest(fps=30))], 30.0)
-    (rate,) = together.rates
-    assert (rate.asked, rate.promised, rate.got) == (30, 30, pytest.approx(30))
-    assert not together.advice
-    assert not together.fault
-
-
 @pytest.mark.parametrize(
     ("asked", "words"),
     [

@@ -85,13 +85,6 @@ def test_an_arrow_moves_with_its_marker_by_fractions_of_a_pixel() -> None:
         assert row_of(y) == pytest.approx(y, abs=0.15)
 
 
-def test_a_marker_that_stays_is_a_dot() -> None:
-    picture = GRAY.copy()
-    draw_arrows(picture, markers([[50, 60]], [[50, 60]], [MarkerStatus.TRACKED]))
-    assert picture[60, 50, 2] > 200
-    np.testing.assert_array_equal(picture[60, 56], GRAY[0, 0])
-
-
 def test_the_hull_is_green_and_the_axis_orange() -> None:
     picture = Annotator(text=False)(GRAY, contact=contact())
     x, y = (contact().hull[0] + contact().hull[1]) / 2
@@ -101,13 +94,6 @@ def test_the_hull_is_green_and_the_axis_orange() -> None:
     x, y = np.array(contact().center) + 30 * np.array([math.cos(0.5), math.sin(0.5)])
     orange = picture[round(y), round(x)].astype(int)
     assert orange[2] > orange[0] + 100
-
-
-def test_a_contact_without_direction_has_a_centre_and_no_axis() -> None:
-    disc = Contact(100.0, (100.0, 120.0), None, None, contact().hull, None)
-    picture = Annotator(text=False)(GRAY, contact=disc)
-    assert picture[120, 100, 2] > 200
-    np.testing.assert_array_equal(picture[120, 112], GRAY[0, 0])
 
 
 def test_a_drawn_ellipse_goes_through_the_ends_of_its_axes() -> None:
@@ -135,20 +121,6 @@ def test_text_appears_and_stays_inside_tiny_and_odd_pictures() -> None:
     assert not np.array_equal(plain[:40, :100], Annotator()(GRAY, **given)[:40, :100])
     for shape in ((1, 1, 3), (7, 3, 3), (33, 61, 3), (900, 1201, 3)):
         assert Annotator()(np.zeros(shape, np.uint8), **{**given, "contact_mask": None}).shape == shape
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"arrow_scale": -1.0}, "arrow_scale"),
-        ({"view": "left"}, "frame, contact, depth"),
-        ({"dilate": -1.0}, "dilate"),
-        ({"deepest": 0.0}, "deepest"),
-    ],
-)
-def test_bad_options_are_refused_with_a_reason(kwargs: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Annotator(**kwargs)
 
 
 def test_pictures_of_another_kind_are_refused() -> None:
