@@ -24,9 +24,9 @@ import numpy as np
 import tactflow
 from tactflow.calibration.force import Watched, Watcher, align, fit_force
 from tactflow.calibration.reference import Reference, read_reference
-from tactflow.cli.terminal import show, table
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
+from tactflow.system.terminal import show, table
 from tactflow.vision.arrays import Floats
 from tactflow.vision.types import Scale
 

@@ -21,10 +21,10 @@ import numpy as np
 import tactflow
 from benchmarks.wide import WideScene, wide_scene
 from tactflow.bench.metrics import mask_iou
-from tactflow.cli.terminal import show, table
 from tactflow.engine.errors import TactflowError
 from tactflow.message.result import Result
 from tactflow.sim import open_scene
+from tactflow.system.terminal import show, table
 from tactflow.vision.arrays import Floats
 from tactflow.vision.types import MarkerStatus
 

@@ -26,8 +26,8 @@ import cv2
 import numpy as np
 
 import tactflow
-from tactflow.cli.terminal import show, table
 from tactflow.message.result import Result
+from tactflow.system.terminal import show, table
 from tactflow.vision.arrays import Floats
 from tactflow.vision.types import MarkerStatus
 

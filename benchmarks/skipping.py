@@ -25,9 +25,9 @@ from tactflow import Result
 from tactflow.bench.judge import LARGE
 from tactflow.bench.lockstep import LockstepPipeline, TimedResult
 from tactflow.bench.timing import quiet
-from tactflow.cli.terminal import show, table
 from tactflow.report import figure
 from tactflow.sources import open_source
+from tactflow.system.terminal import show, table
 
 SENSORS = (
     *((name, "default", f"gels/{name}/*.*") for name in ("franka_mini", "seu_a", "sts_640", "sts_torque160")),

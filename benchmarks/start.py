@@ -25,7 +25,7 @@ import tactflow
 from tactflow.bench.judge import OUTLINES, Judged, compare, judge
 from tactflow.bench.label_file import FrameLabel, load_labels
 from tactflow.bench.timing import quiet
-from tactflow.cli.terminal import show, table
+from tactflow.system.terminal import show, table
 
 SIMULATED = {
     "press": "default",

@@ -31,12 +31,12 @@ from tactflow.bench import metrics
 from tactflow.bench.label_file import FrameLabel, load_labels
 from tactflow.bench.probability import fitted
 from tactflow.bench.score import DIRECTED
-from tactflow.cli.terminal import say, table
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.message.result import Result
 from tactflow.sources import open_source
 from tactflow.sources.files import load_image
 from tactflow.streaming import stream
+from tactflow.system.terminal import say, table
 from tactflow.vision.contact.certainty import contact_evidence
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry

@@ -26,9 +26,9 @@ from scipy.spatial import KDTree
 
 from tactflow.bench.label_file import FrameLabel, load_labels
 from tactflow.bench.probability import fitted
-from tactflow.cli.terminal import say, table
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.sources import open_source
+from tactflow.system.terminal import say, table
 from tactflow.vision.arrays import Flags, Floats, Indices
 from tactflow.vision.markers import MarkerTracker, NoMarkersError, detect_markers
 from tactflow.vision.markers.lattice import nearest

@@ -22,11 +22,11 @@ from typing import Any
 import cv2
 
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
-from tactflow.cli.options import positive
-from tactflow.cli.terminal import say
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.sources import open_source
 from tactflow.sources.files import ImageFiles
+from tactflow.system.arguments import positive
+from tactflow.system.terminal import say
 
 HOST = "127.0.0.1"
 TEXT = "text/plain; charset=utf-8"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from tactflow.cli.terminal import table
+from tactflow.system.terminal import table
 from tactflow.vision.arrays import Flags, Floats
 
 RIDGE: Final = 0.5

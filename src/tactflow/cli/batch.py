@@ -17,12 +17,13 @@ from tactflow.batch.run import Batch, Plan, Result, make_plan
 from tactflow.batch.store import Outcome, Store
 from tactflow.batch.work import Request, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
-from tactflow.cli.options import add_overrides, add_quiet, add_sensor, positive
-from tactflow.cli.terminal import progress_bar, say
+from tactflow.cli.options import add_overrides, add_quiet, add_sensor
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
+from tactflow.system.arguments import positive
 from tactflow.system.signals import INTERRUPTED, ending_handled
+from tactflow.system.terminal import progress_bar, say
 
 LONGEST = 200
 """Letters of a message in a list of many: two lines of a terminal."""

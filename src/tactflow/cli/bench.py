@@ -12,11 +12,11 @@ from tactflow.bench.results import load_errors, regressions
 from tactflow.bench.run import DEFAULT, MARKERLESS, run_bench
 from tactflow.bench.tables import sections
 from tactflow.cli.options import refuse_output, writing
-from tactflow.cli.terminal import notes, progress_bar, say, show
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.report import markdown
 from tactflow.system.extras import missing
+from tactflow.system.terminal import notes, progress_bar, say, show
 
 WORSE = 3
 """Exit code when `--against` finds something worse."""

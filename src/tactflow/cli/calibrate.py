@@ -36,15 +36,16 @@ from tactflow.calibration.refine import apparent_radius, refine_photometry
 from tactflow.calibration.samples import press_errors, summary
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
 from tactflow.cli.guide import Guide
-from tactflow.cli.options import add_overwrite, add_sensor, number, positive, refuse_output
-from tactflow.cli.terminal import notes, say, show, typed
+from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
 from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.run import Runner
 from tactflow.message.result import Result
 from tactflow.sources import open_source
+from tactflow.system.arguments import number, positive
 from tactflow.system.signals import INTERRUPTED, Interrupted
+from tactflow.system.terminal import notes, say, show, typed
 from tactflow.view.guided import Guiding
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale

@@ -11,9 +11,9 @@ from pathlib import Path
 import orjson
 
 from tactflow.cli.options import add_json
-from tactflow.cli.terminal import say, show
 from tactflow.sources.cameras import CameraInfo, list_cameras
 from tactflow.sources.usb import UsbHub, usb_hubs
+from tactflow.system.terminal import say, show
 
 NO_CAMERA = """no camera is plugged in (there is no /dev/video*)
   plug it in and look at the last lines of: sudo dmesg

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tactflow.cli.options import add_endpoint, add_json, seconds, writing
-from tactflow.cli.terminal import show, show_json, typed
+from tactflow.cli.options import add_endpoint, add_json, writing
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
+from tactflow.system.arguments import seconds
+from tactflow.system.terminal import show, show_json, typed
 
 COMMANDS = {
     "take-reference": "take the next frame as the reference",

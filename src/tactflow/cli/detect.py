@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.cli.options import add_json, add_overwrite, number, refuse_output, writing
-from tactflow.cli.terminal import printable, show_json
+from tactflow.cli.options import add_json, add_overwrite, refuse_output, writing
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
+from tactflow.system.arguments import number
 from tactflow.system.files import completed
 from tactflow.system.redaction import shown_address
+from tactflow.system.terminal import printable, show_json
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers

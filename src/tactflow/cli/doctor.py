@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactflow.cli.cameras import describe_hub
-from tactflow.cli.options import add_json, seconds
-from tactflow.cli.terminal import progress_bar, show, show_json, table
+from tactflow.cli.options import add_json
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.sources import KINDS
+from tactflow.system.arguments import seconds
 from tactflow.system.signals import ending_handled, interrupt
+from tactflow.system.terminal import progress_bar, show, show_json, table
 
 if TYPE_CHECKING:
     from tactflow.doctor import Finding

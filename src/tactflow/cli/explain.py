@@ -10,10 +10,10 @@ from pathlib import Path
 from tactflow.cli.options import add_json, add_pipeline, load_plan
 from tactflow.cli.progress import END_WORDS
 from tactflow.cli.statistics import Statistics, milliseconds
-from tactflow.cli.terminal import show, show_json
 from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
+from tactflow.system.terminal import show, show_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,12 +8,13 @@ import sys
 
 import numpy as np
 
-from tactflow.cli.options import add_endpoint, positive, seconds
-from tactflow.cli.terminal import printable, say
+from tactflow.cli.options import add_endpoint
 from tactflow.engine.errors import ConfigError, SourceError
 from tactflow.message.result import Result
 from tactflow.network.subscriber import DEFAULT_ENDPOINT, Subscriber
+from tactflow.system.arguments import positive, seconds
 from tactflow.system.signals import ending_handled, interrupt
+from tactflow.system.terminal import printable, say
 from tactflow.vision.types import MarkerStatus
 
 

@@ -10,11 +10,11 @@ from importlib import import_module
 from typing import Final, NoReturn
 
 from tactflow import __version__
-from tactflow.cli.terminal import printable, say
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.spelling import closest, did_you_mean
+from tactflow.system.terminal import printable, say
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "run": ("run", "run a pipeline"),

@@ -8,13 +8,13 @@ import time
 from importlib.resources import files
 
 from tactflow.cli.options import add_json, add_pipeline, add_quiet, load_plan
-from tactflow.cli.terminal import say, show, show_json, table
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan
 from tactflow.system.extras import opencv_conflict
+from tactflow.system.terminal import say, show, show_json, table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from tactflow.cli.terminal import progress_bar
 from tactflow.engine.run import Progress, Runner, RunResult
+from tactflow.system.terminal import progress_bar
 
 END_WORDS = {"eos": "end of source", "max_frames": "--max-frames reached", "signal": "stopped"}
 """`end` of the statistics, in words."""

@@ -8,13 +8,14 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from tactflow.cli.options import add_overwrite, add_quiet, number, refuse_output, writing
-from tactflow.cli.terminal import notes, progress_bar, say
+from tactflow.cli.options import add_overwrite, add_quiet, refuse_output, writing
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.recording import missing_packages
+from tactflow.system.arguments import number
 from tactflow.system.files import completed
 from tactflow.system.plugins import plugins
 from tactflow.system.spelling import did_you_mean
+from tactflow.system.terminal import notes, progress_bar, say
 
 if TYPE_CHECKING:
     from tactflow.message.result import Result

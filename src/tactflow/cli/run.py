@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from tactflow.api import ended_by_signals, make_runner
-from tactflow.cli.options import add_overwrite, add_pipeline, add_quiet, positive, refuse_output, seconds
+from tactflow.cli.options import add_overwrite, add_pipeline, add_quiet, refuse_output
 from tactflow.cli.pipelines import warn_of_opencv
 from tactflow.cli.progress import run_progress, summary
-from tactflow.cli.terminal import notes, say
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.overrides import Override
 from tactflow.config.shipped import find_pipeline
@@ -27,9 +26,11 @@ from tactflow.engine.run import Runner
 from tactflow.fleet.heartbeat import HANG_AFTER, progress_of, start_heartbeat
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
+from tactflow.system.arguments import positive, seconds
 from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED
+from tactflow.system.terminal import notes, say
 
 STATISTICS_BEGIN = '{\n "frames":'
 """How a statistics file begins. A file that begins otherwise is not replaced."""

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from tactflow.cli.options import add_overwrite, add_quiet, refuse_output, writing
-from tactflow.cli.terminal import progress_bar, say, table
 from tactflow.engine.errors import ConfigError
+from tactflow.system.terminal import progress_bar, say, table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

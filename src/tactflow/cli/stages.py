@@ -14,7 +14,6 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
 from tactflow.cli.options import add_json
-from tactflow.cli.terminal import say, show, show_json, table
 from tactflow.config.document import shown
 from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, names, resolve
@@ -23,6 +22,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.engine.ports import Port, describe_type
 from tactflow.system.spelling import did_you_mean
+from tactflow.system.terminal import say, show, show_json, table
 
 _TYPES = {"integer": "whole number", "string": "text", "boolean": "true | false", "object": "mapping"}
 """Type of JSON Schema -> how it is called here; others keep their names."""

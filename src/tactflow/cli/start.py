@@ -12,7 +12,6 @@ from typing import Final
 
 from tactflow.cli.cameras import NO_CAMERA
 from tactflow.cli.options import add_overwrite, refuse_output, writing
-from tactflow.cli.terminal import notes, printable, say, typed
 from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.doctor import Observation, examine
 from tactflow.doctor.observation import watch
@@ -22,6 +21,7 @@ from tactflow.sources.cameras import list_cameras
 from tactflow.system.files import completed
 from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
+from tactflow.system.terminal import notes, printable, say, typed
 from tactflow.tune.propose import FEWEST_FOUND, Attempt, Seen, distinct_pipelines, divide, propose
 from tactflow.tune.recording import CHANGE, Kept
 from tactflow.tune.report import changed_pipeline

@@ -7,13 +7,14 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tactflow.cli.options import add_json, add_overwrite, add_sensor, number, refuse_output, writing
-from tactflow.cli.terminal import notes, printable, say, show, show_json, typed
+from tactflow.cli.options import add_json, add_overwrite, add_sensor, refuse_output, writing
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
+from tactflow.system.arguments import number
 from tactflow.system.extras import missing
 from tactflow.system.files import completed
+from tactflow.system.terminal import notes, printable, say, show, show_json, typed
 
 _above_0 = number(float, sys.float_info.min, sys.float_info.max, "a number above 0")
 
