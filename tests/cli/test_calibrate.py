@@ -83,7 +83,7 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert "it still fits" in capsys.readouterr().out
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
     told = capsys.readouterr().out
-    assert "with another sensor or light, or where something touches it at the start" in told
+    assert "another sensor or light, or an object on the gel at the start" in told
     assert "calibrate again" in told
     # One press of another ball is no drift.
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:finger?frames=12") == 3

@@ -79,8 +79,8 @@ def test_each_stage_says_why_it_runs(capsys: pytest.CaptureFixture[str]) -> None
     assert facts["outline"]["memory"].startswith("none (pure)")
     assert facts["out"]["runs because"] == "it is a sink, at most 5 times a second"
     assert facts["unused"] == {
-        "pruned because": "no sink needs what it makes",
-        "memory": "none (pure): runs only when something wants its result",
+        "pruned because": "no sink needs its output",
+        "memory": "none (pure): runs only when its result is needed",
         "is": "./parts.py:Needy",
     }
 

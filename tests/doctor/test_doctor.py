@@ -169,7 +169,7 @@ def test_one_ctrl_c_ends_the_look_at_the_source_and_the_next_one_ends_the_comman
     words = ["doctor", "--source", "sim:idle?frames=20"]
     with ending_handled(interrupt):
         assert main(words) == 0
-        assert ": 5 frames looked at" in capsys.readouterr().out
+        assert ": 5 frames observed" in capsys.readouterr().out
         monkeypatch.setattr("tactflow.doctor.examine", signalled)
         assert main(words) == 130
 

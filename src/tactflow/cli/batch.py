@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="[PIPELINE] SRC",
         help="a pipeline (FILE.yaml, or the name of a shipped one; default: ./pipeline.yaml, else the "
-        "packaged one), then recordings: files, folders, quoted patterns, text files of such words",
+        "packaged one), then recordings: files, folders, quoted patterns, or text files that list them",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument(
@@ -53,17 +53,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="work on the Dask cluster of this scheduler, as in tcp://host:8786, instead",
+        help="use the Dask cluster of this scheduler instead, as in tcp://host:8786",
     )
     parser.add_argument(
         "--shard",
         type=_shard,
         default=(1, 1),
         metavar="I/N",
-        help="do only the I-th of N parts of the recordings, as in a job array; one more call without it "
-        "gathers the table and the page",
+        help="process only part I of N of the recordings, as in a job array; a final call without it writes "
+        "the table and the page",
     )
-    parser.add_argument("--fail-fast", action="store_true", help="begin nothing more once a recording fails")
+    parser.add_argument(
+        "--fail-fast", action="store_true", help="start no more recordings after one has failed"
+    )
     add_quiet(parser)
 
 

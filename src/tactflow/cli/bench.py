@@ -19,7 +19,7 @@ from tactflow.system.extras import missing
 from tactflow.system.terminal import notes, progress_bar, say, show
 
 WORSE = 3
-"""Exit code when `--against` finds something worse."""
+"""Exit code when an error has increased since the run of `--against`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "pipelines",
         nargs="*",
         metavar="PIPELINE",
-        help="measure these as well, beside the packaged ones; ./pipeline.yaml is measured if it is there",
+        help="also measure these, besides the packaged ones and ./pipeline.yaml if it exists",
     )
     add("--quick", action="store_true", help="three short scenes, half a minute")
     add(
@@ -76,8 +76,8 @@ def run(args: argparse.Namespace) -> int:
     if stored is None:
         return 0
     worse = regressions(result, stored, scenes)
-    verdict = f"{len(worse)} results got worse than in" if worse else "nothing got worse than in"
-    say("\n".join([f"tactflow: {verdict} {args.against}", *worse]))
+    verdict = f"{len(worse)} errors have" if worse else "no error has"
+    say("\n".join([f"tactflow: {verdict} increased since {args.against}", *worse]))
     return WORSE if worse else 0
 
 
@@ -86,13 +86,13 @@ def packaged_files() -> dict[str, Path]:
     return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, CLASSIC, MARKERLESS)}
 
 
-def _files(given: list[str]) -> dict[str, Path]:
-    """The packaged pipelines, `./pipeline.yaml` where it differs, and those that were given."""
+def _files(words: list[str]) -> dict[str, Path]:
+    """The packaged pipelines, `./pipeline.yaml` where it differs, and those on the command line."""
     files = packaged_files()
     local = Path("pipeline.yaml")
     if local.exists() and local.read_bytes() != files[DEFAULT].read_bytes():
         files["./pipeline"] = local
-    for word in given:
+    for word in words:
         path = find_pipeline(word)
         if not path.exists():
             raise ConfigError(f"{word}: there is no such pipeline file")

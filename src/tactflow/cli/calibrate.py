@@ -72,19 +72,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "what",
         nargs="*",
         metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE] | lens PICTURES",
-        help="a pipeline with the sensor's preprocess, to make a calibration (default: ./pipeline.yaml, else "
-        "the packaged one); or check, and a calibration file, to see how well it fits today; or force, and a "
-        "calibration file, to add to it how the force follows from the contact; or lens, and pictures of a "
-        "printed target, to get undistort and homography of a preprocess",
+        help="PIPELINE: calibrate the sensor of this pipeline (default: ./pipeline.yaml, else the packaged "
+        "one). check: test how well a calibration still fits. force: fit the force, and add it to a "
+        "calibration. lens: print undistort and homography for preprocess, from pictures of a printed target",
     )
     option(
         "--source",
         "--from",
         dest="source",
         metavar="SRC",
-        help="as in 'tactflow run': a camera, a recording or a folder of pictures. First the untouched gel, "
-        "then presses of the ball. For force, a recording with a CSV of the same name beside it, or a folder "
-        "of them",
+        help="as in 'tactflow run': a camera, a recording or a folder of pictures, first of the untouched "
+        "gel, then of presses of the ball. For force, a recording with a CSV of the same name beside it, or "
+        "a folder of them",
     )
     add_sensor(parser)
     option("--out", type=Path, metavar="FILE", help="default: calibration/SENSOR.yaml")
@@ -102,9 +101,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_millimetres,
         nargs=2,
         metavar=("WIDTH", "HEIGHT"),
-        help="what the whole processed picture shows, mm, where the gel has no dots of known pitch",
+        help="size of the whole processed picture, mm, if the gel has no dots of known pitch",
     )
-    option("--ball-radius", type=_millimetres, metavar="MM", help="of the ball; without it, scale only")
+    option(
+        "--ball-radius",
+        type=_millimetres,
+        metavar="MM",
+        help="radius of the ball; without it, only the scale is calibrated",
+    )
     option(
         "--presses",
         type=positive,
@@ -124,20 +128,20 @@ def _add_kind(parser: argparse.ArgumentParser) -> None:
         "--refine",
         action="store_true",
         help="start from the pipeline's calibration, such as the default of a kind of sensor, and adapt it "
-        "to this sensor by one press of the ball or more; its scale stays unless --pitch, --area or --target "
-        "is given",
+        "to this sensor by one or more presses of the ball; the scale is kept unless --pitch, --area or "
+        "--target is given",
     )
     option(
         "--darkness",
         action="store_true",
-        help="learn the depth from how much darker the gel becomes, for sensors in white light such as "
-        "9DTact; one press of the ball is enough",
+        help="fit depth to the darkening of the gel, for sensors in white light such as 9DTact; one press of "
+        "the ball is enough",
     )
     option(
         "--kind",
         metavar="NAME",
-        help="make the default for all sensors of a kind, such as 'GelSight Mini', with the errors that it "
-        "has on others",
+        help="make a default for all sensors of a kind, such as 'GelSight Mini'; its stated errors are those "
+        "on other sensors",
     )
 
 
@@ -147,20 +151,21 @@ def _add_target_and_force(parser: argparse.ArgumentParser) -> None:
     option(
         "--target",
         metavar="PICTURE",
-        help="scale from this raw picture of a printed target where the gel is, of --grid and --pitch",
+        help="take the scale from this raw picture of a printed target in the plane of the gel; it has the "
+        "size of --grid and --pitch",
     )
     option(
         "--grid",
         metavar="COLUMNSxROWS",
-        help="of the target: inner corners of its checkerboard, or dots with --dots",
+        help="size of the target: inner corners of the checkerboard, or dots with --dots",
     )
     option("--dots", action="store_true", help="the target is a grid of dots")
     option(
         "--csv",
         type=Path,
         metavar="FILE",
-        help="for force, and to check it: readings of the gauge, where they do not lie beside the recording; "
-        "columns t (s) or frame, fz (N), and fx and fy if there are",
+        help="for force and check: readings of the gauge, if not beside the recording; columns t (s) or "
+        "frame, fz (N), and optionally fx and fy",
     )
     option(
         "--offset",
@@ -205,7 +210,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
     refuse_output("--out", out, overwrite=args.overwrite, suffixes=(".yaml",))
-    _instruct(args, args.ball_radius, "; what was pressed is kept")
+    _instruct(args, args.ball_radius, "; finished presses are kept")
     kept = KeptPresses(out.with_suffix(".presses"))
     if args.fresh:
         kept.clear()
@@ -230,8 +235,8 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     elif kept.presses:
         say(f"to continue to {args.presses} presses, run the command again with --overwrite")
     say(
-        f"{out} is written. To use it, write into the pipeline file: calibration: {out}\n"
-        f"or give it to a run: {typed('--set', f'calibration={out}')}"
+        f"{out} is written. To use it, add to the pipeline file: calibration: {out}\n"
+        f"or to the command: {typed('--set', f'calibration={out}')}"
     )
     return 0
 
@@ -273,16 +278,16 @@ def _learned(
     error = max(scale.stderr[0] / scale.x, scale.stderr[1] / scale.y)
     if args.pitch is not None and args.target is None and error > LOOSE:
         say(
-            f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid, and these are "
-            "in none (rings are not, for one), or the picture is stretched. Measure a length instead: --area "
-            "WIDTH HEIGHT takes what the whole processed picture shows, --target a printed grid"
+            f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid, and either "
+            "these form none or the picture is stretched. Use --area WIDTH HEIGHT, the size of the whole "
+            "processed picture, or --target, a printed grid"
         )
     learned: dict[str, Any] = {}
     if args.ball_radius is not None:
         say(f"{len(session.presses)} presses; learning from them ...")
         learn = _darkness if args.darkness else _slopes
         learned = learn(args, session, scale, base)
-    made = Calibration(
+    calibration = Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
         raw_size=session.mapping.raw_size,
@@ -292,13 +297,13 @@ def _learned(
         look=small_picture(session.untouched),
         **learned,
     )
-    return made if args.kind is None else made.for_kind(args.kind)
+    return calibration if args.kind is None else calibration.for_kind(args.kind)
 
 
 def _slopes(
     args: argparse.Namespace, session: Session, scale: Scale, base: Calibration | None
 ) -> dict[str, Any]:
-    """What presses say of slopes, for `Calibration`."""
+    """The fit of the slopes, as fields of `Calibration`."""
     apparent = None
     if base is not None and base.slopes is not None:
         apparent = apparent_radius(session, scale, args.ball_radius, base)
@@ -311,7 +316,7 @@ def _slopes(
         say(question)
     for press, kept, misfit in zip(session.presses, fitted.kept, fitted.misfit, strict=True):
         if not kept:
-            say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees from a ball")
+            say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees off the surface of a ball")
     say(_photometric_words(fitted.found.model_dump()))
     return {"photometric": fitted.found, "slopes": fitted.model, "information": fitted.information}
 
@@ -319,7 +324,7 @@ def _slopes(
 def _darkness(
     args: argparse.Namespace, session: Session, scale: Scale, _: Calibration | None
 ) -> dict[str, Any]:
-    """What presses say of darkening, for `Calibration`."""
+    """The fit of the darkening, as fields of `Calibration`."""
     fitted = fit_darkness(session, scale, args.ball_radius)
     if (question := doubt(session, scale, args.ball_radius)) is not None:
         say(question)
@@ -342,21 +347,23 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     session = _find_presses(_load(args, pipeline), guide)
     misfit = calibration.misfit(session.mapping)
     if misfit is not None:
-        show([f"does not fit: {misfit}; name the pipeline that it was made with, or calibrate again"])
+        show([f"does not fit: {misfit}; use the pipeline that it was made with, or calibrate again"])
         return 3
     unlike = calibration.unlikeness(session.untouched)
     limit = f"up to {100 * UNLIKE:.0f} % fits"
     show([f"untouched gel: differs by {100 * unlike:.1f} % of its brightness; {limit}"])
     fits = [unlike <= UNLIKE]
     if unlike > UNLIKE:
-        show(["it also differs with another sensor or light, or where something touches it at the start"])
+        show(["another sensor or light, or an object on the gel at the start, also make it differ"])
     if then is not None:
         fits.append(_check_presses(calibration, then, session))
     elif calibration.darkness is not None:
         fits.append(_check_darkness(calibration, calibration.darkness, session))
     if args.csv is not None:
         fits.append(_check_force(args, path, calibration.force, pipeline))
-    show(["it still fits" if all(fits) else "it does not fit; if none of this explains it, calibrate again"])
+    show(
+        ["it still fits" if all(fits) else "it does not fit; unless a reason above applies, calibrate again"]
+    )
     return 0 if all(fits) else 3
 
 
@@ -419,22 +426,22 @@ def _add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> in
     for source, file in pairs.items():
         try:
             reference = _read(file, args.offset)
-            seen = _watch(_load(args, pipeline, source=source), path)
-            force.align(source, seen, reference, seen.change_at_rest)
+            features = _watch(_load(args, pipeline, source=source), path)
+            force.align(source, features, reference, features.change_at_rest)
         except TactflowError as problem:
             if len(pairs) == 1:
                 raise
             say(f"{source} is left out: {problem}")
             continue
-        watched[source], references[source] = seen, reference
-        say(f"{source}: {len(seen.touched)} frames, {seen.touched.sum()} of them with contact")
+        watched[source], references[source] = features, reference
+        say(f"{source}: {len(features.touched)} frames, {features.touched.sum()} of them with contact")
     if not watched:
         raise ConfigError(f"calibrate force: none of the {len(pairs)} recordings can be used")
     fit = force.fit_force(watched, references)
     for words in _force_words(fit, references):
         say(words)
     calibration.model_copy(update={"force": fit.entry}).save(path)
-    say(f"{path} has the force now")
+    say(f"the force is added to {path}")
     return 0
 
 
@@ -444,8 +451,8 @@ def _force_words(fit: force.Fit, references: Mapping[str, Reference]) -> list[st
     words.append(f"force, {entry.presses} presses: {_quality(entry.press, entry.left_out)}")
     if "volume" not in entry.press.stiffness:
         words.append(
-            "heights are not known, so it is by the change of the light and the area: good for objects "
-            "like these only"
+            "heights are not known, so the force is fitted to the change of light and the area: it is valid "
+            "only for objects like these"
         )
     if fit.turned is not None:
         side = ", mirrored" if fit.mirrored else ""
@@ -643,14 +650,14 @@ def _read(file: Path, offset: float) -> Reference:
 
 
 def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = "") -> None:
-    """Say what to do with the gel. ball_radius : mm; None without a ball. ended : what becomes of presses."""
+    """Print instructions. ball_radius : mm; None without a ball. ended : what Ctrl-C does."""
     if ball_radius is None:
         say("Leave the gel untouched.")
         return
     number = "One press" if args.presses == 1 else f"{args.presses} presses"
     say(
         "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, all "
-        f"over the gel and to several depths. {number} will do; Ctrl-C ends earlier{ended}."
+        f"over the gel and to several depths. {number} are enough; Ctrl-C ends earlier{ended}."
     )
 
 

@@ -71,7 +71,7 @@ def add_arguments_keys(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("keys"),
         metavar="FOLDER",
-        help="where they go; default: keys. The publisher's, once there, stay",
+        help="where to write them; default: keys. Existing keys of the publisher are kept",
     )
 
 

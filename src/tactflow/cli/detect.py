@@ -35,9 +35,9 @@ IN_JSON: Final = ("centers", "polarity", "dot_radius", "pitch")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `detect`."""
     parser.add_argument("first", nargs="?", metavar="SRC", help="the same as --source SRC")
-    parser.add_argument("--source", metavar="SRC", help="as in 'tactflow run': of the untouched gel")
+    parser.add_argument("--source", metavar="SRC", help="as in 'tactflow run', of the untouched gel")
     add_json(parser)
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw what was found, and why")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the dots, and why they were found")
     add_overwrite(parser)
     parser.add_argument("--frame", type=_index, default=0, metavar="N", help="index of the frame, from 0")
     parser.add_argument("--rotate", type=int, default=0, choices=(0, 90, 180, 270), help="as in preprocess")
@@ -98,7 +98,7 @@ def _near_rival(marks: Detection) -> Candidate | None:
 
 
 def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
-    """Lines that say what was found."""
+    """Lines about the dots."""
     sizes = f"radius {marks.dot_radius:.1f} px"
     if marks.radii is not None:
         sizes = f"radii {marks.radii.min():.1f} to {marks.radii.max():.1f} px, most {marks.dot_radius:.1f} px"

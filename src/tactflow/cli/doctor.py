@@ -1,4 +1,4 @@
-"""`tactflow doctor`: what is wrong with a sensor's pictures, what it does, and what to change."""
+"""`tactflow doctor`: what is wrong with a sensor's pictures, its effect, and the remedy."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from tactflow.doctor import Finding
 
 LIVE_SECONDS = 10.0
-"""How long a source is looked at unless told otherwise, s: time for some presses."""
+"""How long a source is observed by default, s: time for some presses."""
 WIDTH = 100
 """Characters of a line."""
 INDENT = 28
-"""Characters before what a fault does and what to change."""
+"""Characters before the effect and the remedy of a fault."""
 SIGNS = {"good": "ok", "warning": "WARN", "fault": "FAULT", "unknown": "?"}
 """Verdict -> how the table shows it."""
 
@@ -40,16 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "pipeline",
         nargs="?",
         metavar="PIPELINE",
-        help="read all sensors of a pipeline file together: the frame rates that it asks for, that the "
-        "drivers promise and that arrive, and the USB hubs that they share",
+        help="read all sensors of a pipeline file together, and compare the frame rates requested, promised "
+        "by the drivers and received",
     )
     parser.add_argument(
         "--seconds",
         type=seconds,
         default=LIVE_SECONDS,
         metavar="S",
-        help=f"how much of it to look at; default {LIVE_SECONDS:g}. Leave the gel untouched at first and at "
-        "last, and press it in between",
+        help=f"how long to observe it; default {LIVE_SECONDS:g}. Leave the gel untouched at the beginning "
+        "and end, and press it in between",
     )
     add_json(parser)
     parser.add_argument(
@@ -59,12 +59,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also write what a bug report needs into one JSON file: versions, pipeline, measurements; "
         "without passwords and tokens",
     )
-    parser.add_argument("--pipeline", dest="reported", metavar="PIPELINE", help="for --report: as for run")
+    parser.add_argument(
+        "--pipeline", dest="reported", metavar="PIPELINE", help="for --report: the pipeline file to include"
+    )
     parser.add_argument("--picture", action="store_true", help="for --report: include the first frame")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the findings; returns 0, or 3 if there is a fault (a warning is none).
+    """Print the findings; returns 0, or 3 if there is a fault, but not for a warning.
 
     Raises
     ------
@@ -81,23 +83,22 @@ def run(args: argparse.Namespace) -> int:
     pipeline = find_pipeline(args.reported)
     # The first signal ends only the look at the source.
     with ending_handled(interrupt), progress_bar("0 frames") as update:
-        seen = observe(args.source, args.seconds, lambda count: update(description=f"{count} frames"))
-    findings = examine(seen)
+        observation = observe(args.source, args.seconds, lambda count: update(description=f"{count} frames"))
+    findings = examine(observation)
     verdict = worst(findings)
-    title = f"{seen.description}: {seen.frames} frames looked at"
+    title = f"{observation.description}: {observation.frames} frames observed"
     counts = {v: sum(finding.verdict == v for finding in findings) for v in ("fault", "warning")}
-    summary = f"{counts['warning']} to look at"
-    if verdict == "fault":
-        summary = f"{counts['fault']} to change, {summary}"
-    elif verdict == "good":
-        summary = "nothing is wrong with these pictures"
+    summary = f"{counts['fault']} faults, {counts['warning']} warnings"
+    if verdict == "good":
+        summary = "no fault was found in these pictures"
     if args.report is not None:
         try:
-            write_bug_report(args.report, seen, findings, pipeline.read_text("utf-8"), picture=args.picture)
+            text = pipeline.read_text("utf-8")
+            write_bug_report(args.report, observation, findings, text, picture=args.picture)
         except OSError as error:
             raise ConfigError(f"--report: {args.report} cannot be written: {error.strerror}") from None
     if args.json:
-        facts = {"source": seen.source, "frames": seen.frames, "verdict": verdict}
+        facts = {"source": observation.source, "frames": observation.frames, "verdict": verdict}
         show_json({**facts, "checks": findings})
     else:
         show([title, *(line for finding in findings for line in _lines(finding)), summary])
@@ -137,7 +138,7 @@ def _rate(rate: float | None) -> str:
 
 
 def _lines(finding: Finding) -> Iterator[str]:
-    """A finding: one line, and below it what a fault does and what to change."""
+    """A finding: one line, and below it the effect and the remedy of a fault."""
     yield f"  {SIGNS[finding.verdict]:<6} {finding.name:<12} {finding.says}"
     for title, text in (("effect", finding.effect), ("change", finding.advice)):
         if text:

@@ -64,13 +64,13 @@ def _facts(
         is_pruned = node in plan.pruned
         facts = {"at": str(node.mark)}
         if is_pruned:
-            facts["pruned because"] = "no sink needs what it makes"
+            facts["pruned because"] = "no sink needs its output"
         else:
             facts["runs because"] = _reason(node, sinks[node.id])
             if skips := _skips(node, pipeline, uncertain):
                 facts["skipped when"] = "; ".join(skips)
         if node.component.kind == "stage":
-            facts["memory"] = "none (pure): runs only when something wants its result"
+            facts["memory"] = "none (pure): runs only when its result is needed"
             if node.component.memory == "stateful":
                 facts["memory"] = "stateful: sees every frame that is not dropped"
         if not is_pruned:
@@ -91,7 +91,7 @@ def _reason(node: Node, sinks: list[str]) -> str:
         rate = "" if node.max_rate is None else f", at most {node.max_rate:g} times a second"
         cls = node.component.cls
         decides = issubclass(cls, Sink) and cls.wants is not Sink.wants
-        return f"it is a sink{rate}{'; it says for each frame whether it wants it' if decides else ''}"
+        return f"it is a sink{rate}{'; it decides for each frame whether it needs it' if decides else ''}"
     *others, last = sinks
     return f"{', '.join(others)} and {last} need it" if others else f"{last} needs it"
 

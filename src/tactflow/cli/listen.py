@@ -23,15 +23,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_endpoint(parser, DEFAULT_ENDPOINT)
     parser.add_argument("--sensor", metavar="NAME", help="only this sensor; default: all")
     parser.add_argument(
-        "--json", action="store_true", help="the messages as they are, one JSON object per line"
+        "--json", action="store_true", help="print the messages unchanged, one JSON object per line"
     )
-    parser.add_argument("--latest", action="store_true", help="skip results that are out of date")
+    parser.add_argument(
+        "--latest", action="store_true", help="print only the newest results, skipping older ones"
+    )
     parser.add_argument("--count", type=positive, metavar="N", help="end after N messages")
     parser.add_argument(
         "--timeout",
         type=seconds,
         metavar="S",
-        help="end when no message has come for S seconds; an error (exit code 4) if none came at all",
+        help="end when no message has arrived for S seconds; an error (exit code 4) if none arrived at all",
     )
 
 

@@ -51,7 +51,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fps",
         type=_frame_rate,
-        help="of the dataset (default: that of the first recording; hdf5 and zarr: every frame at its time)",
+        help="frame rate of the dataset (default: that of the first recording; hdf5 and zarr: every frame)",
     )
     parser.add_argument(
         "--task", default="touch", help="description of the task, stored in the dataset (default: touch)"
@@ -103,7 +103,7 @@ def _exporter(name: str) -> Callable[..., None]:
 def _episodes(
     recordings: Sequence[str], pipeline: str | None, started: list[str]
 ) -> Iterator[tuple[str, Iterable[Result]]]:
-    """The name and the results of each recording; `started` grows by each that is begun."""
+    """The name and the results of each recording; appends the name of each that is started to `started`."""
     from tactflow.streaming import stream
 
     for recording in recordings:

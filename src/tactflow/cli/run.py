@@ -61,13 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sensor",
         metavar="NAME",
-        help="of a pipeline with several sensors, run only this one, in this process",
+        help="run only this sensor of a pipeline with several, in this process",
     )
     parser.add_argument("--stats", metavar="PATH", help="write run statistics as JSON at exit")
     parser.add_argument(
         "--end-with-stdin",
         action="store_true",
-        help="end the run when standard input ends, that is, with the program that started this one",
+        help="end the run when standard input ends, and so with the program that started this one",
     )
     parser.add_argument(
         "--sign-of-life",
@@ -80,8 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         default=HANG_AFTER,
         metavar="SECONDS",
-        help="with several sensors, kill and restart one that has given no sign of life for this time "
-        "(default: %(default)g, also the least while it starts); longer than the slowest stage takes",
+        help="with several sensors, restart one that has given no sign of life for this time (default: "
+        "%(default)g, also the minimum while it starts); must be longer than the slowest stage takes",
     )
     add_quiet(parser)
     parser.add_argument(
@@ -221,7 +221,7 @@ def _write_statistics(path: str, statistics: Mapping[str, Any]) -> bool:
 
 
 def _stop_at_end_of_input(runner: Runner) -> None:
-    """Body of a thread: stop the run when whoever writes to standard input is gone."""
+    """Body of a thread: stop the run at the end of standard input."""
     with suppress(OSError):
         while os.read(sys.stdin.fileno(), 4096):
             pass

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "name",
         nargs="?",
         metavar="NAME",
-        help="a scene, with settings if wanted, as in 'press?frames=300&seed=7' (see --list)",
+        help="a scene, optionally with settings, as in 'press?frames=300&seed=7' (see --list)",
     )
     parser.add_argument(
         "--out",
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=".jsonl (one line a frame), in raw pixels; .csv for force",
     )
     add_overwrite(parser, "these files")
-    parser.add_argument("--list", action="store_true", help="print the scenes and the settings they know")
+    parser.add_argument("--list", action="store_true", help="print the scenes and their settings")
     add_quiet(parser)
 
 

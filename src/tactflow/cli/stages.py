@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "name",
         nargs="?",
         metavar="NAME",
-        help="explain one: a built-in, a plug-in, module:Class or ./file.py:Class, which is run",
+        help="explain this one: a built-in, a plug-in, module:Class or ./file.py:Class (its code is run)",
     )
     add_json(parser, "a JSON array with ports, and the parameters as JSON Schema")
 
@@ -106,7 +106,7 @@ def _find(name: str) -> Component:
             if not is_word(name) or name in names(section):
                 errors.append(error)
     if errors:
-        # A class in a file is tried as a stage, then as a sink; the last complaint is the one that counts.
+        # A class in a file is tried as a stage, then as a sink; the last error is reported.
         raise errors[-1]
     known = [*names("stages"), *names("sinks")]
     raise ConfigError(f"there is no stage or sink {name!r}{did_you_mean(name, known)}")

@@ -28,13 +28,13 @@ from tactflow.tune.report import changed_pipeline
 from tactflow.view.questions import Questions
 
 SETTLE_SECONDS: Final = 3.0
-"""With --yes, time for exposure and white balance before the gel is looked at, s: `settle` of capture."""
+"""With --yes, time for exposure and white balance to settle, s: `settle` of capture."""
 REST_SECONDS: Final = 2.0
-"""How long the untouched gel is looked at, s."""
+"""How long the untouched gel is observed, s."""
 PRESS_SECONDS: Final = 10.0
 """With --yes, how long to wait for presses, s."""
 RECORDED_SECONDS: Final = 30.0
-"""How much of a recording is looked at, s."""
+"""How much of a recording is read, s."""
 EDGES: Final = {"0": "top", "270": "right", "180": "bottom", "90": "left"}
 """Value of `rotate`, degrees clockwise -> edge of the picture that it brings to the top."""
 
@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", nargs="?", metavar="SRC", help="as in 'tactflow run'; default: a camera that is plugged in"
     )
-    parser.add_argument("--yes", action="store_true", help="take every proposal, ask nothing; for scripts")
+    parser.add_argument(
+        "--yes", action="store_true", help="accept every proposal without asking; for scripts"
+    )
     parser.add_argument(
         "--out", type=Path, default=Path("pipeline.yaml"), metavar="FILE", help="default: pipeline.yaml"
     )

@@ -25,18 +25,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "pipeline",
         nargs="?",
         metavar="PIPELINE",
-        help="what to start from; default: ./pipeline.yaml, else the packaged one that fits the gel",
+        help="the pipeline to vary; default: ./pipeline.yaml, else the packaged one that fits the gel",
     )
     parser.add_argument(
         "--source",
         required=True,
         metavar="RECORDING",
-        help="of the sensor: untouched at first, then some presses; as 'tactflow run --source', not live",
+        help="recording of the sensor, first untouched, then with some presses; as 'tactflow run --source'",
     )
     parser.add_argument(
-        "--max-error", type=_above_0, metavar="PX", help="largest error, pixels of the camera's picture"
+        "--max-error",
+        type=_above_0,
+        metavar="PX",
+        help="limit for the largest error, pixels of the camera image",
     )
-    parser.add_argument("--max-ms", type=_above_0, metavar="MS", help="CPU time of a frame with contact")
+    parser.add_argument(
+        "--max-ms", type=_above_0, metavar="MS", help="limit for the CPU time of a frame with contact"
+    )
     add_sensor(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"

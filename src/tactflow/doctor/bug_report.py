@@ -17,11 +17,11 @@ from tactflow.system.redaction import public_address, without_secrets
 
 
 def write_bug_report(
-    path: Path, seen: Observation, findings: Sequence[Finding], pipeline: str, *, picture: bool = False
+    path: Path, observation: Observation, findings: Sequence[Finding], pipeline: str, *, picture: bool = False
 ) -> None:
     """Write the file, JSON; what is there is replaced.
 
-    seen, findings : what `observe` and `examine` have returned. pipeline : text of the pipeline file; tokens
+    observation, findings : of `observe` and `examine`. pipeline : text of the pipeline file; tokens
     and passwords are removed from it, and from the address of the source. picture : include the first frame,
     as PNG in base64.
 
@@ -31,21 +31,21 @@ def write_bug_report(
     """
     report = {
         "versions": facts("", None),
-        "source": public_address(seen.description),
+        "source": public_address(observation.description),
         "frames": {
-            "count": seen.frames,
-            "repeated": seen.repeated,
-            "missing": seen.missing,
-            "nominal_rate": seen.nominal,
-            "size": list(seen.pairs[0].image.shape),
-            "stopped": public_address(seen.stopped),
+            "count": observation.frames,
+            "repeated": observation.repeated,
+            "missing": observation.missing,
+            "nominal_rate": observation.nominal,
+            "size": list(observation.pairs[0].image.shape),
+            "stopped": public_address(observation.stopped),
         },
         "checks": findings,
         "pipeline": without_secrets(pipeline),
         "picture": None,
     }
     if picture:
-        _, png = cv2.imencode(".png", seen.pairs[0].image)
+        _, png = cv2.imencode(".png", observation.pairs[0].image)
         report["picture"] = base64.b64encode(png.tobytes()).decode()
     options = orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS
     with completed(path) as partial:

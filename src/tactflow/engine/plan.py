@@ -90,7 +90,7 @@ class Plan:
     @property
     def warnings(self) -> list[str]:
         """What the user should know before the run."""
-        return [f"{node.mark}  {node.id}: not run, because no sink needs what it makes" for node in self.idle]
+        return [f"{node.mark}  {node.id}: not run, because no sink needs its output" for node in self.idle]
 
 
 def dependencies(node: Node) -> set[str]:
