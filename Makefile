@@ -2,7 +2,6 @@
 # make test         lint, types, tests
 # make soak         what takes longer: faults in running processes, a million frames (two hours)
 # make load         results, drops, latency and memory against the load (five minutes)
-# make fuzz         damaged input to every parser, SECONDS for each
 # make audit        known weaknesses of the packages that are used, where the list can be reached
 # make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
 # make docs         the site in build/site, from docs/ and examples/gallery (an environment of its own)
@@ -26,7 +25,7 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
 
-.PHONY: run test soak load fuzz audit lock lint types docs packages ros-env lerobot-env lerobot-datasets peers peers-page \
+.PHONY: run test soak load audit lock lint types docs packages ros-env lerobot-env lerobot-datasets peers peers-page \
 	system-deps clean
 
 run: $(VENV)/.installed
@@ -42,10 +41,6 @@ soak: $(VENV)/.installed-test
 
 load: $(VENV)/.installed-test
 	$(PY) benchmarks/load.py
-
-fuzz: SECONDS := 300
-fuzz: $(VENV)/.installed-test
-	$(PY) -m tests.fuzz --seconds $(SECONDS) --seed $$(date +%s)
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .

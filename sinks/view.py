@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,7 +69,6 @@ class View(Guiding):
             description="folder in which the views of a run of several sensors tell each other where they "
             "are; such a run sets it by itself",
         )
-        open_browser: bool = Field(False, description="open the page in the desktop's browser")
 
         @model_validator(mode="after")
         def _guarded(self) -> View.Params:
@@ -128,11 +126,7 @@ class View(Guiding):
         self._server = Server(self._hub, listener, p.host, p.token)
         self._server.start()
         self.description = address(p.host, port)
-        with_token = self.description + (f"?token={p.token}" if p.token else "")
-        log.info("view: %s", with_token)
-        if p.open_browser:
-            # It may take its time, or wait for the browser to end.
-            threading.Thread(target=webbrowser.open, args=(with_token,), daemon=True).start()
+        log.info("view: %s%s", self.description, f"?token={p.token}" if p.token else "")
 
     def wants(self) -> bool:
         """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""

@@ -18,7 +18,7 @@ from tactflow.message.result import Result, encode_message
 from tactflow.network.address import Address
 from tactflow.network.commands import Commands
 from tactflow.network.control_socket import ControlSocket
-from tactflow.network.publisher import SEND_BUFFER, Publisher
+from tactflow.network.publisher import Publisher
 from tactflow.ports import Image
 
 log = logging.getLogger("tactflow")
@@ -71,13 +71,6 @@ class Zmq(Sink):
             le=LARGEST,
             description="messages that may wait for each subscriber (32: half a second at 60 Hz); more "
             "bridges its pauses, fewer keep it fresher",
-        )
-        send_buffer: int = Field(
-            SEND_BUFFER,
-            ge=1024,
-            le=LARGEST,
-            description="kernel send buffer per subscriber, bytes; large ones hold seconds of stale "
-            "messages, smaller ones than this slow down messages that are longer (depth maps, field)",
         )
         linger: float = Field(
             1.0, ge=0, le=60, description="time to deliver the last messages at the end of a run, s"
@@ -199,7 +192,7 @@ class Zmq(Sink):
         Raises StageError if an address is taken or cannot be bound, or the keys are wrong.
         """
         p = self.params
-        self._publisher = Publisher(p.endpoint, p.backlog, p.send_buffer, p.keys)
+        self._publisher = Publisher(p.endpoint, p.backlog, p.keys)
         self.endpoint = self._publisher.endpoint
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
         log.info("publishing %s", self.description)

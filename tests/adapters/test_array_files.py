@@ -15,11 +15,10 @@ import pytest
 
 import tactflow
 from tactflow.adapters import array_files
-from tactflow.adapters.array_files import FILL, UNIT, Hdf5, Zarr, write
+from tactflow.adapters.array_files import Hdf5, Zarr, write
 from tactflow.cli.main import main
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame
-from tactflow.message.columns import frame_columns
 from tactflow.message.result import Result
 from tactflow.sources import open_source
 from tactflow.vision.types import Markers
@@ -86,21 +85,6 @@ def test_its_attributes_say_what_is_in_it(name: str, exported: tuple[Path, list[
     assert {key: file[key].attrs.get("units", "") for key in units} == units
     assert file["markers_status"].attrs["description"] == "(N, M): 0 tracked, 1 inferred, 2 lost"
     assert file["flow_count"].attrs["missing"] == -1
-
-
-def test_every_length_angle_and_force_has_its_unit() -> None:
-    units = {c.name: set(UNIT.findall(c.description)) for c in frame_columns() if c.kind in FILL}
-    assert {name for name, found in units.items() if len(found) > 1} == {
-        *(f"pose_stderr_{part}" for part in "xyz456"),
-        "pose_covariance",
-    }
-    assert {name for name, found in units.items() if not found} == {
-        *("seq", "pose_since", "contact_slope", "contact_confidence", "contact_probability"),
-        *("flow_count", "features_values"),
-        *("contact_normal_x", "contact_normal_y", "contact_normal_z"),
-        *("flow_divergence", "flow_divergence_stderr", "flow_shear_1", "flow_shear_2", "flow_shear_stderr"),
-        *("slip_slipping", "slip_stick_ratio", "force_in_range"),
-    }
 
 
 @pytest.mark.parametrize("name", SUFFIXES)

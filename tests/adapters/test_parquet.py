@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import random
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +16,6 @@ from tactflow.adapters.parquet import TABLES, Parquet
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.schema import message_schema
 from tactflow.vision.types import Depth, Force, Scale, Slip
-from tests.clock import until
 from tests.faults.rig import array, run
 from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, Results, build_message, result_of
 
@@ -157,37 +152,6 @@ def test_the_example_of_the_page_runs(
     page = (REPOSITORY / "docs" / "recordings.md").read_text()
     exec("import pandas" + page.partition("```python\nimport pandas")[2].partition("```")[0], {})
     assert "contact_center_x" in capsys.readouterr().out
-
-
-KILLED = """
-import sys
-from pathlib import Path
-from tests.adapters.test_parquet import FOUND, opened, result_of, tick
-
-folder = Path(sys.argv[1])
-sink = opened(folder, flush=0.005)
-for seq in range(1_000_000):
-    sink.write(result_of(tick(seq), FOUND[seq % len(FOUND)]))
-    (folder / "written").write_text(str(sink.counters()["frames"]))
-"""
-
-
-@pytest.mark.slow
-def test_what_was_written_can_be_read_after_kill_9_at_random_moments(tmp_path: Path) -> None:
-    moments = random.Random(16)
-    for turn in range(10):
-        folder = tmp_path / str(turn)
-        with subprocess.Popen([sys.executable, "-c", KILLED, str(folder)]) as process:
-            until(lambda folder=folder: any(folder.glob("frames/part-*")))
-            time.sleep(moments.uniform(0, 0.2))
-            written = int((folder / "written").read_text() or 0)
-            process.kill()
-        frames = rows(folder, "frames")
-        assert [row["seq"] for row in frames] == list(range(len(frames)))
-        assert len(frames) >= max(written, 1)
-        with_dots = [row["seq"] for row in frames if row["seq"] % len(FOUND)]
-        dots = sorted({row["seq"] for row in rows(folder, "markers")})
-        assert dots[: len(with_dots)] == with_dots
 
 
 def test_a_run_puts_its_pipeline_and_calibration_into_every_table(tmp_path: Path) -> None:

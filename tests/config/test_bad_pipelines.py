@@ -7,13 +7,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from tactflow.cli.main import main
-from tactflow.config.load import load_pipeline
-from tactflow.engine.errors import ConfigError
-from tactflow.engine.plan import make_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = Path(__file__).with_name("parts.py")
@@ -291,31 +286,3 @@ def test_a_mistake_in_an_own_file_is_shown_with_its_line(
     assert "bad.yaml:4:14  stages.own.use: " in err
     assert re.search(words, err), err
     assert "Traceback" not in err
-
-
-def load_or_refuse(path: Path) -> bool:
-    """True if the file loads, False if it is refused with a place; anything else is an error."""
-    try:
-        make_plan(load_pipeline(path))
-    except ConfigError as error:
-        message = str(error)
-    else:
-        return True
-    assert re.search(r"mutant\.yaml:\d+:\d+  ", message), message
-    return False
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.one_of(
-        st.binary(max_size=60),
-        st.text(max_size=60).map(str.encode),
-        st.text(alphabet="stages:ik \n\t{}[]&*!-'\"|>#%@0123.~\\", max_size=80).map(
-            lambda s: b"stages:\n" + s.encode()
-        ),
-    )
-)
-def test_no_file_at_all_ends_in_a_traceback(tmp_path: Path, data: bytes) -> None:
-    path = tmp_path / "mutant.yaml"
-    path.write_bytes(data)
-    assert not load_or_refuse(path)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import zmq
 
-from tactflow.network.publisher import MOST_EVENTS, SEND_BUFFER, Publisher
+from tactflow.network.publisher import MOST_EVENTS, Publisher
 
 TOPIC = b"tactflow.main "
 FLOOD = 5 * MOST_EVENTS
@@ -16,7 +16,7 @@ FLOOD = 5 * MOST_EVENTS
 
 @pytest.fixture
 def publisher() -> Iterator[Publisher]:
-    opened = Publisher("tcp://127.0.0.1:*", 32, SEND_BUFFER)
+    opened = Publisher("tcp://127.0.0.1:*", 32)
     yield opened
     opened.close(0)
 

@@ -546,15 +546,6 @@ def test_a_taken_port_gives_way_to_the_next_free_one(view: Views, caplog: pytest
         assert get(sink).status == 200
 
 
-def test_the_browser_is_opened_only_on_request(monkeypatch: pytest.MonkeyPatch, view: Views) -> None:
-    opened: list[str] = []
-    monkeypatch.setattr("tactflow.sinks.view.webbrowser.open", opened.append)
-    view()
-    asked = view(open_browser=True)
-    until(lambda: opened)
-    assert opened == [asked.description]
-
-
 @pytest.mark.parametrize(
     "params",
     [

@@ -25,20 +25,6 @@ BACKLOG = 32
 """Messages that may wait for each viewer. Chosen by hand."""
 
 
-class _ServerLog(logging.Handler):
-    """Passes the first complaint of the server's own log on to ours, and counts all: anybody may connect."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.complaints = 0
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Count, and pass on the first."""
-        self.complaints += 1
-        if self.complaints == 1:
-            log.warning("foxglove: %s (more of this is only counted)", record.getMessage())
-
-
 class Foxglove(Sink):
     """Serves the channels of a recording live: `/main/image`, `/main/annotations`, `/main/results`, and
     `/main/pose`, the pose of the object for the 3D panel, in metres.
@@ -88,7 +74,6 @@ class Foxglove(Sink):
         self._context: Context | None = None
         self._channels: dict[str, Channel] = {}
         self._sent = 0
-        self._log = _ServerLog()
 
     def open(self) -> None:
         """Begin to serve; afterwards `address` is the real one.
@@ -114,9 +99,8 @@ class Foxglove(Sink):
                 topic, schema=schema, message_encoding=kind.packing, context=context
             )
         p = self.params
-        server_log = logging.getLogger("foxglove")
-        server_log.addHandler(self._log)
-        server_log.propagate = False
+        # It complains of every connection that is not Foxglove's, and anybody may connect.
+        logging.getLogger("foxglove").setLevel(logging.ERROR)
         try:
             self._server = foxglove.start_server(
                 name="tactflow", host=p.host, port=p.port, context=context, message_backlog_size=BACKLOG
@@ -134,8 +118,8 @@ class Foxglove(Sink):
         return any(channel.has_sinks() for channel in list(self._channels.values()))
 
     def counters(self) -> dict[str, int]:
-        """messages : sent so far. complaints : of the server, as about connections of other programs."""
-        return {"messages": self._sent, "complaints": self._log.complaints}
+        """messages : sent so far."""
+        return {"messages": self._sent}
 
     def write(self, result: Result) -> None:
         """Send the channels that somebody looks at; never waits."""
@@ -165,7 +149,6 @@ class Foxglove(Sink):
             channel.close()
         self._channels = {}
         self._context = None
-        logging.getLogger("foxglove").removeHandler(self._log)
 
 
 def _encode_pose(result: Result, sensor: str, nanoseconds: int) -> bytes | None:

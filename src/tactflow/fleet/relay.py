@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import zmq
 
 from tactflow.engine.contract import Publication
-from tactflow.network.publisher import SEND_BUFFER, Publisher
+from tactflow.network.publisher import Publisher
 
 POLL_MS = 100
 """Poll interval of the relay's thread, ms; also how long the upstream must be quiet before the relay ends."""
@@ -30,7 +30,7 @@ def relay(publication: Publication, upstream: Sequence[str]) -> Iterator[None]:
     ------
     StageError : the address cannot be bound, or the keys are invalid.
     """
-    publisher = Publisher(publication.address, publication.backlog, SEND_BUFFER, publication.keys)
+    publisher = Publisher(publication.address, publication.backlog, publication.keys)
     stop = threading.Event()
     thread = threading.Thread(
         target=_forward,

@@ -1,4 +1,4 @@
-"""Addresses of ZeroMQ sockets, and who can reach them."""
+"""Addresses of ZeroMQ sockets."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Sockets that others connect to over ZeroMQ: to read results, to send commands. They connect with
-`connection.Connection`."""
+"""ZeroMQ sockets of a run: for results, and for commands. Clients connect with `connection.Connection`."""
 
 from __future__ import annotations
 
@@ -21,35 +20,35 @@ if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
 LONGEST_REQUEST = 4096
-"""Bytes of a subscription or a command, which have some twenty. ZeroMQ keeps subscriptions in a tree and
-takes a step on the stack for each of their bytes: one of a megabyte ends the process."""
+"""Largest subscription or command, bytes; usual ones have some twenty. ZeroMQ keeps subscriptions in a tree
+and recurses once per byte: a subscription of a megabyte overflows the stack."""
 OPTIONS: dict[int, int] = {
     zmq.MAXMSGSIZE: LONGEST_REQUEST,
-    # A connection that has not finished its handshake by then is closed, ms. Chosen by hand.
+    # Handshake timeout, ms. Chosen by hand.
     zmq.HANDSHAKE_IVL: 5000,
-    # After so much silence the system asks whether the other machine is still there, s. Chosen by hand.
+    # Idle time before the first keep-alive probe, s. Chosen by hand.
     zmq.TCP_KEEPALIVE: 1,
     zmq.TCP_KEEPALIVE_IDLE: 10,
 }
 
 
 class BoundSocket:
-    """A bound socket with a context, and with keys an authenticator, of its own.
+    """A bound socket with its own context and, if keys are required, its own authenticator.
 
     Parameters
     ----------
     kind : ZeroMQ's type of the socket. endpoint : address to bind.
-    hint : what to try where the address is taken. options : ZeroMQ's option -> value.
-    keys : the publisher's folder made by `tactflow keys new`: only those who have a key in it are admitted,
-        and everything is encrypted. None admits everybody who can reach the address.
+    hint : advice if the address is in use. options : ZeroMQ's option -> value.
+    keys : the publisher's folder made by `tactflow keys new`: only clients with a key in it are admitted, and
+        everything is encrypted. None admits every client that can reach the address.
 
     Raises
     ------
-    StageError : the address is invalid, taken or cannot be bound, or the keys are wrong. Nothing stays open.
+    StageError : the address is invalid, in use or cannot be bound, or the keys are wrong.
 
     Attributes
     ----------
-    socket : belongs to one thread at a time. endpoint : the real address, with the port that was picked.
+    socket : to be used by one thread at a time. endpoint : the bound address, with the actual port.
     """
 
     def __init__(
@@ -81,7 +80,7 @@ class BoundSocket:
         self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def close(self, linger: float = 0.0) -> None:
-        """Deliver what is under way, for at most `linger` seconds, and free the address. May come twice."""
+        """Deliver pending messages for at most `linger` seconds, then free the address. Idempotent."""
         if self._authenticator is not None:
             self._authenticator.stop()
             self._authenticator = None
@@ -90,12 +89,12 @@ class BoundSocket:
 
 
 def _refuse_taken_path(path: Path, endpoint: str, hint: str) -> None:
-    """ZeroMQ would delete whatever is at the path of an ipc address, even the socket of another run."""
+    """Refuse the path of a file or of another run's socket: ZeroMQ would delete it."""
     if sys.platform == "win32" or not path.exists():
         return
     if not path.is_socket():
         raise StageError(f"{endpoint}: {path} is a file; an address needs an unused path")
     with system_socket.socket(system_socket.AF_UNIX) as probe:
-        # Nobody answers at a socket that a killed run has left behind.
+        # A socket left behind by a killed run refuses the connection, and may be replaced.
         if probe.connect_ex(str(path)) == 0:
             raise StageError(f"{endpoint} is in use: {hint}")

@@ -1,4 +1,4 @@
-"""Commands to a run from outside: from its live page, and from programs over ZeroMQ."""
+"""Commands to a run, from its live page and from programs over ZeroMQ."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from tactflow.engine.contract import Source
 from tactflow.engine.control import Control
 
 Answer = dict[str, Any]
-"""`message`, what was done, in words; of recordings also `path`."""
+"""`message`: what was done; for recordings also `path`."""
 
 
 class RefusedError(Exception):
-    """The command does not exist, or is not possible now; says why."""
+    """The command does not exist or is not possible now, for the reason given."""
 
 
 class Commands:
-    """Carries out commands to a run, from any thread. Raises RefusedError where `refusal` gives a reason.
+    """Executes commands on a run, from any thread. Raises RefusedError if `refusal` gives a reason.
 
-    control : handle on the run; None: nothing is possible.
+    control : handle on the run; None refuses every command.
     """
 
     def __init__(self, control: Control | None) -> None:
@@ -61,7 +61,7 @@ class Commands:
         return {"message": "the next frame is taken as the reference"}
 
     def record(self, on: bool) -> Answer:
-        """Begin or finish a recording, which touches the disk; raises StageError if it cannot be written."""
+        """Start or finish a recording. Raises StageError if it cannot be written."""
         recorder = self._admitted("record").recorder()
         assert recorder is not None
         was_recording = recorder.recording
@@ -76,7 +76,7 @@ class Commands:
         self._admitted("stop").stop()
 
     def state(self) -> dict[str, Any]:
-        """paused, recording : bool. source : its state in words, None before it is opened."""
+        """paused, recording : bool. source : state of the source in words, None before it is opened."""
         if self._control is None:
             return {"paused": False, "recording": False, "source": None}
         source, recorder = self._control.source, self._control.recorder()

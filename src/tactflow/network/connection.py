@@ -1,5 +1,4 @@
-"""The socket of a program that connects to a running tactflow: `Subscriber` and `RemoteControl`. They connect
-to a `bound_socket.BoundSocket`."""
+"""The client side of a `bound_socket.BoundSocket`: base of `Subscriber` and `RemoteControl`."""
 
 from __future__ import annotations
 
@@ -17,19 +16,18 @@ from tactflow.network.keys import use_keys
 from tactflow.system.files import expanded
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-"""The other side does not admit us; ZeroMQ does not try again."""
+"""The server rejected our keys; ZeroMQ does not retry."""
 HUNG_UP = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-"""The other side closed the connection during the handshake; ZeroMQ tries again."""
+"""The server closed the connection during the handshake; ZeroMQ retries."""
 MOST_HANG_UPS = 5
-"""In a row, after which we are not admitted: one or two also happen when the other side is ended. Chosen by
-hand."""
+"""Consecutive hang-ups that count as a rejection; a server that ends causes one or two. Chosen by hand."""
 
 
 class Connection:
-    """A connected socket with a context of its own that notices when it is not admitted; a context manager.
+    """A connected socket with its own context that detects rejection; a context manager.
 
     kind : ZeroMQ's type of the socket. endpoint : address to connect to. options : ZeroMQ's option -> value.
-    keys : the subscriber's folder made by `tactflow keys new`; None where the run requires no keys.
+    keys : the subscriber's folder made by `tactflow keys new`; None if the run requires no keys.
 
     Raises
     ------
@@ -62,9 +60,9 @@ class Connection:
             raise
 
     def _wait(self, until: float) -> bool:
-        """Wait for a message until this time of `time.monotonic`; False if none came.
+        """Wait for a message until a time of `time.monotonic`; False on timeout.
 
-        Raises PermissionError if the other side does not admit us.
+        Raises PermissionError if the server rejects us.
         """
         while self._hang_ups < MOST_HANG_UPS:
             left = max(until - time.monotonic(), 0.0)
@@ -84,7 +82,7 @@ class Connection:
         raise PermissionError(f"{self.endpoint} {reason}")
 
     def close(self) -> None:
-        """Disconnect. May be called twice."""
+        """Disconnect. Idempotent."""
         if not self._socket.closed:
             self._socket.disable_monitor()
         self._handshakes.close(0)

@@ -1,8 +1,6 @@
-"""The socket over which other programs control a run: a JSON object in, a JSON object out.
+"""The socket for commands to a run: one JSON object per request, one per reply. It has its own thread.
 
-    {"do": "pause"}  ->  {"ok": true, "message": "paused", "state": {"sensor": "main", "paused": true, ...}}
-
-It has a thread of its own, which the run never waits for.
+{"do": "pause"}  ->  {"ok": true, "message": "paused", "state": {"sensor": "main", "paused": true, ...}}
 """
 
 from __future__ import annotations
@@ -22,11 +20,11 @@ from tactflow.network.commands import Answer, Commands, RefusedError
 log = logging.getLogger("tactflow")
 
 POLL_MS = 200
-"""How often the thread looks whether it shall end, ms. Chosen by hand."""
+"""Poll interval of the thread, ms. Chosen by hand."""
 LINGER = 0.2
 """Time to deliver the last answer at the end of a run, s. Chosen by hand."""
 LONGEST_QUOTE = 40
-"""Letters of an unknown command that its answer repeats."""
+"""Characters of an unknown command that the reply repeats at most."""
 _HINT = (
     "another run takes commands there, or another program. End it, or choose another address "
     "(--set sinks.zmq.control=tcp://127.0.0.1:5558); several sensors need one each, such as "
@@ -35,10 +33,10 @@ _HINT = (
 
 
 class ControlSocket:
-    """Takes commands for a run until it is closed.
+    """Serves commands for a run until it is closed.
 
-    endpoint, keys, Raises : as for `BoundSocket`. sensor : of the run. commands : to the run. The attribute
-    `endpoint` is the real address.
+    endpoint, keys, Raises : as for `BoundSocket`. sensor : name in replies. commands : executes them. The
+    attribute `endpoint` is the bound address.
     """
 
     def __init__(self, endpoint: str, keys: str | None, sensor: str, commands: Commands) -> None:
@@ -54,14 +52,14 @@ class ControlSocket:
             "record_stop": lambda: commands.record(False),
         }
         self._closing = threading.Event()
-        # Not REP, which answers nobody any more after a client has left in the middle of a request.
+        # A REP socket would stop replying once a client leaves in the middle of a request.
         self._bound = BoundSocket(zmq.ROUTER, endpoint, _HINT, {}, keys)
         self.endpoint = self._bound.endpoint
         self._thread = threading.Thread(target=self._serve, name="tactflow-control", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Answer no more, and free the address."""
+        """Stop serving, and free the address."""
         self._closing.set()
         self._thread.join()
         self._bound.close(LINGER)
@@ -69,11 +67,11 @@ class ControlSocket:
     def _serve(self) -> None:
         socket = self._bound.socket
         while not self._closing.is_set():
-            # A client that leaves can wake us without a message to receive.
+            # A client that leaves can wake the poll without a message to receive.
             with suppress(zmq.Again):
                 if socket.poll(POLL_MS):
                     parts = socket.recv_multipart(zmq.NOBLOCK)
-                    # What a REQ socket sends: the way back, an empty part, the request. Drop anything else.
+                    # A REQ socket sends a return path, an empty part and the request. Drop anything else.
                     if b"" in parts:
                         end = parts.index(b"") + 1
                         socket.send_multipart([*parts[:end], self._answer(parts[end:])])

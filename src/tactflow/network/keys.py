@@ -1,4 +1,4 @@
-"""Keys of publishers and subscribers: who may read results over a network, encrypted by ZeroMQ's CURVE.
+"""Keys for reading results over a network, with ZeroMQ's CURVE encryption.
 
 `make_keys` makes two folders. One stays with the publisher:
 
@@ -10,8 +10,8 @@ the other goes to the subscriber NAME, and to nobody else:
     NAME/subscriber.key_secret         proves that it is NAME
     NAME/publisher.key                 which publisher it trusts
 
-The files are certificates as pyzmq writes them, which also checks who connects (ZAP,
-https://rfc.zeromq.org/spec/27/); CURVE (https://rfc.zeromq.org/spec/26/) is libzmq's.
+The files are pyzmq certificates; its authenticator checks clients (ZAP, https://rfc.zeromq.org/spec/27/).
+CURVE: https://rfc.zeromq.org/spec/26/.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import stat
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,19 +30,19 @@ if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
 DOMAIN = "tactflow"
-"""What an authenticator is asked about (ZAP): who may read results."""
+"""The ZAP domain of all our sockets."""
 HINT = "tactflow keys new makes keys"
 
 
 class WrongKeysError(ValueError):
-    """Keys are missing, damaged, or accessible to other users; says what to do."""
+    """Keys are missing, damaged, or accessible to other users; the message states the remedy."""
 
 
 def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
-    """Make keys for one subscriber, and for the publisher unless it has some; return the folder of each.
+    """Create keys for a subscriber and, if there are none, for the publisher; return the folder of each.
 
-    folder : gets these two folders; made if it is not there. name : of the subscriber: letters, digits, - and
-    _.
+    folder : parent of these two folders, created if missing. name : of the subscriber: letters, digits, -
+    and _.
 
     Raises
     ------
@@ -79,13 +78,13 @@ def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
 def require_keys(
     socket: zmq.Socket[bytes], context: zmq.Context[zmq.Socket[bytes]], folder: Path
 ) -> ThreadAuthenticator:
-    """Let a socket that is not bound yet admit only the subscribers whose keys are in the publisher's folder.
+    """Make an unbound socket admit only the subscribers whose keys are in the publisher's folder.
 
-    Returns the authenticator that checks them, which the caller stops. Raises WrongKeysError.
+    Returns the running authenticator, which the caller must stop. Raises WrongKeysError.
     """
     socket.curve_publickey, socket.curve_secretkey = _load(folder / "publisher.key_secret")
     socket.curve_server = True
-    # Without these two, everybody who has the publisher's public key is admitted while no authenticator runs.
+    # Without these two, any client with the publisher's public key is admitted while no authenticator runs.
     socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN.encode())
     socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
     admitted = folder / "subscribers"
@@ -104,16 +103,13 @@ def require_keys(
 
 
 def use_keys(socket: zmq.Socket[bytes], folder: Path) -> None:
-    """Let a socket that is not connected yet prove who it is, and talk to the right publisher alone.
-
-    Raises WrongKeysError.
-    """
+    """Make an unconnected socket authenticate itself and its publisher. Raises WrongKeysError."""
     socket.curve_publickey, socket.curve_secretkey = _load(folder / "subscriber.key_secret")
     socket.curve_serverkey = _load(folder / "publisher.key")[0]
 
 
 def _load(file: Path) -> tuple[bytes, bytes]:
-    """The public and the secret key in a file; the latter is empty in a file of a public key."""
+    """Load the public and the secret key of a file; the latter is empty in a file of a public key."""
     is_secret = file.suffix == ".key_secret"
     try:
         _refuse_shared(file, is_secret)
@@ -129,19 +125,12 @@ def _load(file: Path) -> tuple[bytes, bytes]:
 
 
 def _refuse_shared(file: Path, is_secret: bool) -> None:
-    """Refuse a key that others can change, replace by renaming a folder above it, or read (if secret)."""
+    """Refuse a key that other users can replace, change or (if it is secret) read."""
     if sys.platform == "win32":
         return
-    for key in {file.absolute(), file.resolve()}:
-        for path in (key, *key.parents):
-            found = path.stat()
-            forbidden = 0o002
-            if path in (key, key.parent):
-                forbidden = 0o077 if is_secret and path == key else 0o022
-            elif found.st_mode & stat.S_ISVTX:
-                # In a sticky folder, such as /tmp, nobody renames what belongs to somebody else.
-                forbidden = 0
-            if found.st_mode & forbidden:
-                raise WrongKeysError(f"{path}: other users can read or change it; chmod go-rwx {path}")
-            if found.st_uid not in (0, os.geteuid()):
-                raise WrongKeysError(f"{path}: belongs to another user, who can change it; chown it")
+    for path, forbidden in ((file, 0o077 if is_secret else 0o022), (file.parent, 0o022)):
+        status = path.stat()
+        if status.st_mode & forbidden:
+            raise WrongKeysError(f"{path}: other users can read or change it; chmod go-rwx {path}")
+        if status.st_uid not in (0, os.geteuid()):
+            raise WrongKeysError(f"{path}: belongs to another user, who can change it; chown it")

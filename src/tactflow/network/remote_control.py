@@ -1,7 +1,6 @@
-"""Control of a run in another process, where its ZeroMQ sink takes commands (`sinks.zmq.control`).
+"""Client for the commands of a running tactflow (`sinks.zmq.control`).
 
-Nothing here needs OpenCV or the rest of tactflow: over plain ZeroMQ, a REQ socket sends one JSON object,
-`{"do": "pause"}`, and receives one.
+With plain ZeroMQ, a REQ socket sends a JSON object such as `{"do": "pause"}` and receives one.
 """
 
 from __future__ import annotations
@@ -18,30 +17,30 @@ import zmq
 from tactflow.network.connection import Connection
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5557"
-"""Where `tactflow control` looks for a run that takes commands."""
+"""Default address of `tactflow control`."""
 LONGEST_ANSWER = 1 << 20
-"""Longest answer, bytes; statistics have some ten thousand. Chosen by hand."""
+"""Longest reply, bytes; statistics have some ten thousand. Chosen by hand."""
 Answer = dict[str, Any]
 
 
 class RemoteControl(Connection):
-    """Controls a run in another process; a context manager. Belongs to one thread at a time.
+    """Controls a run in another process; a context manager. Use it in one thread at a time.
 
-    Each method waits for the answer of the run and returns it: `message`, what was done, in words; `state`
-    with `sensor`, `paused`, `recording`, `source`; `path` for recordings; `stats` for statistics.
+    Each method waits for the reply of the run and returns it: `message`, what was done; `state` with
+    `sensor`, `paused`, `recording`, `source`; `path` for recordings; `stats` for statistics.
 
     Parameters
     ----------
-    endpoint : address at which the run takes commands. timeout : how long to wait for an answer, s.
-    keys : the subscriber's folder made by `tactflow keys new`, where the run requires keys.
+    endpoint : address for commands of the run. timeout : longest wait for a reply, s.
+    keys : the subscriber's folder made by `tactflow keys new`, if the run requires keys.
 
     Raises
     ------
     ValueError : from the constructor: the endpoint is not an address, the folder has no valid keys, the
         timeout is not positive.
-    TimeoutError : from every method: no answer came; it is not known whether the command was carried out.
-    PermissionError : from every method: the run does not admit us: it requires keys, or other ones.
-    RuntimeError : from every method: the run says that it is not possible, and why.
+    TimeoutError : from every method: no reply; whether the command was executed is unknown.
+    PermissionError : from every method: the run rejects our keys, or requires some.
+    RuntimeError : from every method: the run refuses the command, for the reason given.
 
     Examples
     --------
@@ -59,46 +58,46 @@ class RemoteControl(Connection):
         if not 0 < timeout < math.inf:
             raise ValueError(f"timeout: required a number of seconds above 0, got {timeout}")
         self.timeout = timeout
-        # After a timeout another command may be sent; a late answer is not taken for the answer to that.
+        # After a timeout another command may be sent; a late reply is not taken for the reply to that one.
         options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1}
         super().__init__(zmq.REQ, endpoint, options | {zmq.MAXMSGSIZE: LONGEST_ANSWER}, keys)
 
     def ping(self) -> Answer:
-        """Whether the run is there."""
+        """Check that the run replies."""
         return self.ask("ping")
 
     def stats(self) -> Answer:
-        """Its statistics so far, under `stats`, as in the statistics file."""
+        """The statistics so far, under `stats`, as in the statistics file."""
         return self.ask("stats")
 
     def take_reference(self) -> Answer:
-        """Have the next frame taken as the reference: how the gel looks untouched."""
+        """Take the next frame as the reference of the untouched gel."""
         return self.ask("take_reference")
 
     def pause(self) -> Answer:
-        """Hold capturing: a recording waits, frames of a live source are dropped."""
+        """Pause capturing: a recording waits, frames of a live source are dropped."""
         return self.ask("pause")
 
     def resume(self) -> Answer:
-        """Go on."""
+        """Resume capturing."""
         return self.ask("resume")
 
     def record_start(self) -> Answer:
-        """Begin a recording; `path` is its file. The pipeline must have a sink `record`."""
+        """Start a recording; `path` is its file. The pipeline must have a sink `record`."""
         return self.ask("record_start")
 
     def record_stop(self) -> Answer:
-        """Finish the recording, if there is one."""
+        """Finish the recording, if any."""
         return self.ask("record_stop")
 
     def ask(self, command: str) -> Answer:
-        """Send a command by its name, and wait for the answer."""
-        # Where we have been refused already, there is nobody to send it to.
+        """Send a command by its name, and wait for the reply."""
+        # After a rejection, there is no connection to send it over.
         with suppress(zmq.Again):
             self._socket.send(orjson.dumps({"do": command}), zmq.NOBLOCK)
         end = time.monotonic() + self.timeout
         while self._wait(end):
-            # A late answer to an earlier command wakes us, and is dropped by the socket.
+            # A late reply to an earlier command wakes the poll, and is dropped by the socket.
             with suppress(zmq.Again):
                 return self._checked(self._socket.recv(zmq.NOBLOCK))
         keys_hint = ", and are these its keys" if self._has_keys else ""

@@ -1,1 +1,0 @@
-"""Hostile input: every parser of bytes from elsewhere, fed with valid samples that were damaged."""
