@@ -128,31 +128,6 @@ def test_what_is_missing_differs_from_every_number_and_black_frames_are_frames(
     source.close()
 
 
-def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    there, out = tmp_path / "there", tmp_path / "out"
-    there.mkdir()
-    for name, arguments, code, said in (
-        ("hdf5", ["sim:press?frames=2", "--out", str(there)], 2, "already exists"),
-        ("hdf5", ["sim:press?frames=2", "no-such.mcap"], 4, "no-such.mcap: no such file"),
-    ):
-        options = [] if "--out" in arguments else ["--out", str(out)]
-        assert main(["export", name, *arguments, *options]) == code
-        assert said in capsys.readouterr().err
-        assert list(tmp_path.iterdir()) == [there]
-    monkeypatch.setattr(array_files, "missing", lambda what, _, modules: f"{what} need {modules[0]}")
-    for name, needed in (("hdf5", "HDF5 files need h5py"), ("zarr", "Zarr files need zarr")):
-        assert main(["export", name, "sim:press?frames=2", "--out", str(out)]) == 3
-        assert needed in capsys.readouterr().err
-        assert not out.exists()
-
-
-def test_frames_at_a_rate_are_the_nearest(tmp_path: Path) -> None:
-    assert main(["export", "hdf5", "sim:press?frames=10", "--fps", "20", "--out", str(tmp_path / "out")]) == 0
-    assert opened(tmp_path / "out/episode_000.h5")["seq"][:].tolist() == [0, 3, 6, 9]
-
-
 def test_a_recording_without_a_frame_is_refused(tmp_path: Path) -> None:
     file = Hdf5(tmp_path / "none.h5")
     with pytest.raises(StageError, match="there is no frame in it"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import cv2
@@ -18,7 +17,7 @@ from tactflow.adapters.network import Network
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.message.result import Result
 from tactflow.vision.depth.surface import Rest, Surface
-from tactflow.vision.types import Depth, Features, Markers, Scale
+from tactflow.vision.types import Depth, Markers, Scale
 from tests.conftest import REPOSITORY
 
 pytest.importorskip("onnx", reason="the package onnx, which makes files, is not installed")
@@ -331,13 +330,6 @@ def test_the_examples_are_right_before_their_files_are_there(name: str) -> None:
         )
 
 
-def test_wrong_settings_are_one_mistake_with_its_place(tmp_path: Path) -> None:
-    file = copied(tmp_path, "encoder.yaml")
-    mistakes = tactflow.check(file, settings={"stages.network.inputs.frames.stride": 0})
-    assert len(mistakes) == 1
-    assert "stages.network.inputs.frames.stride" in mistakes[0]
-
-
 def test_a_force_and_a_contact_mask_reach_the_message(tmp_path: Path) -> None:
     image = np.zeros((6, 8, 3), np.uint8)
     image[2:4, 3:6] = 200
@@ -376,39 +368,3 @@ def test_depth_integrates_gradients_without_colours() -> None:
     depth = surface.depth(gel, Rest(gel), mask, gradients)
     assert np.abs(depth.heights - heights)[mask > 0].max() < 0.03
     assert depth.greatest_stderr is None
-
-
-def test_a_network_that_is_stuck_does_not_hold_up_other_stages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pooled(tmp_path / "encoder.onnx", 6, 4)
-    (tmp_path / "last.py").write_text(
-        "from tactflow import Result, Sink\nfrom tactflow.vision.types import Features\n"
-        "class Contacts(Sink):\n    seen = []\n    done = None\n"
-        "    def write(self, touching: bool) -> None:\n        self.seen.append(touching)\n"
-        "        if len(self.seen) == 30:\n            self.done.set()\n"
-        "class Encoded(Sink):\n    seen = []\n"
-        "    def write(self, features: Features) -> None:\n        self.seen.append(features)\n"
-    )
-    pipeline = tactflow.load(
-        copied(tmp_path, "encoder.yaml"),
-        source="sim:press",
-        settings={
-            "sinks": {"fast": {"use": "./last.py:Contacts"}, "slow": {"use": "./last.py:Encoded"}},
-        },
-    )
-    done = Event()
-    fast, slow = (pipeline.nodes[id_].component.cls for id_ in ("fast", "slow"))
-    fast.done = done
-    run = Network.process
-
-    def stuck(self: Network, *inputs: Any) -> Any:
-        # It goes on only when the others have seen all frames without it.
-        assert done.wait(60)
-        return run(self, *inputs)
-
-    monkeypatch.setattr(Network, "process", stuck)
-    assert tactflow.run(pipeline, max_frames=30).stats["frames"] == 30
-    assert len(fast.seen) == 30
-    assert 1 <= len(slow.seen) < 30
-    assert all(isinstance(features, Features) for features in slow.seen)

@@ -335,12 +335,3 @@ def test_a_sink_never_writes_over_what_the_run_reads(
     with pytest.raises(ConfigError, match=rf"p\.yaml:12:3  sinks\.jsonl: .* is {what}; choose another path"):
         load(text)
     assert (tmp_path / "p.yaml").read_text() == text
-
-
-@pytest.mark.parametrize("file", ["/dev/zero", "./large.py"])
-def test_code_is_read_from_files_of_a_sane_size(tmp_path: Path, file: str) -> None:
-    (tmp_path / "large.py").write_text("#" * (1 << 20) + "\n")
-    text = f'stages: {{capture: {{source: "sim:press"}}, mine: {{use: "{file}"}}}}'
-    (tmp_path / "pipeline.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=f"cannot read {file}: larger than 1024 KiB"):
-        load_pipeline(tmp_path / "pipeline.yaml")

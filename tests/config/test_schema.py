@@ -37,23 +37,6 @@ def test_every_shipped_pipeline_fits_the_schema(path: Path, validator: Draft2020
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "stages: {capture: }",
-        "stages: {capture: {source: sim:press}, second: {use: hull, when: touching}}",
-        "stages: {own: {use: './a.py:B', whatever: 3}}",
-        "stages: {own: {use: 'a.b:C', whatever: 3}}",
-        "{stages: {hull: {use: capture, source: a}}, sinks: }",
-        "stages: {hull: {when: [touching, {signal: a.b, otherwise: repeat}], queue: {capacity: 2}}}",
-        "stages: {hull: {on_error: disable, segment: heavy, in: {contact_mask: a.b}}}",
-        "{stages: {capture: }, sinks: {jsonl: {max_rate: 5, on_error: {action: skip_frame, budget: 3}}}}",
-    ],
-)
-def test_right_pipelines_fit(text: str, validator: Draft202012Validator) -> None:
-    assert places(validator, text) == []
-
-
-@pytest.mark.parametrize(
     ("text", "place"),
     [
         ("{}", "$"),

@@ -99,18 +99,6 @@ def test_only_commands_with_a_key_are_obeyed(folders: tuple[Path, Path], tmp_pat
         sink.close()
 
 
-def test_nobody_is_admitted_while_nothing_checks_the_keys(folders: tuple[Path, Path]) -> None:
-    publisher = Publisher(ANY_PORT, 10, str(folders[0]))
-    try:
-        assert publisher._authenticator is not None
-        publisher._authenticator.stop()
-        with Subscriber(publisher.endpoint, keys=folders[1]):
-            # A subscription comes as soon as a subscriber is admitted.
-            assert not publisher.socket.poll(1000)
-    finally:
-        publisher.close()
-
-
 def test_the_relay_of_several_sensors_requires_keys_and_their_own_processes_need_none(
     folders: tuple[Path, Path],
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tactflow.config.load import load_pipeline
-from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.message.result import Result
@@ -181,17 +180,6 @@ def test_a_ring_across_two_epochs_brings_the_references_of_the_older_one(tmp_pat
     assert [frame.seq for frame in frames if frame.reference] == [0, 1, 25]
     assert [frame.epoch for frame in frames] == [0] * 8 + [1] * 5
     assert [frame.seq for frame in frames if not frame.paced] == [0, 1]
-
-
-def test_without_the_extra_the_error_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *a: None if name == "mcap" else found(name, *a)
-    )
-    with pytest.raises(StageError, match=r"recordings need mcap: pip install 'tactflow\[record\]'"):
-        opened(tmp_path / "a.mcap")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from pathlib import Path
 
 import numpy as np
@@ -28,18 +27,6 @@ def test_the_list_names_every_scene_and_every_setting(capsys: Capture) -> None:
     assert main(["sim", "--list"]) == 0
     words = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
     assert {*scene_descriptions(), "noise", "frames", "light"} <= words
-
-
-def test_a_full_disk_is_told_by_the_name_that_was_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", ".a.1.partial.npy")
-
-    monkeypatch.setattr("tactflow.sim.export.write_frames", full)
-    out = tmp_path / "a.npy"
-    assert main(["sim", "press?frames=5", "--out", str(out), "--quiet"]) == 3
-    assert capsys.readouterr().err == f"tactflow: --out {out}: cannot be written: No space left on device\n"
 
 
 @pytest.mark.parametrize(

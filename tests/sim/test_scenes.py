@@ -313,27 +313,6 @@ def test_dropped_moments_are_missing_and_repeated_frames_identical() -> None:
     np.testing.assert_array_equal(scene.frame(repeated), scene.frame(repeated + 1))
 
 
-def test_a_stray_reflection_is_not_a_contact_and_lies_far_from_it() -> None:
-    scene, plain = open_scene("stray?noise=0"), open_scene("press?noise=0")
-    np.testing.assert_array_equal(scene.frame(0), plain.frame(0))
-    stray = (scene.clean(50).astype(int) - plain.clean(50)).min(axis=-1) > 10
-    truth = scene.truth(50)
-    np.testing.assert_array_equal(truth.contact_mask, plain.truth(50).contact_mask)
-    assert stray.sum() > 500
-    near = cv2.dilate(truth.contact_mask.astype(np.uint8), np.ones((201, 201), np.uint8)) > 0
-    assert not (stray & near).any()
-
-
-def test_painted_markers_differ_in_size_and_leds_glare_beside_bright_ones() -> None:
-    layout = open_scene("painted").layout
-    assert layout.radii.min() < 0.6 * layout.radius
-    assert layout.radii.max() > 1.4 * layout.radius
-    scene = open_scene("leds?noise=0")
-    glare = (scene.clean(0).min(axis=-1) == 255).astype(np.uint8)
-    assert cv2.connectedComponents(glare)[0] == 1 + 6
-    assert not glare[tuple(np.rint(scene.truth(0).position).astype(int).T[::-1])].any()
-
-
 @pytest.mark.parametrize("name", ["block", "coin", "key", "finger", "long_edge"])
 def test_the_contact_of_a_large_object_is_in_one_piece(name: str) -> None:
     scene = open_scene(name)

@@ -65,15 +65,6 @@ def test_an_existing_file_is_neither_replaced_nor_touched_unasked(tmp_path: Path
     assert seqs_in(path) == [7]
 
 
-def test_closing_twice_or_without_opening_is_harmless(tmp_path: Path) -> None:
-    Jsonl(Jsonl.Params(path=str(tmp_path / "never.jsonl"))).close()
-    assert not (tmp_path / "never.jsonl").exists()
-    sink = opened(tmp_path / "r.jsonl")
-    sink.close()
-    sink.close()
-    assert not sink.wants()
-
-
 def test_standard_output_gets_every_line_at_once(capfdbinary: pytest.CaptureFixture[bytes]) -> None:
     sink = opened("-", flush=60.0)
     assert sink.wants()

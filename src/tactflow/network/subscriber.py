@@ -31,8 +31,8 @@ OPTIONS: dict[int, int | bytes] = {
 }
 
 BACKLOG = 10_000
-"""Length of the receive queue, messages: nearly three minutes at 60 Hz, some 140 MB. Further ones are lost and
-counted. Chosen by hand."""
+"""Length of the receive queue, messages: nearly three minutes at 60 Hz, some 140 MB. Further ones are lost
+and counted. Chosen by hand."""
 
 LONGEST_MESSAGE = 16 << 20
 """Longest message, bytes; one with 140 dots has about 14,000. A publisher that sends a longer one is
