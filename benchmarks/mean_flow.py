@@ -38,7 +38,7 @@ FOUND = 0.3
 """Overlap below which the contact that was found is another one."""
 
 
-class Seen(NamedTuple):
+class Comparison(NamedTuple):
     """error, stated : (2,) of the mean flow, px. overlap : of the region with the true one."""
 
     error: Floats
@@ -46,15 +46,15 @@ class Seen(NamedTuple):
     overlap: float
 
 
-def compare(result: Result, truth: Floats, contact: Floats) -> Seen | None:
+def compare(result: Result, truth: Floats, contact: Floats) -> Comparison | None:
     """A frame beside the truth; None where no mean flow is stated."""
     flow, mask = result.flow, result.contact_mask
     if mask is None or flow is None or flow.mean is None or flow.stderr is None:
         return None
-    return Seen(np.subtract(flow.mean, truth), np.array(flow.stderr), mask_iou(mask, contact))
+    return Comparison(np.subtract(flow.mean, truth), np.array(flow.stderr), mask_iou(mask, contact))
 
 
-def named(name: str, seed: int) -> Iterator[Seen]:
+def named(name: str, seed: int) -> Iterator[Comparison]:
     """Frames of a scene; neighbouring ones err alike, so that every sixth will do."""
     spec = f"{name}?frames=60&seed={seed}"
     scene = open_scene(spec)
@@ -62,11 +62,13 @@ def named(name: str, seed: int) -> Iterator[Seen]:
     for result in tactflow.stream(replace(pipeline, skipping=False)):
         if result.seq >= 0 and result.seq % 6 == 0:
             truth = scene.truth(result.seq, result["mapping"])
-            seen = truth.contact_flow and compare(result, np.array(truth.contact_flow), truth.contact_mask)
-            yield from [seen] if seen else []
+            comparison = truth.contact_flow and compare(
+                result, np.array(truth.contact_flow), truth.contact_mask
+            )
+            yield from [comparison] if comparison else []
 
 
-def random(scene: WideScene) -> Seen | None:
+def random(scene: WideScene) -> Comparison | None:
     """A random gel with dots."""
     settings = {
         "stages.preprocess.rotate": 0,
@@ -94,16 +96,16 @@ def random(scene: WideScene) -> Seen | None:
     return compare(result, scene.shift[inside].mean(axis=0) + np.median(moved, axis=0), scene.contact)
 
 
-def row(name: str, frames: list[Seen]) -> list[str]:
+def row(name: str, frames: list[Comparison]) -> list[str]:
     """The columns of a set."""
-    error, stated = (np.array([seen[column] for seen in frames]) for column in (0, 1))
+    error, stated = (np.array([comparison[column] for comparison in frames]) for column in (0, 1))
     within = [100 * np.mean(np.abs(error) < k * stated) for k in (1, 2)]
     return [
         name,
         f"{np.sqrt(np.mean(error**2)):.2f}",
         f"{np.median(stated):.2f}",
         f"{within[0]:.0f} {within[1]:.0f}",
-        f"{np.median([seen.overlap for seen in frames]):.2f}",
+        f"{np.median([comparison.overlap for comparison in frames]):.2f}",
         str(len(frames)),
     ]
 
@@ -115,10 +117,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[1], help="of the named scenes")
     args = parser.parse_args()
     logging.disable(logging.WARNING)
-    sets = {name: [seen for seed in args.seeds for seen in named(name, seed)] for name in NAMED}
+    sets = {name: [comparison for seed in args.seeds for comparison in named(name, seed)] for name in NAMED}
     rows = [row(name, frames) for name, frames in sets.items() if frames]
-    known = [seen for frames in sets.values() for seen in frames]
-    gels: list[Seen] = []
+    known = [comparison for frames in sets.values() for comparison in frames]
+    gels: list[Comparison] = []
     seed, tried = FIRST, 0
     while tried < args.scenes:
         scene, seed = wide_scene(seed), seed + 1
@@ -126,12 +128,12 @@ def main() -> None:
             continue
         tried += 1
         try:
-            seen = random(scene)
+            comparison = random(scene)
         except TactflowError:
             # No dots were found.
             continue
-        gels += [seen] if seen else []
-    found = [seen for seen in gels if seen.overlap > FOUND]
+        gels += [comparison] if comparison else []
+    found = [comparison for comparison in gels if comparison.overlap > FOUND]
     rows += [row("all named", known)] if known else []
     rows += [row("random, found", found), row("random, all", gels)]
     show(table([["scene", "error, px", "stated, px", "one, two", "overlap", "frames"], *rows]))

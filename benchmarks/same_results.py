@@ -3,7 +3,7 @@
     python benchmarks/same_results.py run OUT [--data ../shared/data]     # with this Python's tactflow
     python benchmarks/same_results.py compare BEFORE AFTER
 
-Exit code 1 if anything differs by more than the tolerances below.
+Exit code 1 if anything differs by more than `TOLERANCES`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,8 @@ PIPELINES = ("default", "wedge", "markerless", "classic")
 UPRIGHT = {"wedge": [f"stages.preprocess.{key}" for key in ("homography=null", "rotate=90", "downsample=2")]}
 """Pipeline for another camera -> settings for the simulator's pictures."""
 
-MARKER_TOLERANCE = 1e-3
-"""Maximum difference of marker positions, px."""
-OUTLINE_TOLERANCE = 1.0
-"""Maximum distance of a hull's vertex from the other hull, px."""
-OTHER_TOLERANCE = 1e-2
-"""Maximum difference of centre (px), angle (degrees) and mean flow (px)."""
+TOLERANCES = {"hull": 1.0, "center": 1e-2, "angle": 1e-2, "flow": 1e-2, "position": 1e-3, "status": 0.0}
+"""Largest differences: px, degrees; of a hull, the distance of a vertex from the other hull."""
 
 
 def jobs(data: Path) -> Iterator[tuple[str, str, str, list[str]]]:
@@ -69,13 +65,30 @@ def run(out: Path, data: Path, frames: int) -> None:
         print(f"{name}: {len(done.stdout.splitlines())} messages, exit {done.returncode}", flush=True)
 
 
-def hull_distance(before: list[Any], after: list[Any]) -> float:
-    """Largest distance of a vertex of a hull from the border of the other, px."""
-    first, second = (np.asarray(hull, np.float32).reshape(-1, 1, 2) for hull in (before, after))
-    return max(
-        max(abs(cv2.pointPolygonTest(border, (float(x), float(y)), True)) for x, y in points[:, 0])
-        for points, border in ((first, second), (second, first))
-    )
+def numbers(message: dict[str, Any]) -> dict[str, Any]:
+    """The numbers of a message that are compared; those that it does not have are missing."""
+    contact, flow, markers = (message[key] or {} for key in ("contact", "flow", "markers"))
+    found = {key: contact.get(key) for key in ("hull", "center", "angle")} | {"flow": flow.get("mean")}
+    statuses = {"tracked": 0, "inferred": 1, "lost": 2}
+    found |= {"position": markers.get("position"), "status": [statuses[s] for s in markers.get("status", [])]}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def difference(key: str, before: Any, after: Any) -> float:
+    """How far two values of a number differ at most; infinite if they differ in shape."""
+    first, second = (np.asarray(value, np.float32) for value in (before, after))
+    if key == "hull":
+        return max(
+            abs(cv2.pointPolygonTest(border, (float(x), float(y)), True))
+            for points, border in ((first, second), (second, first))
+            for x, y in points
+        )
+    if first.shape != second.shape:
+        return np.inf
+    distance = np.abs(np.subtract(before, after))
+    if key == "angle":
+        distance = np.minimum(distance, 180 - distance)
+    return float(distance.max(initial=0))
 
 
 def differences(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
@@ -83,38 +96,12 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
     if before["seq"] != after["seq"]:
         yield f"seq {before['seq']} and {after['seq']}"
         return
-    if (before["contact"] is None) != (after["contact"] is None):
-        yield "contact decision"
-    elif before["contact"] is not None:
-        if (
-            distance := hull_distance(before["contact"]["hull"], after["contact"]["hull"])
-        ) > OUTLINE_TOLERANCE:
-            yield f"hull by {distance:.2f} px"
-        moved = np.subtract(before["contact"]["center"], after["contact"]["center"])
-        if np.abs(moved).max() > OTHER_TOLERANCE:
-            yield f"centre by {np.abs(moved).max():.3g} px"
-        angles = before["contact"]["angle"], after["contact"]["angle"]
-        if (angles[0] is None) != (angles[1] is None):
-            yield "angle known or not"
-        elif angles[0] is not None and abs((angles[0] - angles[1] + 90) % 180 - 90) > OTHER_TOLERANCE:
-            yield f"angle {angles[0]:.3f} and {angles[1]:.3f}"
-    flows = [(message["flow"] or {}).get("mean") for message in (before, after)]
-    if (flows[0] is None) != (flows[1] is None):
-        yield "flow known or not"
-    elif flows[0] is not None and np.abs(np.subtract(*flows)).max() > OTHER_TOLERANCE:
-        yield f"mean flow by {np.abs(np.subtract(*flows)).max():.3g} px"
-    markers = before["markers"], after["markers"]
-    if (markers[0] is None) != (markers[1] is None):
-        yield "markers known or not"
-    elif markers[0] is not None:
-        if len(markers[0]["position"]) != len(markers[1]["position"]):
-            yield f"{len(markers[0]['position'])} and {len(markers[1]['position'])} markers"
-        elif markers[0]["position"]:
-            distance = np.abs(np.subtract(markers[0]["position"], markers[1]["position"])).max()
-            if distance > MARKER_TOLERANCE:
-                yield f"markers by {distance:.3g} px"
-            if markers[0]["status"] != markers[1]["status"]:
-                yield "marker status"
+    old, new = numbers(before), numbers(after)
+    for key, tolerance in TOLERANCES.items():
+        if (key in old) != (key in new):
+            yield f"{key} known or not"
+        elif key in old and (distance := difference(key, old[key], new[key])) > tolerance:
+            yield f"{key} by {distance:.3g}"
 
 
 def compare(before: Path, after: Path) -> int:

@@ -63,13 +63,13 @@ def attempts() -> list[dict[str, str]]:
         done = subprocess.run(
             [python, "-W", "ignore", "-c", statement], capture_output=True, text=True, timeout=300
         )
-        said = done.stderr.strip().splitlines()
+        messages = done.stderr.strip().splitlines()
         version = subprocess.run(
             [python, "-c", f"from importlib.metadata import version; print(version({package!r}))"],
             capture_output=True,
             text=True,
         ).stdout.strip()
-        error = said[-1] if done.returncode and said else "no error"
+        error = messages[-1] if done.returncode and messages else "no error"
         answers.append({"package": package, "version": version, "tried": statement, "error": error})
     return answers
 

@@ -2,40 +2,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from tactflow.bench.methods import alternatives, measure_methods
+from tactflow.bench.methods import measure_methods
 from tactflow.bench.pipelines import Bench
 from tactflow.bench.results import BenchResult
 from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
-from tactflow.engine.graph import Pipeline
 from tactflow.sim import scene_descriptions
-
-
-@pytest.fixture(scope="module")
-def pipelines() -> dict[str, Pipeline]:
-    return {name: load_pipeline(find_pipeline(name)) for name in ("default", "classic")}
-
-
-def test_every_method_of_a_stage_is_an_alternative_with_the_parameters_of_the_pipeline_that_uses_it(
-    pipelines: dict[str, Pipeline],
-) -> None:
-    ways = alternatives(pipelines, "inpaint")
-    assert list(ways)[:2] == ["normalized", "telea"]
-    assert ways.keys() >= {"ns", "none"}
-    assert ways["telea"].params == pipelines["classic"].nodes["inpaint"].params
-
-
-def test_the_same_method_with_other_parameters_is_named_after_its_pipeline(
-    pipelines: dict[str, Pipeline],
-) -> None:
-    mine = load_pipeline(find_pipeline("default"), overrides=["stages.tracker.polarity=dark"])
-    assert list(alternatives(pipelines | {"mine": mine}, "tracker")) == ["default", "classic", "mine"]
-    assert list(alternatives(pipelines | {"same": pipelines["default"]}, "hull")) == ["default", "classic"]
-
 
 OWN_TRACKER = """
 import numpy as np
@@ -58,10 +32,10 @@ class Broken(Own):
 
 
 def test_a_tracker_of_ones_own_is_measured_whichever_ports_it_takes_and_a_broken_one_stops_no_other(
-    pipelines: dict[str, Pipeline], tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     (tmp_path / "own.py").write_text(OWN_TRACKER)
-    measured = {"default": pipelines["default"]}
+    measured = {"default": load_pipeline(find_pipeline("default"))}
     for name in ("Own", "Broken"):
         use = f"stages.tracker={{use: {tmp_path / 'own.py'}:{name}}}"
         measured[name] = load_pipeline(find_pipeline("default"), overrides=[use])

@@ -33,16 +33,6 @@ def test_values_of_many_frames_become_one_number() -> None:
     }
 
 
-def test_a_stored_run_is_read_back(tmp_path: Path) -> None:
-    path = tmp_path / "stored.json"
-    run(displacement_rms=0.02, marker_recall=0.99).save(path)
-    assert load_errors(path, quick=True) == {
-        "tracker/pattern/press": {"displacement_rms": 0.02, "marker_recall": 0.99}
-    }
-    with pytest.raises(ConfigError, match="result of a quick run; compare it with a quick run"):
-        load_errors(path, quick=False)
-
-
 def test_what_got_worse_by_more_than_its_tolerance_is_named() -> None:
     stored = run(displacement_rms=0.02)
     within = QUANTITIES["displacement_rms"].allowed(0.02)

@@ -115,22 +115,6 @@ def test_a_printed_target_gives_the_scale(
     assert said["found_by"] == "target of 5x7, pitch of 3 mm"
 
 
-def test_the_untouched_gel_is_the_reference_also_where_that_is_not_a_frame_of_the_session(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    darker = (open_scene("idle").frame(0) * 0.8).astype(np.uint8)
-    cv2.imwrite("rest.png", darker)
-    looks = []
-    for reference in ("1", "rest.png"):
-        shipped = (tactflow.load().directory / "default.yaml").read_text()
-        Path("p.yaml").write_text(shipped.replace("reference: 1 ", f"reference: {reference} "))
-        words = ["--from", "sim:idle?frames=3", "--pitch", "1.724", "--out", "a.yaml", "--overwrite"]
-        assert calibrate("p.yaml", *words) == 0
-        looks.append(np.load("a.npz")["look"].mean())
-    assert looks[1] < 0.85 * looks[0]
-
-
 @pytest.mark.parametrize(("rows_apart", "told"), [(30, False), (28, True)])
 def test_a_scale_from_dots_in_no_square_grid_is_told(
     rows_apart: int,

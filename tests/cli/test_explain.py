@@ -67,7 +67,7 @@ def paragraphs(text: str) -> dict[str, dict[str, str]]:
 
 
 @pytest.mark.usefixtures("pipeline")
-def test_each_stage_says_why_it_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_stage_says_why_it_runs_and_when_it_is_skipped(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain"]) == 0
     facts = paragraphs(capsys.readouterr().out)
     assert list(facts) == ["capture", "prepare", "unused", "compare", "outline", "refine", "out", "view"]
@@ -83,12 +83,6 @@ def test_each_stage_says_why_it_runs(capsys: pytest.CaptureFixture[str]) -> None
         "memory": "none (pure): runs only when its result is needed",
         "is": "./parts.py:Needy",
     }
-
-
-@pytest.mark.usefixtures("pipeline")
-def test_each_stage_says_when_it_is_skipped(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["explain"])
-    facts = paragraphs(capsys.readouterr().out)
     assert facts["outline"]["skipped when"] == (
         "compare.touching is false (its outputs are absent: no_contact); compare gives no contact_mask"
     )

@@ -134,13 +134,6 @@ def test_a_full_disk_behind_standard_output_is_an_error_without_a_traceback() ->
     assert done.stderr == "tactflow: standard output: No space left on device\n"
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere every file name is text")
-def test_a_file_name_that_is_not_utf8_is_pointed_at(tmp_path: Path) -> None:
-    done = program("run", "--source", "\udcff.png", "--quiet", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "--source: '\\udcff.png' is not UTF-8; rename the file" in done.stderr
-
-
 # -- reports of a run -------------------------------------------------------------------------------------
 
 

@@ -174,13 +174,6 @@ def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
     assert made["sensor"] == "digit"
 
 
-def test_who_quits_gets_no_file(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start, "Questions", lambda *_: Scripted("unknown", "0", "quit"))
-    out = tmp_path / "made.yaml"
-    assert main(["start", recorded("press?frames=60"), "--out", str(out)]) == 130
-    assert not out.exists()
-
-
 def test_without_a_page_and_a_terminal_nobody_can_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

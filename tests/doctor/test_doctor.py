@@ -8,7 +8,6 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from tactflow.cli.main import main
 from tactflow.doctor import examine, observe
 from tactflow.sim import open_scene
 from tactflow.sources import FrameReader
-from tactflow.sources.devices import Camera
 from tactflow.system.signals import ending_handled, interrupt
 from tests.vision.dots import grid, render
 
@@ -123,18 +121,6 @@ def test_missing_and_repeated_frames_of_a_camera_are_counted(
     assert found["drop-outs"].verdict == "fault"
     assert "4 of " in found["drop-outs"].says
     assert found["latency"].verdict == "unknown"
-
-
-def test_a_camera_whose_driver_stamps_tells_how_old_its_frames_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Capture:
-        def get(self, _: int) -> float:
-            return 9_950.0
-
-    camera = Camera.__new__(Camera)
-    camera._capture = Capture()  # type: ignore[assignment]
-    monkeypatch.setattr("tactflow.sources.devices.time", SimpleNamespace(monotonic=lambda: 10.0))
-    monkeypatch.setattr("tactflow.sources.devices.sys", SimpleNamespace(platform="linux"))
-    assert camera.delay() == pytest.approx(0.05)
 
 
 def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(

@@ -46,8 +46,6 @@ def cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cameras under any number; `gone` cannot be opened."""
 
     def opened(spec: str, *, camera: CameraRequest) -> FrameReader:
-        if spec == "broken":
-            raise RuntimeError("a mistake of ours")
         if spec == "gone":
             raise SourceError("gone: cannot be opened; no such camera")
         return Camera(spec, camera)
@@ -84,12 +82,6 @@ def test_a_hub_that_slow_sensors_share_is_named_in_place_of_each(monkeypatch: py
     assert line.startswith(
         "left and right share the USB hub usb1 of 480 Mbit/s: move one to another root hub"
     )
-
-
-def test_a_mistake_in_a_reader_ends_the_measurement() -> None:
-    sensors = [Sensor("left", "broken", CameraRequest()), Sensor("right", "2", CameraRequest())]
-    with pytest.raises(RuntimeError, match="a mistake of ours"):
-        measure_together(sensors, 30.0)
 
 
 def test_the_command_prints_every_sensor_of_a_file_and_fails_for_one_that_is_gone(

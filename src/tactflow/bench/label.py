@@ -96,7 +96,7 @@ def _index(text: str, names: Sequence[str], spec: str) -> int:
 class LabelServer(ThreadingHTTPServer):
     """Serves the page for these items; `serve_forever` runs it, and `address` is where.
 
-    path : the file of labels, made if it is missing. lab, round_ : of the labels; those of another round are
+    path : the file of labels, created if missing. lab, round_ : of the labels; those of other rounds are
     neither shown nor changed. dots : clicks mark dots instead of outlines. port : 0 for any that is free.
 
     Raises
@@ -147,7 +147,7 @@ class LabelServer(ThreadingHTTPServer):
         ConfigError, StageError : the file of labels is broken by now, or cannot be written.
         """
         with self._saving:
-            # Read anew: another page, program or person may have changed it.
+            # Read again: another page or program may have changed it.
             labels = self._load()
             place = next((i for i, other in enumerate(labels) if other.key == label.key), len(labels))
             labels[place : place + 1] = [] if remove else [label]

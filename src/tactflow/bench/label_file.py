@@ -30,8 +30,8 @@ class FrameLabel(BaseModel):
 
     recording : its path relative to a folder that whoever shares the file names, or its name.
     frame, reference : an index from 0, or the name of a picture's file without its suffix.
-    lab : where the label comes from. round : 1 for a person's first labels; a frame that is labelled again
-    in round 2, without a look at round 1, tells how much labels scatter.
+    lab : where the label comes from. round : 1 for first labels; 2 for labelling again without a look at
+    them, to measure the scatter.
     contact : whether something touches the gel; None if the person cannot tell.
     outlines : of the contact, each of 3 points (x, y) or more, raw px; only where contact is True.
     dots : centres (x, y) of all markers, raw px; None if nobody marked them.

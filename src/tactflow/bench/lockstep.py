@@ -1,9 +1,9 @@
 """Whole pipelines, taking turns.
 
-Each pipeline runs in the real engine with all its stages in one segment, so in one thread, which is held at
-the source until it is its turn, and then runs freely through as many frames as the turn has. So pipelines can
-be compared with each other (A B A B ...) in one process, and the measured time is everything that a frame
-costs, the encoding of its message included. The frames of a turn are read before the clock runs: they lie in
+Each pipeline runs in the real engine with all its stages in one segment, and so in one thread. The source
+holds this thread until it is its turn, and then lets it run through the frames of the turn. So pipelines can
+be compared with each other (A B A B ...) in one process, and the measured time is the whole cost of a frame,
+including the encoding of its message. The frames of a turn are read before the clock runs: they lie in
 memory then, as a camera's do, and not in the cache.
 """
 
@@ -33,7 +33,7 @@ from tactflow.vision.geometry import PixelMapping
 
 
 class TimedResult(Result):
-    """What a pipeline found in a frame, and what that cost.
+    """The result of a pipeline for a frame, and its cost.
 
     mapping : from raw to processed pixels, or None. cpu_s : CPU time, s.
     """
@@ -144,7 +144,7 @@ def on_recording(pipeline: Pipeline, path: Path) -> Pipeline:
 
 def take_turns(
     pipelines: Mapping[str, Pipeline],
-    see: Callable[[str, TimedResult], str],
+    observe: Callable[[str, TimedResult], str],
     *,
     unit: CopyUnit | None = None,
     block: int = BLOCK,
@@ -154,7 +154,7 @@ def take_turns(
     Parameters
     ----------
     pipelines : name -> pipeline, each with its recording.
-    see : called with (name, result) for each frame, after its turn; returns the kind of frame its time
+    observe : called with (name, result) for each frame, after its turn; returns the kind of frame its time
         belongs to. The time of references is kept apart.
     unit : measured along the way. block : frames in a turn.
 
@@ -180,7 +180,7 @@ def take_turns(
                 except TactflowError as error:
                     failures[name], results = str(error), []
                 for result in results:
-                    kind = see(name, result)
+                    kind = observe(name, result)
                     times[name]["reference" if result.frame.reference else kind].append(result.cpu_s)
                 if not results:
                     del running[name]

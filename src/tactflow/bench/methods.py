@@ -52,7 +52,7 @@ def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Nod
 
 @dataclass(frozen=True, slots=True)
 class _Inputs:
-    """What the stages of the default pipeline hand to each other in one frame, and the truth about it.
+    """Ports of the default pipeline in one frame, and the truth about it.
 
     clean : (H, W, 3) uint8, the processed frame without markers.
     """
@@ -140,8 +140,8 @@ STAGES: Mapping[str, frozenset[str]] = {
     "tracker": frozenset({"image", "frame"}),
     "flow_in_mask": frozenset({"markers", "contact_mask", "field"}),
 }
-"""The stages whose methods are measured alone, with the ports that are given to them. Those that are given
-the true contact are measured only in frames that show one."""
+"""The stages whose methods are measured alone, and their inputs. Those that take the true contact are
+measured only in frames that show one."""
 
 
 def measure_methods(bench: Bench, pipelines: Mapping[str, Pipeline], case: Case) -> None:
@@ -189,7 +189,7 @@ def _measure_stage(
 
 
 def _call(node: Node, ports: frozenset[str]) -> Callable[[_Inputs], Any]:
-    """A new stage of this kind, as a function of what it is given."""
+    """A new stage, as a function of its inputs."""
     process = node.component.cls(node.params).process
     # A class of another kind may need other ports than the stage whose place it takes.
     wanted = [port.name for port in node.component.ports.inputs if port.name in ports or not port.optional]

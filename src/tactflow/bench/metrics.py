@@ -74,10 +74,7 @@ def aspect_ratio(mask: NDArray[np.generic]) -> float:
 
 
 def dot_pitch(points: FloatArray) -> float:
-    """Median distance of a point (N, 2) to its nearest neighbour, px.
-
-    A single point has no neighbour that it could be mistaken for: infinite.
-    """
+    """Median distance of a point (N, 2) to its nearest neighbour, px; infinite for a single point."""
     apart = cdist(points, points)
     np.fill_diagonal(apart, np.inf)
     return float(np.median(apart.min(axis=1, initial=np.inf)))
@@ -122,13 +119,13 @@ def detection(points: FloatArray, truth: FloatArray, radius: float) -> tuple[flo
 
 
 def identity_errors(position: FloatArray, truth: FloatArray, pitch: float) -> BoolArray:
-    """Which markers carry the wrong name: nearer to another marker's true position, or off by half a pitch.
+    """Which markers have the wrong identity: nearer to another's true position, or off by half a pitch.
 
     position, truth : (N, 2), claimed and true positions of the same markers, px. pitch : distance of
     neighbouring markers at rest, px. Returns (N,) bool.
     """
     apart = cdist(position, truth)
     own = np.diagonal(apart)
-    # Ties go to the marker itself: two dots that truly coincide cannot be told apart by anybody.
+    # Ties count as correct: coinciding dots cannot be distinguished.
     nearest = apart.min(axis=1, initial=np.inf)
     return np.asarray((nearest < own) | (own > pitch / 2))

@@ -103,7 +103,7 @@ QUANTITIES: Mapping[str, Quantity] = {quantity.key: quantity for quantity in _AL
 class Tally:
     """Values of quantities, frame by frame.
 
-    values : key of `QUANTITIES` -> one array (N,) float64 for each frame that has something to say.
+    values : key of `QUANTITIES` -> one array (N,) float64 for each frame that has values.
     """
 
     def __init__(self) -> None:
@@ -126,7 +126,7 @@ class Tally:
     def errors(self) -> dict[str, float]:
         """Quantity -> its one number, for those that have values."""
         joined = {key: np.concatenate(arrays) for key, arrays in self.values.items()}
-        # What is left of floating-point rounding in a perfect result is no error.
+        # Rounding errors of a perfect result count as 0.
         return {
             key: round(float(quantity.summary(joined[key])), 9)
             for key, quantity in QUANTITIES.items()

@@ -103,7 +103,7 @@ class Rendered:
 
     def deep(self, index: int) -> bool:
         """Whether something is pressed to at least half of its depth."""
-        # The smooth ramp passes through half depth; a hair of tolerance keeps that frame on one side.
+        # The smooth ramp passes through half depth; the tolerance keeps that frame on one side.
         return any(press.depth >= 0.5 * press.shape.depth - 1e-9 for press in self.scene.presses(index))
 
 

@@ -22,10 +22,10 @@ _ROUND = 100
 
 
 def add_decision(tally: Tally, touching: bool, truth: Truth, deep: bool) -> bool:
-    """Count whether a contact is seen where there is one; True if both say yes.
+    """Count a decision; returns True for a contact that was found.
 
-    A missed contact of at least half depth enters the outlines with an overlap of 0. Other errors of missed
-    contacts are unknown: what was missed is counted beside, so that silence improves no mean.
+    A missed contact of at least half depth counts as an outline with an overlap of 0. Its other errors are
+    unknown; misses are counted separately.
 
     deep : whether the contact has at least half of its depth.
     """
@@ -94,11 +94,11 @@ def add_detection(tally: Tally, points: NDArray[np.float64], truth: Truth) -> No
 
 
 class MarkerScore:
-    """Compares tracked markers of one recording: where are they, and are they still themselves?
+    """Compares positions and identities of the markers tracked in one recording.
 
-    The first frame tells which of the method's markers is which true one. Displacement errors are lengths of
-    error vectors: their RMS over the markers that kept their identity, their 99th percentile over all whose
-    position the method claims to know. A visible marker that the method never found is lost.
+    The first frame assigns the method's markers to the true ones. Displacement errors are lengths of
+    error vectors: their RMS over the markers that kept their identity, their 99th percentile over all that
+    the method does not call lost. A visible marker that the method never found is lost.
     """
 
     def __init__(self, tally: Tally) -> None:
@@ -117,7 +117,7 @@ class MarkerScore:
         own = index[found]
         lost = ~found
         lost[found] = markers.status[own] == MarkerStatus.LOST
-        # Every true marker can be mistaken for another one, also those that the method never found.
+        # A marker may also be confused with one that the method never found.
         position = np.array(truth.position, dtype=np.float64)
         position[found] = markers.position[own]
         claimed = visible & ~lost
@@ -129,9 +129,9 @@ class MarkerScore:
         self._tally.add(displacement_rms=error[claimed & ~wrong], displacement_p99=error[claimed])
 
     def _match(self, markers: Markers, truth: Truth) -> NDArray[np.int64]:
-        """Find the marker of the method that belongs to each true one, and count those without partner.
+        """Find the marker of the method that belongs to each true one, and count the unmatched ones.
 
-        A place that is only inferred is no false marker.
+        Inferred markers are not counted as false.
         """
         self._pitch = metrics.dot_pitch(truth.origin)
         index = metrics.match_points(markers.origin, truth.origin, self._pitch / 2)

@@ -1,12 +1,12 @@
-"""CPU time of alternatives, measured so that they can be compared.
+"""Comparable CPU times of alternatives.
 
 Two habits make ratios trustworthy on a machine that other programs share: alternatives take turns
-(A B A B ...), so that a slow moment hits all of them alike; and what counts is the CPU time of the own
-thread, not wall time, in which others run. A turn is `BLOCK` frames in a row: within it, an alternative
+(A B A B ...), so that a slow moment affects all of them alike; and the CPU time of the thread is measured,
+not wall time, which includes other programs. A turn is `BLOCK` frames in a row: within it, an alternative
 streams as it does in use, with its code and buffers in the cache.
 
 The unit "copy" is the median time in which the same machine, in the same run, copies one raw frame of
-800 x 600 x 3 bytes. It carries results from one machine to another far better than milliseconds do.
+800 x 600 x 3 bytes. It depends far less on the machine than milliseconds do.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 
 BLOCK = 20
 """Frames that an alternative gets in a turn. After the turns of others its first frame takes 1.5 to 2 times
-as long, its second 1.1 to 1.3 times, the later ones as long as in a run of its own: of 20 that leaves the
-median where it belongs (of 5 it did not), and a turn is still short beside a recording."""
+as long, its second 1.1 to 1.3 times, the later ones as long as in a run of its own: with 20, the median is
+that of such a run (with 5 it was not), and a turn is still short compared with a recording."""
 
 Times = dict[str, list[float]]
 """Kind of frame ("contact", "idle", "reference") -> CPU time of each such frame, s."""
@@ -45,7 +45,7 @@ def quiet() -> Iterator[None]:
 
 
 class CopyUnit:
-    """The unit "copy", to be taken again and again during a run.
+    """The unit "copy", measured repeatedly during a run.
 
     Source and destination come from a pool several times as large as any cache nearby, because a camera's
     frame is in memory too, and not in the cache, when it arrives. All of that memory has been written before.

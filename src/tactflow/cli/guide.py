@@ -11,7 +11,7 @@ from tactflow.calibration.progress import progress
 
 
 class Guide:
-    """Tells whether each press was good, and where to press next.
+    """Reports whether each press was good, and where to press next.
 
     wanted : number of presses that are enough. say : shows a line.
 
@@ -31,7 +31,7 @@ class Guide:
         self._undos.put(None)
 
     def __call__(self, finder: PressFinder) -> bool:
-        """Look at the presses so far; whether they are enough."""
+        """Report new presses; returns whether there are enough."""
         presses = finder.presses
         over = len(presses) - finder.lasts
         if self._reported is None:
@@ -53,7 +53,7 @@ class Guide:
         return self._reported >= self._wanted
 
     def _report(self, finder: PressFinder, number: int) -> None:
-        """Say whether a press was good, and what to do next."""
+        """Report whether a press was good, and what to do next."""
         state = progress(finder.presses[: number + 1], False, self._wanted)
         press = state["presses"][number]
         verdict = press["fault"] or f"good, radius {press['radius']:.0f} px"

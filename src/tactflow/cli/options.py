@@ -86,14 +86,14 @@ def load_plan(args: argparse.Namespace, sensor: str | None = None) -> tuple[Pipe
 
 
 def refuse_output(option: str, path: Path, *, overwrite: bool, suffixes: Sequence[str] = ()) -> None:
-    """Find out before the work, not after it, that a file cannot be written. Missing folders will be made.
+    """Check before the work that a file can be written; missing folders are made later.
 
     option : the option that names the file. suffixes : how its name may end; empty for any.
 
     Raises
     ------
-    ConfigError : its name ends otherwise; its folder is not a folder or read-only; it is a folder; it exists
-        and `overwrite` is false.
+    ConfigError : its name has another suffix; its folder is not a folder, or read-only; it is a folder; it
+        exists and `overwrite` is false.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         ends = " or ".join(suffixes)

@@ -1,4 +1,4 @@
-"""What `tactflow run` tells people: the progress of a run, and the summary at its end."""
+"""The progress of `tactflow run`, and the summary at its end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ END_WORDS = {"eos": "end of source", "max_frames": "--max-frames reached", "sign
 
 @contextmanager
 def run_progress(runner: Runner, *, shown: bool) -> Iterator[Callable[[Progress], None]]:
-    """Count frames on a terminal. Gives what the runner calls."""
+    """Show the number of frames on a terminal; yields the function that the runner calls."""
     sensor = runner.pipeline.sensor
     with progress_bar(sensor, shown=shown) as bar:
 
@@ -33,7 +33,7 @@ def summary(result: RunResult, runner: Runner) -> str:
     # The error itself has been printed already.
     end = "error" if result.error is not None else END_WORDS.get(stats["end"], stats["end"])
     lines = [f"{_frames(stats['frames'])} in {stats['wall_s']:.1f} s, {stats['dropped']} dropped ({end})"]
-    # Of several, the last one is what the results carry.
+    # The last one is that of the results.
     contacts = [s for name, s in stats["signals"].items() if name.endswith(".contact")]
     if contacts:
         lines.append(f"contacts: {contacts[-1]['rises']} ({_frames(contacts[-1]['true'])} with contact)")

@@ -268,7 +268,7 @@ def run_record(args: argparse.Namespace) -> int:
 
 
 def _recording_options(args: argparse.Namespace, out: Path) -> dict[str, Any]:
-    """Settings of the sink that records to a file. Raises ConfigError if the file is there already."""
+    """Settings of the sink that records to a file. Raises ConfigError if the file exists."""
     if out.exists() and args.number:
         out = next_name(out)
     if out.exists() and not args.overwrite:

@@ -22,7 +22,7 @@ from tactflow.system.files import completed
 from tactflow.system.redaction import shown_address
 from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
 from tactflow.system.terminal import notes, printable, say, typed
-from tactflow.tune.propose import FEWEST_FOUND, Attempt, Seen, distinct_pipelines, divide, propose
+from tactflow.tune.propose import FEWEST_FOUND, Attempt, Sample, distinct_pipelines, divide, propose
 from tactflow.tune.recording import CHANGE, Kept
 from tactflow.tune.report import changed_pipeline
 from tactflow.view.questions import Questions
@@ -138,20 +138,20 @@ def _set_up(args: argparse.Namespace, source: str, reader: FrameReader, question
             at_rest = len(kept)
         else:
             _watch(reader, RECORDED_SECONDS, observation, questions, kept)
-            seen = divide(kept.frames)
-            questions.show(seen.frames[seen.strongest])
+            sample = divide(kept.frames)
+            questions.show(sample.frames[sample.strongest])
         text = "Where is the end of the gel that points away from the cable? Press it, and choose its edge."
         rotate = int(questions.ask(text, edges, edges=True))
         if reader.live:
             _press(reader, observation, questions, kept)
             observation.pairs[:0] = rest.pairs
-            seen = divide(kept.frames, at_rest)
+            sample = divide(kept.frames, at_rest)
         questions.begin("Trying pipelines on these pictures ...")
         dots = observation.dots
-        attempts = propose(seen, None if dots is None else dots.pitch, rotate, kind, say)
+        attempts = propose(sample, None if dots is None else dots.pitch, rotate, kind, say)
         faults = [found for found in examine(observation) if found.verdict in ("warning", "fault")]
         remarks = [f"{fault.name}: {fault.says}; {fault.effect}. Change: {fault.advice}" for fault in faults]
-        answer = _decide(args, attempts[0], seen, remarks, questions)
+        answer = _decide(args, attempts[0], sample, remarks, questions)
     if answer == "quit":
         raise KeyboardInterrupt
     _write(args.out, source, attempts, remarks)
@@ -209,7 +209,7 @@ def _press(reader: FrameReader, observation: Observation, questions: Questions, 
 
 
 def _decide(
-    args: argparse.Namespace, best: Attempt, seen: Seen, remarks: Sequence[str], questions: Questions
+    args: argparse.Namespace, best: Attempt, sample: Sample, remarks: Sequence[str], questions: Questions
 ) -> str:
     """Show the proposal; returns write, again or quit. Raises StageError with --yes if there is none."""
     choices = {"write": f"Write {args.out}" + ("" if args.no_run else " and go on live")}
@@ -217,7 +217,7 @@ def _decide(
         choices["again"] = "Look again"
     choices["quit"] = "Quit"
     text = f"Proposed: {best}"
-    if not seen.pressed:
+    if not sample.pressed:
         text = f"No press was seen, so that contacts are untested. {text}"
     elif best.failure or best.found < FEWEST_FOUND:
         del choices["write"]

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 from tactflow.engine.errors import ConfigError
 
 _FAILURES = ("error", "disabled")
-"""Reasons for not running that are failures: what they left out is not saved."""
+"""Reasons for not running that are failures, which save no time."""
 
 
 class NodeStatistics(BaseModel):

@@ -46,7 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
     )
-    parser.add_argument("--html", type=Path, metavar="FILE", help="default: beside --out, ending in .html")
+    parser.add_argument(
+        "--html", type=Path, metavar="FILE", help="also write a report with a plot of time against error"
+    )
     add_overwrite(parser, "these files")
     add_json(parser)
 
@@ -59,7 +61,11 @@ def run(args: argparse.Namespace) -> int:
     ConfigError, SourceError
         If the options are wrong, or the recording cannot be used.
     """
-    page = _page(args)
+    refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
+    if args.html is not None:
+        refuse_output("--html", args.html, overwrite=args.overwrite)
+        if problem := missing("plots", "plot", ["matplotlib"]):
+            raise ConfigError(f"--html: {problem}")
     # Imported here: the simulator and the bench take their time.
     from tactflow.tune import report
     from tactflow.tune.recording import take
@@ -80,8 +86,8 @@ def run(args: argparse.Namespace) -> int:
         show_json(report.as_json(tuned))
     else:
         show(report.lines(tuned))
-    if page is not None:
-        report.write_page(page, tuned)
+    if args.html is not None:
+        report.write_page(args.html, tuned)
     if tuned.chosen is None:
         say(impossible(tuned))
         return StageError.exit_code
@@ -89,20 +95,5 @@ def run(args: argparse.Namespace) -> int:
     text = "\n".join(map(printable, report.pipeline_text(tuned, file, args.out).split("\n")))
     with writing(args.out), completed(args.out) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
-    written = f"{args.out} is" if page is None else f"{args.out} and {page} are"
-    say(f"{written} written; try: {typed('tactflow', 'run', str(args.out), '--source', args.source)}")
+    say(f"{args.out} is written; try: {typed('tactflow', 'run', str(args.out), '--source', args.source)}")
     return 0
-
-
-def _page(args: argparse.Namespace) -> Path | None:
-    """Where the page goes; None without matplotlib, unless the page was asked for. Refuses wrong files."""
-    refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
-    problem = missing("plots", "plot", ["matplotlib"])
-    if problem and args.html is None:
-        say(f"no page: {problem}")
-        return None
-    if problem:
-        raise ConfigError(f"--html: {problem}")
-    page: Path = args.html or args.out.with_suffix(".html")
-    refuse_output("--html", page, overwrite=args.overwrite)
-    return page

@@ -153,7 +153,7 @@ def _blur_between(gray: Gray, first: float, second: float) -> float | None:
         return None
     ratio = np.square(fine[crest] / np.maximum(coarse[crest], 1e-6))
     squared = (second**2 - ratio * first**2) / np.maximum(ratio - 1.0, 1e-3)
-    # Only the sharper edges show the blur of the lens; soft shading also has edges.
+    # Only the sharper edges show the blur of the lens; shading is soft.
     return float(np.sqrt(np.percentile(np.maximum(squared, 0.0), 25.0)))
 
 

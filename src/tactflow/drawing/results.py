@@ -149,7 +149,7 @@ class Annotator:
         scale: Scale | None = None,
         normals: NDArray[np.float32] | None = None,
     ) -> NDArray[np.uint8]:
-        """A new picture of the size of `image`, with whatever is given drawn on it.
+        """A new picture of the size of `image`, with these results drawn on it.
 
         image : (H, W, 3) uint8 BGR. contact_mask : (H, W) uint8, needed by the "contact" view alone.
         valid : (H, W) uint8, 0 where no gel is, which is shown darker. depth, scale : for the "depth" view;

@@ -1,4 +1,4 @@
-"""What the program shows people on a terminal: text, notes and warnings, tables, progress."""
+"""Output on a terminal: text, notes and warnings, tables, progress."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import orjson
 def printable(line: str) -> str:
     """One line from files, cameras and the network, without characters that control a terminal.
 
-    Line breaks and marks that turn the direction of writing are among them: no name can forge a second line.
+    Line breaks and changes of the writing direction are among them: no name can forge a second line.
 
     >>> printable("left\\x1b[2J, no\\ttab, \\u202etxt\\nOK")
     'left?[2J, no\\ttab, ?txt?OK'
@@ -45,9 +45,9 @@ def show_json(value: object) -> None:
 
 
 def say(text: str) -> None:
-    """Print what is not a result, on standard error. Lines behind the first are indented.
+    """Print a message on standard error. All lines but the first are indented.
 
-    So every line that is not indented is one of the program's own, whatever a name in the text holds.
+    So a name with line breaks cannot imitate a message of the program.
     """
     print("\n  ".join(map(printable, text.split("\n"))), file=sys.stderr)
 
@@ -93,7 +93,7 @@ def progress_bar(
     if not shown or not sys.stderr.isatty():
         yield lambda **_: None
         return
-    # Imported here: rich takes a while, and most commands are not watched.
+    # Imported here because rich takes a while, and many commands run without a terminal.
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

@@ -1,7 +1,7 @@
-"""Propose a pipeline for a sensor of which nothing is known, from frames at rest and frames with presses.
+"""Propose a pipeline for an unknown sensor, from frames at rest and frames with presses.
 
-No truth is needed: the shipped pipelines process the same frames, and are compared by what they report at
-rest, where every contact is false, and while the gel is pressed, where every frame without one is a miss.
+No truth is needed: the shipped pipelines process the same frames, and are compared by their false contacts at
+rest and their missed contacts while the gel is pressed.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ GEOMETRY: Final = frozenset({"capture", "preprocess", "visualize"})
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Frames of a sensor, and what is known of them.
+class Sample:
+    """Frames of a sensor, divided into those at rest and those with a press.
 
     frames : (H, W, 3) uint8 each. reference : index of the frame of the untouched gel. rest, pressed :
     indices of frames. changes : largest relative change of light of each frame from the reference.
@@ -101,8 +101,8 @@ class Attempt:
         return f"{self.pipeline}: {found}, {100 * self.false:.0f} % false contacts at rest, {dots}"
 
 
-def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Seen:
-    """Tell frames of the untouched gel from those with a press, by the change of light alone.
+def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Sample:
+    """Divide frames into those of the untouched gel and those with a press, by the change of light alone.
 
     at_rest : number of first frames known to show the untouched gel; None: as many as look like the
         reference.
@@ -118,7 +118,7 @@ def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Seen:
     rest = list(same) if at_rest is None else list(range(reference, at_rest))
     limit = max(CHANGE, PRESSED * max(changes))
     pressed = [index for index in range(rest[-1] + 1, len(frames)) if changes[index] >= limit]
-    return Seen(list(frames), reference, rest, pressed, changes)
+    return Sample(list(frames), reference, rest, pressed, changes)
 
 
 @cache
@@ -162,7 +162,7 @@ def shrinking(size: tuple[int, int], pitch: float | None) -> int:
 
 
 def propose(
-    seen: Seen,
+    sample: Sample,
     pitch: float | None,
     rotate: int = 0,
     kind: str | None = None,
@@ -176,11 +176,11 @@ def propose(
     pitch : of the dots, px, None without dots. rotate : degrees clockwise. kind : shipped pipeline for the
     sensor as named by the user, None if unknown. report : called with the result of each.
     """
-    height, width = seen.frames[0].shape[:2]
+    height, width = sample.frames[0].shape[:2]
     settings = {"stages.preprocess.rotate": rotate, DOWNSAMPLE: shrinking((width, height), pitch)}
     attempts = []
     for names in distinct_pipelines():
-        attempts.append(_attempt(kind if kind in names else names[0], settings, seen))
+        attempts.append(_attempt(kind if kind in names else names[0], settings, sample))
         report(str(attempts[-1]))
     best = max(attempts, key=lambda attempt: attempt.score)
 
@@ -192,9 +192,9 @@ def propose(
     return sorted(attempts, key=rank)
 
 
-def _attempt(name: str, settings: dict[str, Any], seen: Seen) -> Attempt:
+def _attempt(name: str, settings: dict[str, Any], sample: Sample) -> Attempt:
     attempt = Attempt(name, settings)
-    frames = [seen.frames[seen.reference], *seen.frames]
+    frames = [sample.frames[sample.reference], *sample.frames]
     # The reference is chosen already.
     running = stream(name, source=frames, settings={**settings, "stages.capture.settle": 0}, images=True)
     touching, dots, moved = [], [], []
@@ -204,23 +204,23 @@ def _attempt(name: str, settings: dict[str, Any], seen: Seen) -> Attempt:
                 if index < 0:
                     continue
                 touching.append(result.contact is not None)
-                if index == seen.strongest:
+                if index == sample.strongest:
                     attempt.picture = result
-                if index in seen.rest and result.markers is not None:
+                if index in sample.rest and result.markers is not None:
                     tracked = result.markers.status == MarkerStatus.TRACKED
                     dots.append(int(tracked.sum()))
                     moved.append(np.hypot(*(result.markers.position - result.markers.origin)[tracked].T))
     except StageError as error:
-        # What comes behind the colon is what a user could do about it.
+        # The remedy behind the colon does not apply here.
         reason = str(error.__cause__ or error).partition(": ")[0]
         attempt.failure = shorten(reason, 70, placeholder=" ...")
         return attempt
     contact = np.array(touching)
-    attempt.false = float(contact[seen.rest].mean())
-    variance = _variance(contact[seen.rest])
-    if seen.pressed:
-        attempt.found = float(contact[seen.pressed].mean())
-        variance += _variance(contact[seen.pressed])
+    attempt.false = float(contact[sample.rest].mean())
+    variance = _variance(contact[sample.rest])
+    if sample.pressed:
+        attempt.found = float(contact[sample.pressed].mean())
+        variance += _variance(contact[sample.pressed])
     attempt.deviation = math.sqrt(variance)
     if dots and any(map(len, moved)):
         attempt.dots = int(np.median(dots))
