@@ -7,7 +7,6 @@ import pytest
 
 from tactflow.bench.lockstep import LockstepPipeline, TimedResult, on_recording, take_turns
 from tactflow.config.load import load_pipeline
-from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Pipeline
 
 STAGES = '''
@@ -84,15 +83,6 @@ def test_a_frames_time_is_its_own(tmp_path: Path) -> None:
     assert times[1] >= 0.06
     assert times[3] >= 0.03
     assert times[2] < times[3] < times[1]
-
-
-def test_what_came_before_a_failure_is_kept_and_then_it_is_raised(pipeline: Pipeline, tmp_path: Path) -> None:
-    lockstep = LockstepPipeline(recorded(pipeline, tmp_path, 1, 2, 255, 3))
-    assert [result.seq for result in lockstep.block(4)] == [0, 1]
-    for _ in range(2):
-        with pytest.raises(TactflowError, match="too bright"):
-            lockstep.block(4)
-    lockstep.close()
 
 
 def test_pipelines_take_turns_and_each_sees_every_frame_once(pipeline: Pipeline, tmp_path: Path) -> None:

@@ -8,13 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.report import pareto, points, write_bench_report
+from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import BenchResult
 from tactflow.bench.tables import sections
 from tactflow.report import markdown
-
-RMS = QUANTITIES["displacement_rms"]
 
 
 @pytest.fixture
@@ -36,16 +33,6 @@ def result() -> BenchResult:
     made.add("pipeline", "default", "press", scored, times={"contact": [0.0015], "idle": [0.0001]}, frames=2)
     made.failures["pipeline/classic/press"] = "no markers\nmore"
     return made
-
-
-def test_a_point_is_the_median_over_scenes_and_the_front_holds_what_nothing_beats(
-    result: BenchResult,
-) -> None:
-    found = points(result, "tracker", RMS)
-    # A method without an answer in some scene is left out.
-    assert found.keys() == {"slow & <exact>", "fast", "bad"}
-    assert found["fast"] == (5.5, 0.2)
-    assert pareto(found) == ["fast", "slow & <exact>"]
 
 
 def test_every_kind_of_measurement_has_its_row(result: BenchResult) -> None:

@@ -1,4 +1,4 @@
-"""The original script's masks of markers and contact."""
+"""The original script's masks of markers and contact, and the reference of its difference."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from tactflow.classic.functions import difference, mask_marker
+from tactflow.classic.stages import Difference
+from tactflow.engine.frame import Frame
 
 BRIGHTER_BY = 14
 """Smallest brightening, grey levels, that passes the script's threshold of 140."""
@@ -53,3 +55,22 @@ def test_mask_marker_follows_the_description_step_by_step() -> None:
     mask = mask_marker(image)
     assert mask.any()
     assert np.array_equal(mask, expected)
+
+
+GREY = np.full((40, 60, 3), 100, np.uint8)
+
+
+def frame(seq: int, *, reference: bool = False) -> Frame:
+    return Frame("test", seq, seq / 60, GREY, reference=reference)
+
+
+def test_the_difference_is_taken_from_the_last_reference_until_a_reset() -> None:
+    stage, touched = Difference(Difference.Params()), GREY.copy()
+    touched[10:30, 10:40] += 20
+    assert not stage.process(GREY - np.uint8(50), frame(0, reference=True)).touching
+    assert not stage.process(GREY, frame(1, reference=True)).touching
+    result = stage.process(touched, frame(2))
+    assert result.touching
+    assert np.array_equal(result.contact_mask, difference(touched, GREY))
+    stage.reset()
+    assert not stage.process(touched, frame(3)).touching

@@ -56,9 +56,8 @@ def test_the_hull_and_its_line_are_those_of_the_script(seed: int) -> None:
     angle, slope, middle = line_step_by_step(hull, mask.shape[1])
     assert contact.area == cv2.contourArea(hull)
     np.testing.assert_array_equal(contact.hull, hull.reshape(-1, 2))
-    # OpenCV fits in single precision, here relative to the contact.
-    assert contact.angle == pytest.approx(angle, abs=2e-4)
-    assert contact.slope == pytest.approx(slope, abs=1e-5)
+    assert contact.angle == pytest.approx(angle, abs=1e-9)
+    assert contact.slope == pytest.approx(slope, abs=1e-9)
     assert contact.center == middle
 
 

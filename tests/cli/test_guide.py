@@ -48,12 +48,3 @@ def test_the_last_press_is_undone_and_the_session_ends_with_enough() -> None:
     assert [found.center for found in session.presses] == [(20, 20)], "the one that lasts stays"
     assert said[-1] == "press 1 is undone; press again"
     assert guide(finder([*session.presses, press(70, 20), press(70, 70)]))
-
-
-def test_presses_of_a_recording_beyond_those_that_are_wanted_are_counted_alone() -> None:
-    said: list[str] = []
-    guide = Guide(1, said.append)
-    guide(finder([]))
-    guide(finder([press(45, 45), press(20, 20)]))
-    assert said[0].startswith("press 1 of 1: good")
-    assert said[1].startswith("press 2: good")

@@ -18,7 +18,6 @@ import tactflow
 from tactflow.cli import start
 from tactflow.cli.main import main, make_parser
 from tactflow.engine.errors import SourceError
-from tactflow.view import questions
 from tests.clock import PATIENCE
 
 Recorded = Callable[[str], str]
@@ -172,19 +171,6 @@ def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
     assert made["stages"]["capture"]["source"] == cameras[2]
     assert made["stages"]["preprocess"]["rotate"] == 90
     assert made["sensor"] == "digit"
-
-
-def test_without_a_page_and_a_terminal_nobody_can_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError("not permitted")
-
-    monkeypatch.setattr(questions, "bind", refuse)
-    assert main(["start", "sim:press?frames=60", "--out", str(tmp_path / "made.yaml")]) == 2
-    err = capsys.readouterr().err
-    assert "no page, because 127.0.0.1:8780 cannot be served (not permitted); answer here" in err
-    assert "nobody can answer" in err
 
 
 @pytest.mark.parametrize(("recording", "dots"), [("gels/digit_fots", False), ("gels/gelslim_ball", True)])

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -18,7 +16,6 @@ from tactflow.cli.main import main
 from tactflow.doctor import examine, observe
 from tactflow.sim import open_scene
 from tactflow.sources import FrameReader
-from tactflow.system.signals import ending_handled, interrupt
 from tests.vision.dots import grid, render
 
 Image = NDArray[np.uint8]
@@ -139,25 +136,6 @@ def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
     (focus,) = [check for check in told["checks"] if check["name"] == "focus"]
     assert (focus["verdict"], focus["unit"]) == ("fault", "px")
     assert focus["says"] in table
-
-
-def test_one_ctrl_c_ends_the_look_at_the_source_and_the_next_one_ends_the_command(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def signalled(_: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-
-    @contextmanager
-    def progress_bar(_: str) -> Iterator[Callable[..., None]]:
-        yield lambda description: signalled(0) if description == "5 frames" else None
-
-    monkeypatch.setattr("tactflow.cli.doctor.progress_bar", progress_bar)
-    words = ["doctor", "--source", "sim:idle?frames=20"]
-    with ending_handled(interrupt):
-        assert main(words) == 0
-        assert ": 5 frames observed" in capsys.readouterr().out
-        monkeypatch.setattr("tactflow.doctor.examine", signalled)
-        assert main(words) == 130
 
 
 def test_the_file_for_a_bug_report_has_a_picture_only_if_asked_and_no_secrets(tmp_path: Path) -> None:

@@ -65,18 +65,8 @@ def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     monkeypatch.chdir(tmp_path)
     path = Fitted(SMALL, Case("press", 30), tmp_path, 3).path
     budget = 1.5
-    words = [
-        "tune",
-        "default",
-        "--source",
-        str(path),
-        "--max-error",
-        str(budget),
-        "--json",
-        "--html",
-        "tuned.html",
-    ]
-    assert main(words) == 0
+    words = ["tune", "default", "--source", str(path), "--json", "--html", "tuned.html"]
+    assert main([*words, "--max-error", str(budget)]) == 0
     output = json.loads(capsys.readouterr().out)
     trials = candidates(find_pipeline("default"), (320, 240), None)
     judge(trials, [Fitted(SMALL, Case("press", 24), tmp_path, 50)])

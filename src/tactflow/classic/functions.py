@@ -125,10 +125,8 @@ def fit_ellipse(points: NDArray[np.int32]) -> Ellipse | None:
     """
     if len(points) < 5:
         return None
-    # OpenCV fits in single precision: coordinates relative to the contact lose less of it.
-    left, top = points.min(axis=(0, 1)).tolist()
     try:
-        (x, y), (first, second), rotation = cv2.fitEllipse(points - np.array([left, top], np.int32))
+        (x, y), (first, second), rotation = cv2.fitEllipse(points)
     except cv2.error:
         return None
     if not np.isfinite([x, y, first, second, rotation]).all() or min(first, second) <= _THINNEST_AXIS:
@@ -136,7 +134,7 @@ def fit_ellipse(points: NDArray[np.int32]) -> Ellipse | None:
     # OpenCV measures the angle of the first axis, clockwise on the screen.
     theta = math.radians(rotation if first >= second else rotation + 90)
     angle = None if first == second else axis_direction(theta)[0]
-    return Ellipse((x + left, y + top), (float(max(first, second)), float(min(first, second))), angle)
+    return Ellipse((x, y), (float(max(first, second)), float(min(first, second))), angle)
 
 
 def regress_line(points: NDArray[np.int32], width: int) -> tuple[float, float | None, tuple[float, float]]:
@@ -144,19 +142,14 @@ def regress_line(points: NDArray[np.int32], width: int) -> tuple[float, float | 
 
     Returns its angle, degrees in (-90, 90], counter-clockwise on the screen; its slope dy/dx (y down), None
     where it is vertical; and (x, y), px, halfway between its ends at x = 0 and x = width, both truncated to
-    whole pixels, or any of its points if it is vertical. OpenCV's single precision gives 2e-4 degrees and
-    1e-4 px.
+    whole pixels, or any of its points if it is vertical.
 
     points : (N, 1, 2) int32, px, N >= 2. width : of the image, px.
 
     >>> regress_line(np.array([[[0, 10]], [[100, 10]]], np.int32), 200)
     (0.0, 0.0, (99.5, 10.0))
     """
-    # Relative to the contact, as in `fit_ellipse`.
-    left, top = points.min(axis=(0, 1)).tolist()
-    fitted = cv2.fitLine(points - np.array([left, top], np.int32), cv2.DIST_L2, 0, 0.01, 0.01)
-    vx, vy, x, y = (float(value) for value in np.ravel(fitted))
-    x, y = x + left, y + top
+    vx, vy, x, y = (float(value) for value in np.ravel(cv2.fitLine(points, cv2.DIST_L2, 0, 0.01, 0.01)))
     angle, slope = axis_direction(math.atan2(vy, vx))
     if slope is None:
         return angle, None, (x, y)
