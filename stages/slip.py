@@ -1,24 +1,27 @@
-"""Stage `slip`: whether what touches the gel slips."""
+"""Stage `slip`: how what touches the gel moves against it."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 from tactflow.engine.contract import Stage, StageParams
-from tactflow.ports import ContactMask, Slipping, Touching
-from tactflow.vision.flow import DisplacementField, SlipTest
+from tactflow.engine.frame import Frame
+from tactflow.ports import ContactMask, MarkerMask, Slipping, Touching, Unmarked, Untouched
+from tactflow.vision.arrays import Floats32
+from tactflow.vision.flow import DisplacementField, SlipTracker
+from tactflow.vision.flow.registration import cells, light_change
 from tactflow.vision.types import Slip
 
 
 class SlipPorts(NamedTuple):
-    """slipping : whether the contact slides over the gel. slip : that, and the part of it that sticks."""
+    """slipping : whether the contact slides over the gel. slip : that, how far, and the part that sticks."""
 
     slipping: Slipping
     slip: Slip | None
 
 
 class SlipStage(Stage):
-    """Gross slip from the gel that a contact leaves behind, incipient slip from how the gel moves below it.
+    """Motion of the object, by its picture on the gel, against the motion of the gel, by its markers.
 
     `when: slipping` gates other stages. This stage needs no gate: without a contact it does next to nothing.
     """
@@ -27,18 +30,29 @@ class SlipStage(Stage):
 
     def __init__(self, params: StageParams) -> None:
         super().__init__(params)
-        self._test = SlipTest()
+        self._rest: tuple[Untouched, Floats32] | None = None
+        self._tracker = SlipTracker()
 
     def reset(self) -> None:
         """A new reference follows: displacements are measured anew."""
-        self._test.reset()
+        self._tracker.reset()
 
     def process(
-        self, touching: Touching, contact_mask: ContactMask, field: DisplacementField | None = None
+        self,
+        frame: Frame,
+        touching: Touching,
+        contact_mask: ContactMask,
+        unmarked: Unmarked,
+        untouched: Untouched,
+        marker_mask: MarkerMask | None = None,
+        field: DisplacementField | None = None,
     ) -> SlipPorts:
         """Slip of this frame's contact; `slip` is absent without one, or where no marker is near."""
         if not touching or field is None:
-            self._test.reset()
+            self._tracker.reset()
             return SlipPorts(False, None)
-        slip = self._test(field, contact_mask)
+        if self._rest is None or self._rest[0] is not untouched:
+            self._rest = untouched, cells(untouched)
+        change = light_change(unmarked, self._rest[1], marker_mask)
+        slip = self._tracker(frame.seq, frame.t, change, field, contact_mask)
         return SlipPorts(slip is not None and slip.slipping, slip)

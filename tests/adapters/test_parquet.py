@@ -28,7 +28,7 @@ SCALE = Scale(0.05, 0.06, (0.0005, 0.0005), (150.0, 200.0))
 DEPTH = Depth(np.zeros((4, 3), np.float32), 0.4, 0.1, 3.2, None)
 SECOND = replace(CONTACT, area=12.0, angle=None, ellipse=None, hull=CONTACT.hull + 100)
 TWO = replace(CONTACT, separate=(CONTACT, SECOND))
-SLIP = Slip(slipping=True, stick_ratio=0.25)
+SLIP = Slip(True, 0.25, 0.9, (3.0, -4.0), 2.5, 60.0, 7, (0.5, 0.6), 1.5, 3.0)
 FORCE = Force((0.1, None, 2.5), (0.01, None, 0.2), True)
 FOUND = [
     Results(PROCESSED),

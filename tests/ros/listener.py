@@ -32,6 +32,8 @@ TOPICS = {
     "contact_pixels": PolygonStamped,
     "contact_pose": PoseStamped,
     "contact_pose_pixels": PoseStamped,
+    "slip": PoseStamped,
+    "slip_pixels": PoseStamped,
     "flow": Vector3Stamped,
     "flow_pixels": Vector3Stamped,
     "markers": PointCloud2,

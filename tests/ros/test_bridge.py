@@ -39,7 +39,7 @@ RESULTS = Results(
     MARKERS,
     Scale(0.1, 0.2, (0.001, 0.001), (10.0, 5.0)),
     Depth(HEIGHTS, 1.0, None, 3.0, None),
-    slip=Slip(True, 0.0),
+    slip=Slip(True, 0.0, 0.9, (3.0, -4.0), 90.0, 60.0, 0),
     force=Force((None, None, 2.5), (None, None, 0.2), True),
     pose=Pose("tracked", 0, (1.0, 2.0, -0.5), (0.5, 0.0, 0.25), (0.0, 0.0, 90.0), np.eye(6)),
 )
@@ -172,6 +172,10 @@ def test_a_cloud_has_a_point_for_each_marker(pair: Pair) -> None:
 def test_touch_slip_force_depth_and_picture_arrive(pair: Pair) -> None:
     assert pair.receive("touching") == {"data": True}
     assert pair.receive("slipping") == {"data": True}
+    for topic, expected in (("slip", (0.0003, -0.0008)), ("slip_pixels", (3.0, -4.0))):
+        pose = pair.receive(topic)["pose"]
+        assert (pose["position"]["x"], pose["position"]["y"]) == pytest.approx(expected)
+        assert list(pose["orientation"].values()) == pytest.approx([0, 0, -(0.5**0.5), 0.5**0.5])
     force = pair.receive("wrench")["wrench"]["force"]
     assert math.isnan(force["x"])
     assert force["z"] == -2.5

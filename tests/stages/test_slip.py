@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tactflow.engine.contract import StageParams
+from tactflow.engine.frame import Frame
 from tactflow.engine.ports import read_ports
 from tactflow.stages.slip import SlipPorts, SlipStage
 from tactflow.vision.flow import FieldModel
-from tactflow.vision.types import Markers, Slip
+from tactflow.vision.types import Markers
 
 X, Y = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
 ORIGIN = np.column_stack([X.ravel(), Y.ravel()])
@@ -17,27 +19,34 @@ FIELD = FieldModel(ORIGIN, (200, 200))(MARKERS)
 NOTHING = np.zeros((200, 200), np.uint8)
 
 
-def step(stage: SlipStage, left: int) -> SlipPorts:
-    mask = NOTHING.copy()
-    mask[70:130, left : left + 60] = 255
+REST = np.zeros((200, 200, 3), np.uint8)
+
+
+def step(stage: SlipStage, left: int, seq: int = 0) -> SlipPorts:
+    mask, picture = NOTHING.copy(), REST.copy()
+    mask[70:130, left : left + 60] = picture[70:130, left : left + 60, 0] = 255
     assert FIELD is not None
-    return stage.process(True, mask, FIELD)
+    return stage.process(Frame("main", seq, seq / 60, picture), True, mask, picture, REST, None, FIELD)
 
 
-def test_it_gives_a_signal_for_gates_and_how_much_sticks() -> None:
+def test_it_gives_a_signal_for_gates_and_how_far_the_object_has_slid() -> None:
     ports = read_ports(SlipStage, "process")
     assert [(port.name, port.optional) for port in ports.outputs] == [("slipping", False), ("slip", True)]
     stage = SlipStage(StageParams())
-    assert step(stage, 60) == SlipPorts(False, Slip(False, 1.0))
-    assert step(stage, 70) == SlipPorts(True, Slip(True, 0.0))
+    first, second = step(stage, 60), step(stage, 70, 1)
+    assert first.slip is not None
+    assert second.slip is not None
+    assert (first.slipping, first.slip.stick_ratio, first.slip.speed) == (False, 1.0, None)
+    assert (second.slipping, second.slip.stick_ratio, second.slip.since) == (True, 0.0, 0)
+    assert second.slip.translation == pytest.approx((10, 0), abs=0.5)
 
 
 def test_without_a_contact_or_a_field_nothing_slips_and_the_last_contact_is_forgotten() -> None:
-    stage = SlipStage(StageParams())
+    stage, frame = SlipStage(StageParams()), Frame("main", 0, 0.0, REST)
     step(stage, 60)
-    assert stage.process(False, NOTHING) == SlipPorts(False, None)
+    assert stage.process(frame, False, NOTHING, REST, REST) == SlipPorts(False, None)
     assert not step(stage, 70).slipping
-    assert stage.process(True, NOTHING, None) == SlipPorts(False, None)
+    assert stage.process(frame, True, NOTHING, REST, REST) == SlipPorts(False, None)
     assert not step(stage, 80).slipping
     stage.reset()
     assert not step(stage, 90).slipping

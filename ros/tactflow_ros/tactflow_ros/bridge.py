@@ -65,6 +65,7 @@ GEOMETRY: dict[str, tuple[type, Maker]] = {
     "contact": (PolygonStamped, messages.polygon),
     "contact_pose": (PoseStamped, messages.pose),
     "flow": (Vector3Stamped, messages.flow),
+    "slip": (PoseStamped, messages.slip),
     "markers": (PointCloud2, messages.markers),
 }
 """Topic -> type and converter; published in metres and, as `NAME_pixels`, in pixels."""

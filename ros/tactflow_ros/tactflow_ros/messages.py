@@ -114,10 +114,7 @@ def pose(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
     result = PoseStamped(header=head)
     place = result.pose.position
     ((place.x, place.y),) = unit.places(contact["center"]).tolist()
-    # tactflow's angles are counter-clockwise on the screen; the frame's z points into the picture.
-    angle = -math.radians(contact["angle"] or 0.0)
-    result.pose.orientation.z = math.sin(angle / 2)
-    result.pose.orientation.w = math.cos(angle / 2)
+    _turn(result, contact["angle"] or 0.0)
     return result
 
 
@@ -158,6 +155,24 @@ def flow(message: Message, head: Header, unit: Unit) -> Vector3Stamped | None:
     result = Vector3Stamped(header=head)
     ((result.vector.x, result.vector.y),) = unit.vectors(mean).tolist()
     return result
+
+
+def slip(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
+    """How far the object has moved over the gel, and how far it has turned on it."""
+    found = message.get("slip")
+    if found is None or found.get("translation") is None:
+        return None
+    result = PoseStamped(header=head)
+    place = result.pose.position
+    ((place.x, place.y),) = unit.vectors(found["translation"]).tolist()
+    _turn(result, found["rotation"])
+    return result
+
+
+def _turn(result: PoseStamped, angle: float) -> None:
+    """tactflow's angles are counter-clockwise on the screen; the frame's z points into the picture."""
+    half = -math.radians(angle) / 2
+    result.pose.orientation.z, result.pose.orientation.w = math.sin(half), math.cos(half)
 
 
 def markers(message: Message, head: Header, unit: Unit) -> PointCloud2 | None:

@@ -43,7 +43,7 @@ FILL: Final[Mapping[str, tuple[str, float]]] = {
     "byte": ("u1", 255),
 }
 """Kind of a column -> data type, and the value that stands for a missing one."""
-UNIT: Final = re.compile(r"(?:^|, | and )(mm per px|mm\^[23]|px\^2|mm|px|degrees|N|s)(?=[ ;:,]|$)")
+UNIT: Final = re.compile(r"(?:^|, | and )(mm per px|mm\^[23]|px\^2|mm/s|px/s|mm|px|degrees|N|s)(?=[ ;:,]|$)")
 """A unit in the description of a column."""
 MARKERS: Final = {
     "markers_origin": ("points", "(N, M, 2): (x, y) of each marker in the reference frame, px"),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
-from tactflow.message.encoding import FLOW_DETAILS, STATUS_NAMES
+from tactflow.message.encoding import FLOW_DETAILS, SLIP_DETAILS, STATUS_NAMES
 from tactflow.vision.types import Contact, Depth, Ellipse, Features, Flow, Force, Markers, Pose, Scale, Slip
 
 T = TypeVar("T")
@@ -110,7 +110,10 @@ def _scale(scale: Any) -> Scale:
 
 
 def _slip(slip: Any) -> Slip:
-    return Slip(bool(slip["slipping"]), float(slip["stick_ratio"]))
+    keys = ("probability", "translation", "rotation", "speed", "since", *SLIP_DETAILS)
+    known = {key: _numbers(slip.get(key)) for key in keys}
+    since = _optional(int, known.pop("since"))
+    return Slip(bool(slip["slipping"]), float(slip["stick_ratio"]), since=since, **known)
 
 
 def _force(force: Any) -> Force:

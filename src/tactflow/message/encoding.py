@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus, Pose, Scale
+from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus, Pose, Scale, Slip
 
 if TYPE_CHECKING:
     from tactflow.message.result import Result
@@ -25,6 +25,8 @@ FLOW_DETAILS = (
     *("rotation_stderr", "divergence_stderr", "shear_stderr", "shear"),
 )
 """Attributes of `Flow` that only a detailed message has."""
+SLIP_DETAILS = ("translation_stderr", "rotation_stderr", "speed_stderr")
+"""Attributes of `Slip` that only a detailed message has."""
 _EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
 """What `skipped` of a message may name: the ports that every message has, and the reference."""
 
@@ -49,7 +51,7 @@ def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
     if scale is not None:
         message["scale"] = {"mm_per_px": (scale.x, scale.y), "origin": scale.origin}
     if result.slip is not None:
-        message["slip"] = _attributes(result.slip, "slipping", "stick_ratio")
+        message["slip"] = _slip(result.slip, scale, detail)
     if result.force is not None:
         message["force"] = _attributes(result.force, "value", "stderr", "in_range")
     if result.pose is not None:
@@ -100,6 +102,18 @@ def _flow(flow: Flow, scale: Scale | None, detail: bool) -> dict[str, Any]:
             message["mean_mm_stderr"] = scale.vector_stderr(flow.mean, flow.stderr)
     if detail:
         message |= _attributes(flow, *FLOW_DETAILS)
+    return message
+
+
+def _slip(slip: Slip, scale: Scale | None, detail: bool) -> dict[str, Any]:
+    message = _attributes(
+        slip, "slipping", "stick_ratio", "probability", "translation", "rotation", "speed", "since"
+    )
+    if scale is not None:
+        message["translation_mm"] = None if slip.translation is None else scale.vector(slip.translation)
+        message["speed_mm"] = None if slip.speed is None else slip.speed * math.sqrt(scale.x * scale.y)
+    if detail:
+        message |= _attributes(slip, *SLIP_DETAILS)
     return message
 
 

@@ -129,12 +129,34 @@ class _MarkersModel(_Strict):
 
 
 class _SlipModel(_Strict):
-    """Whether the contact slips."""
+    """How the object moves against the gel."""
 
     slipping: bool = Field(description="whether it slides over the gel")
     stick_ratio: float = Field(
         ge=0, le=1, description="share of the contact on which the gel moves with it; 0 while it slides"
     )
+    probability: _Share | None = Field(None, description="that it slides; null when unknown")
+    translation: _Point | None = Field(
+        None, description="(x, y), how far the middle of the contact has moved over the gel, px"
+    )
+    rotation: _Finite | None = Field(
+        None, description="how far it has turned on the gel, degrees, counter-clockwise as seen"
+    )
+    speed: _NotNegative | None = Field(
+        None, description="RMS over the contact, px/s; null in the first frame"
+    )
+    since: int | None = Field(
+        None, ge=0, description="seq of the frame from which translation and rotation are measured"
+    )
+    translation_mm: _Point | None = Field(None, description="translation, mm (calibrated)")
+    speed_mm: _NotNegative | None = Field(None, description="speed, mm/s (calibrated)")
+    translation_stderr: tuple[_NotNegative, _NotNegative] | None = Field(
+        None, description="standard error of translation, px (detail)"
+    )
+    rotation_stderr: _NotNegative | None = Field(
+        None, description="standard error of rotation, degrees (detail)"
+    )
+    speed_stderr: _NotNegative | None = Field(None, description="standard error of speed, px/s (detail)")
 
 
 class _ScaleModel(_Strict):

@@ -52,7 +52,8 @@ class Programme:
     dilation : outward displacement by a press, pitches. contacts : number spread over the recording; 0: as
     many as fit. partial : whether slip starts at the edge of the contact; for balls. rolls : whether a ball
     turns as it travels, without slip. tilts : rotation about the direction of motion and across it, from 0 to
-    this and back during a hold, degrees.
+    this and back during a hold, degrees. holds : turn up to which the gel follows, degrees, before it slips,
+    in holds in which the indenter turns on and not back; None: always.
     """
 
     indenters: tuple[Callable[..., Shape], ...]
@@ -72,6 +73,7 @@ class Programme:
     partial: bool = False
     rolls: bool = False
     tilts: tuple[float, float] = (0.0, 0.0)
+    holds: float | None = None
 
 
 def _smooth(value: float) -> float:
@@ -212,7 +214,12 @@ def presses(
     pitch = min(pitch, _LARGEST_STROKE)
     x, y, angle, ahead = _place(programme, settings.seed, timing.cycle, size)
     drag, travelled, stick, sliding = _dragged(programme, timing, ahead, settings, pitch)
-    turn = float(np.radians(settings.twist)) * (-1.0 if timing.cycle % 2 else 1.0) * timing.swing
+    turning = timing.swing if programme.holds is None else timing.progress
+    turn = float(np.radians(settings.twist)) * (-1.0 if timing.cycle % 2 else 1.0) * turning
+    twist = turn
+    if programme.holds is not None:
+        twist = float(np.clip(turn, *np.radians([-programme.holds, programme.holds])))
+        sliding |= turn != twist and timing.progress < 1
     full = programme.depths[timing.cycle % len(programme.depths)] * settings.depth
     depth = timing.envelope * full
     tilts = [
@@ -229,7 +236,7 @@ def presses(
             angle + turn,
             depth * shape.depth,
             (float(drag[0]), float(drag[1])),
-            turn,
+            twist,
             programme.dilation * pitch,
             settings.sink,
             settings.rim,

@@ -86,6 +86,14 @@ SCENES: dict[str, Recipe] = {
         ),
         {"twist": 20.0, "shear": 0.0},
     ),
+    "spin": Recipe(
+        "a flat punch is pressed and turned; the gel follows for 8 degrees, then slips",
+        Programme(
+            (shapes.box,), wander=(120.0, 80.0), angles=(-40.0, 40.0), hold=50, period=90,
+            depths=(1.0, 0.6, 0.8), dilation=0.12, holds=8.0,
+        ),
+        {"twist": 40.0, "shear": 0.0},
+    ),
     "edge": Recipe(
         "a knife edge at several angles",
         Programme((shapes.edge,), wander=(120.0, 90.0), angles=(-90.0, 90.0), dilation=0.2),

@@ -148,10 +148,18 @@ class Flow:
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """Whether what touches the gel slips.
+    """How what touches the gel moves against the gel under it.
 
-    slipping : whether it slides over the gel.
+    slipping : whether it slides over the gel: whether `probability` is above a half.
     stick_ratio : share of the contact on which the gel still moves with it, 0 to 1; 0 while it slides.
+    probability : that it has moved farther over the gel in the last 0.1 s than a contact that sticks, and in
+        the direction in which it drags the gel, 0 to 1.
+    translation : (x, y), px: how far the middle of the contact has moved over the gel since frame `since`.
+    rotation : how far it has turned on the gel since then, degrees, counter-clockwise as seen on the screen.
+    speed : RMS over the contact in the last 0.1 s, px/s; None in the first frame.
+    since : seq of the frame in which it was touched, or measured anew.
+    translation_stderr : (x, y), px. rotation_stderr : degrees. speed_stderr : px/s. Standard errors; None
+        where unknown.
 
     >>> Slip(False, 0.7).stick_ratio
     0.7
@@ -159,6 +167,14 @@ class Slip:
 
     slipping: bool
     stick_ratio: float
+    probability: float | None = None
+    translation: tuple[float, float] | None = None
+    rotation: float | None = None
+    speed: float | None = None
+    since: int | None = None
+    translation_stderr: tuple[float, float] | None = None
+    rotation_stderr: float | None = None
+    speed_stderr: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

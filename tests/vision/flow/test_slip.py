@@ -1,15 +1,17 @@
-"""Gross and incipient slip."""
+"""Motion of the object against the gel, gross and incipient slip."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import pytest
 
 from tactflow.sim import open_scene
-from tactflow.vision.flow import FieldModel, SlipTest
+from tactflow.vision.flow import FieldModel, SlipTracker
+from tactflow.vision.flow.registration import cells, light_change
 from tactflow.vision.flow.slip import stick_ratio
 from tactflow.vision.geometry.preprocess import Preprocessor
 from tactflow.vision.types import Markers, MarkerStatus, Slip
@@ -19,13 +21,13 @@ NOISE = 0.015
 
 
 def judged(spec: str, frames: range) -> Iterator[tuple[int, bool, float, Slip]]:
-    """Frame, whether it truly slips, its true stick ratio, and what the test says, from true outlines."""
-    scene, test, rng = open_scene(spec), SlipTest(), np.random.default_rng(3)
+    """Frame, whether it truly slips, its true stick ratio, and the slip, from true outlines and depths."""
+    scene, tracker, rng = open_scene(spec), SlipTracker(), np.random.default_rng(3)
     model = FieldModel(scene.truth(0, MAPPING).origin, MAPPING.size)
     for index in frames:
         truth = scene.truth(index, MAPPING)
         if not truth.touching or truth.stick_ratio is None:
-            test.reset()
+            tracker.reset()
             continue
         seen = np.where(truth.visible, MarkerStatus.TRACKED, MarkerStatus.LOST).astype(np.uint8)
         position = truth.position + rng.normal(0, NOISE, truth.position.shape)
@@ -33,30 +35,35 @@ def judged(spec: str, frames: range) -> Iterator[tuple[int, bool, float, Slip]]:
         field = model(markers)
         assert field is not None
         mask = np.uint8(255) * truth.contact_mask
-        slip = test(field, mask)
+        picture = np.repeat(np.rint(2 * truth.sunk).astype(np.uint8)[..., None], 3, axis=2)
+        slip = tracker(index, index / 60, light_change(picture, cells(0 * picture), None), field, mask)
         if slip is not None:
             yield index, truth.slipping, truth.stick_ratio, slip
 
 
-@pytest.mark.parametrize("spec", ["slide?frames=140", "stick_slip?frames=150"])
-def test_a_contact_that_slides_is_noticed_within_three_frames_and_not_before(spec: str) -> None:
+@pytest.mark.parametrize(
+    "spec", ["slide?frames=140", "stick_slip?frames=150", "scrape?frames=140", "spin?frames=140"]
+)
+def test_a_contact_that_slides_is_noticed_within_0_1_seconds_and_not_before(spec: str) -> None:
     told = [(index, true, slip.slipping) for index, true, _, slip in judged(spec, range(14, 110))]
     first = next(index for index, true, _ in told if true)
     found = next(index for index, _, slipping in told if slipping)
-    assert first <= found <= first + 3
+    assert first <= found <= first + 6
     # From then on without a gap, for as long as it slides.
     assert all(slipping for index, true, slipping in told if true and index >= found)
 
 
 def test_a_slip_is_noticed_where_no_dot_is_where_the_gel_clings_to_the_object() -> None:
-    told = [(index, true, slip) for index, true, _, slip in judged("stick_slip?seed=13", range(190, 226))]
-    first = next(index for index, true, _ in told if true)
+    told = list(judged("stick_slip?seed=13", range(190, 226)))
+    first = next(index for index, true, _, _ in told if true)
+    mostly = next(index for index, _, sticks, _ in told if sticks < 0.5)
     scene = open_scene("stick_slip?seed=13")
     truth, (press,) = scene.truth(first, MAPPING), scene.presses(first)
     away = np.hypot(*(truth.position - truth.center).T)
     clings = press.radius * math.sqrt(truth.contact_mask.sum() / math.pi) / math.sqrt(2 * 95 * press.depth)
     assert away.min() > clings
-    assert first <= next(index for index, _, slip in told if slip.slipping) <= first + 3
+    # Without a dot there, the gel that slips at the edge looks like all of it.
+    assert mostly <= next(index for index, *_, slip in told if slip.slipping) <= first + 6
 
 
 def test_what_rolls_sticks_also_where_it_has_left_the_gel_that_it_touched_first() -> None:
@@ -106,14 +113,73 @@ def test_gel_that_stays_behind_does_not_stick() -> None:
 
 
 def test_another_contact_starts_anew_and_what_moves_against_the_drag_is_no_slip() -> None:
-    test = SlipTest()
+    tracker = SlipTracker()
+    for seq, (left, expected) in enumerate(((60, False), (None, None), (80, False), (72, False), (88, True))):
+        slip = step(tracker, seq, left)
+        assert (None if slip is None else slip.slipping) == expected
+
+
+def test_one_measurement_goes_on_while_the_outline_flickers() -> None:
+    tracker = SlipTracker()
+    for seq in range(12):
+        slip = step(tracker, seq, 60 + 3 * seq, shown=0.5 + 0.5 * (seq % 2))
+        assert slip is not None
+        assert slip.since == 0
+        assert slip.slipping == (seq > 0)
+    assert slip.translation == pytest.approx((33, 0), abs=0.5)
+    assert slip.speed == pytest.approx(180, abs=5)
+    assert slip.rotation == pytest.approx(0, abs=0.5)
+
+
+def test_the_picture_of_another_object_starts_the_measurement_anew() -> None:
+    tracker = SlipTracker()
+    assert step(tracker, 0, 60) is not None
+    slip = step(tracker, 1, 60, striped=True)
+    assert slip is not None
+    assert (slip.since, slip.slipping, slip.speed) == (1, False, None)
+
+
+@pytest.mark.parametrize("spec", ["slide?frames=140", "scrape?frames=140", "spin?frames=140"])
+def test_translation_and_rotation_are_right_and_their_errors_honest(spec: str) -> None:
+    scene, start, misses = open_scene(spec), (np.zeros(2), 0.0), []
+    for index, _, _, slip in judged(spec, range(14, 75)):
+        press = scene.presses(index)[0]
+        gel = np.array([[press.x, press.y]]) - press.shear
+        place = MAPPING.to_processed(scene.camera.to_raw(gel))[0]
+        turn = -math.degrees(press.angle - press.twist)
+        if slip.since == index:
+            start = place, turn
+        assert slip.translation is not None
+        assert slip.rotation is not None
+        assert slip.translation_stderr is not None
+        away = np.array(slip.translation) - (place - start[0])
+        assert slip.rotation_stderr is not None
+        turned = slip.rotation - (turn - start[1])
+        stderr = np.array([*slip.translation_stderr, slip.rotation_stderr])
+        misses.append(np.array([*away, turned]) / np.maximum(stderr, 0.1))
+    assert np.hypot(*away) < 6
+    assert abs(turned) < 3 or slip.rotation_stderr > 10
+    assert np.mean(np.abs(misses) < 2) > 0.9
+
+
+SHADE = np.random.default_rng(5).integers(20, 120, (60, 60), np.uint8)
+STRIPES = np.tile(np.repeat(np.array([20, 250], np.uint8), 10), (60, 3))
+
+
+def step(
+    tracker: SlipTracker, seq: int, left: int | None, shown: float = 1.0, striped: bool = False
+) -> Slip | None:
+    """A square with texture on gel that is dragged to the right; None where no pixel is in contact.
+
+    shown : the part of it that the outline holds."""
     x, y = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
     origin = np.column_stack([x.ravel(), y.ravel()])
     markers = Markers(origin, origin + np.array([3.0, 0]), np.zeros(100, np.uint8), np.full(100, NOISE))
     field = FieldModel(origin, (200, 200))(markers)
     assert field is not None
-    here, there = np.zeros((2, 200, 200), np.uint8)
-    here[60:120, 40:100] = there[60:120, 80:140] = 255
-    for mask, expected in ((here, False), (np.zeros_like(here), None), (there, False), (here, False)):
-        slip = test(field, mask)
-        assert (None if slip is None else slip.slipping) == expected
+    mask, picture = np.zeros((200, 200), np.uint8), np.zeros((200, 200, 3), np.uint8)
+    if left is not None:
+        shade = STRIPES if striped else cv2.GaussianBlur(SHADE, None, 4)
+        picture[70:130, left : left + 60] = shade[..., None]
+        mask[70:130, left : left + round(60 * shown)] = 255
+    return tracker(seq, seq / 60, light_change(picture, cells(0 * picture), None), field, mask)

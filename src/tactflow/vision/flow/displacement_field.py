@@ -222,6 +222,7 @@ class DisplacementField:
 
     def __init__(self, model: FieldModel, markers: Markers, seen: Flags) -> None:
         self.grid = model.fine.grid
+        self._asked: tuple[Mask, GelMotion | None] | None = None
         self._model, self._seen = model, seen
         position = np.ascontiguousarray(markers.position, np.float64)
         stderr = np.ascontiguousarray(markers.stderr, np.float64)
@@ -253,6 +254,14 @@ class DisplacementField:
         squares = scale * unknown + (weights * weights) @ self._planes[VARIANCE]
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
 
+    def at(self, rest: Points) -> Floats:
+        """(M, 2) float64, px: displacement of the gel that rests at points (M, 2), px; beyond the grid, that
+        at its border."""
+        places = ((rest - self.grid.first) / self.grid.spacing).astype(np.float32)
+        x, y = np.ascontiguousarray(places.T[:, :, None])
+        moved = cv2.remap(self.displacement, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(moved[:, 0], np.float64)
+
     def share(self, mask: Mask) -> Floats:
         """(rows, columns), how much of the gel of each cell is in a region now, 0 to 1.
 
@@ -267,6 +276,11 @@ class DisplacementField:
         mask : (H, W) uint8, 255 inside, else 0, in the current frame: what counts is where the gel is now.
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
+        if self._asked is None or self._asked[0] is not mask:
+            self._asked = mask, self._summed(mask)
+        return self._asked[1]
+
+    def _summed(self, mask: Mask) -> GelMotion | None:
         check_mask(mask)
         box = cv2.boundingRect(mask)
         large = box[2] * box[3] >= MANY * self.grid.spacing**2

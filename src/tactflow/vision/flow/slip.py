@@ -1,41 +1,45 @@
-"""Slip of what touches the gel: all of it, or at the edge of the contact first."""
+"""Slip: how the object that touches a gel moves against the gel under it."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from enum import Enum
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats
-from tactflow.vision.flow.displacement_field import DisplacementField
-from tactflow.vision.flow.in_mask import UNKNOWN
+from tactflow.vision.arrays import Flags, Floats, Floats32, Mask
+from tactflow.vision.flow.displacement_field import CELL, DisplacementField, GelMotion
+from tactflow.vision.flow.in_mask import OUTLINE, UNKNOWN
+from tactflow.vision.flow.registration import CELL as PX
+from tactflow.vision.flow.registration import Registration, Template, register, template_of
 from tactflow.vision.types import Slip
 
+WINDOW: Final = 0.1
+"""Time over which the speed is measured, s, at least a frame: as late as slip may be noticed."""
+SLID: Final = 0.04
+"""Motion against the gel within the window that counts as slip, and drag of the gel in its direction that
+friction causes then, relative to the RMS radius of the contact: gel strains by as much under a contact that
+sticks."""
+SPREAD: Final = np.array([5.0, 5.0, 5.0, 1.0, 0.3])
+"""Standard deviation of what an object does since a keyframe beside moving with the gel: shift, turn, and
+growth, cells, see `Registration`; relative change of contrast."""
+OVERLAP: Final = 0.7
+"""Share of the keyframe that is seen below which it is replaced."""
+AGED: Final = 0.35
+"""Residual from which on the keyframe is replaced: the object shows another side."""
+PRESSED: Final = 0.3
+"""Growth of the contact, or change of its contrast, relative, from which on the keyframe is replaced."""
+ROUNDS: Final = 3
+"""Of the search for the gel under a point: the field is smooth, so that each gains a digit."""
+LEAST_MOVED: Final = 1e-6
+"""Motion, px, that has no direction."""
 EXCHANGED: Final = 0.1
-"""Share of the gel in contact that was exchanged for other gel, from which on a contact slips. In simulated
-presses, twists and drags that stick it is 0.06 at most; a ball with a contact of radius r exchanges as much
-when it has slid by 0.16 r."""
-GOES_ON: Final = 0.03
-"""Share exchanged within `RECENT` frames while which a slip goes on. Chosen by hand."""
-RECENT: Final = 3
-"""Frames over which it is told whether a slip goes on: 0.05 s at 60 frames a second. Chosen by hand."""
-GROWN: Final = 0.08
-"""Change of the contact's area, relative, after which slip is measured from this frame on: what presses
-harder or lets go moves the gel without slipping. Chosen by hand."""
-DRAGGED: Final = 3.0
-"""Standard errors of the mean flow by which the gel must lie in the direction of the motion: friction drags
-it along. What rolls over the gel does not: it presses one bit of gel after the other, and sticks."""
-SHIFTED: Final = 0.5
-"""Part of the exchange that the shift of the contact's middle must explain: an outline that flickers comes
-and goes in other ways. Chosen on a simulated box of which the light shows a fifth, another one each frame."""
+"""Share of the gel in contact that has come, or has left, from which on the stick ratio is measured anew:
+what presses harder or lets go moves the gel without slipping."""
 CORE: Final = 0.5
-"""Part of the contact, around its middle, from which the motion of what sticks is first taken. Chosen by
-hand: slip begins at the edge."""
+"""Part of the contact, around its middle, whose motion is taken for that of the gel: slip begins at the
+edge. Chosen by hand."""
 LAG: Final = 0.06
 """How far gel may stay behind the motion of what sticks, relative to its RMS. Chosen on the simulator."""
 UNSURE: Final = 6.0
@@ -47,42 +51,59 @@ _ROUNDS: Final = 4
 """Fits to the part that sticks, each to what the last one found to stick. Chosen by hand."""
 
 
-class _Touched(NamedTuple):
-    """The gel in contact in one frame: (rows, columns) share of each cell; (rows, columns, 2) moved, px."""
+class _Key(NamedTuple):
+    """The frame that others are compared with: its picture and field. core : (rows, columns), share of each
+    cell in the middle of the contact, which sticks longest. slid, covariance : (3,), (3, 3), slip from the
+    start to it, px and radians."""
 
-    share: Floats
-    moved: Floats
-    area: float
+    template: Template
+    field: DisplacementField
+    core: Floats
+    slid: Floats
+    covariance: Floats
 
 
-class SlipTest:
-    """Tells whether a contact slips, frame by frame.
+class _Moment(NamedTuple):
+    """What is known at a time, s: mean motion and turn of the gel in contact, (3,), slip until then, (3,),
+    its covariance, (3, 3), and what of that stems from before the keyframe; px and radians."""
 
-    Gross slip shows in which gel is touched: what slides leaves gel behind and takes new gel, while a press
-    only takes new gel, and letting go only leaves some. Incipient slip shows in how the gel moves under the
-    contact: where it sticks it moves as the rigid object does, and where it slips it stays behind. Both are
-    measured from a frame in which the contact was as large as now.
+    time: float
+    gel: Floats
+    slid: Floats
+    covariance: Floats
+    inherited: Floats
 
-    References
-    ----------
-    S. Dong, D. Ma, E. Donlon, A. Rodriguez, "Maintaining grasps within slipping bounds by monitoring
-    incipient slip", ICRA 2019, for the departure from a rigid motion.
+
+class SlipTracker:
+    """Measures how an object moves against the gel, frame by frame.
+
+    The picture of the contact is registered with that of a keyframe. Each point of the object then lies on
+    another bit of gel than in the keyframe, or on the same one where it sticks. The rigid motion that is
+    nearest to these displacements, over the gel at rest, is the slip. Keyframes are replaced as the object
+    moves on or is pressed otherwise, and the slips between them add up.
+
+    What slides drags the gel along: friction does work. What rolls over the gel, or is pressed and leaves it,
+    also moves, but not in the direction of the gel's displacement.
 
     Examples
     --------
-    >>> from tactflow.vision.flow.displacement_field import FieldModel
+    >>> from tactflow.vision.flow import FieldModel
+    >>> from tactflow.vision.flow.registration import cells, light_change
     >>> from tactflow.vision.types import Markers
     >>> x, y = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
     >>> origin = np.column_stack([x.ravel(), y.ravel()])
     >>> still = Markers(origin, origin + [3.0, 0.0], np.zeros(100, np.uint8), np.full(100, 0.02))
-    >>> field, test = FieldModel(origin, (200, 200))(still), SlipTest()
-    >>> for left in (60, 60, 68):
+    >>> field, tracker = FieldModel(origin, (200, 200))(still), SlipTracker()
+    >>> for seq, left in enumerate((60, 60, 68)):
     ...     mask = np.zeros((200, 200), np.uint8)
     ...     mask[70:130, left : left + 60] = 255
-    ...     print(test(field, mask).slipping)
-    False
-    False
-    True
+    ...     picture = np.repeat(mask[..., None] // 5, 3, axis=2)
+    ...     change = light_change(picture, cells(0 * picture), None)
+    ...     slip = tracker(seq, seq / 60, change, field, mask)
+    ...     print(slip.slipping, round(abs(slip.translation[0]), 1))
+    False 0.0
+    False 0.0
+    True 8.0
     """
 
     def __init__(self) -> None:
@@ -90,77 +111,182 @@ class SlipTest:
 
     def reset(self) -> None:
         """Nothing touches the gel: what comes is another contact."""
-        self._start: _Touched | None = None
-        self._recent: deque[_Touched] = deque(maxlen=RECENT)
+        self._key: _Key | None = None
+        self._since = 0
+        self._grip: tuple[Floats, Floats] | None = None
+        self._last = self._before = np.zeros(5)
+        self._recent: deque[_Moment] = deque()
         self._slipping = False
 
-    def __call__(self, field: DisplacementField, mask: NDArray[np.uint8]) -> Slip | None:
-        """Judge the next frame; None where the contact is too small or too far from markers to tell.
+    def __call__(
+        self, seq: int, time: float, change: Floats32, field: DisplacementField, mask: Mask
+    ) -> Slip | None:
+        """Slip in the next frame; None where the contact is too small or too far from markers to tell.
 
-        field : of this frame. mask : (H, W) uint8, 255 in contact, else 0.
-        Raises ValueError if mask is not (H, W) uint8.
+        seq : of the frame. time : s. change : of `light_change`. field : of this frame. mask : (H, W) uint8,
+        255 in contact.
         """
-        now = _touched(field, mask)
-        if now is None:
+        gel, template = field.motion(mask), template_of(change, mask)
+        if gel is None or template is None or gel.unknown > UNKNOWN:
             self.reset()
             return None
-        if self._start is not None and self._start.share.shape != now.share.shape:
-            # Markers that joined have changed the grid of the field.
+        share, key, found = field.share(mask), self._key, None
+        if key is not None and key.core.shape == share.shape:  # else markers have joined
+            found = self._registered(key, change, field)
+        motion = np.array([*gel.mean, gel.gradient.growth[1] if gel.gradient else 0.0])
+        if key is None or found is None:
             self.reset()
-        start = self._start
-        if start is None or abs(now.area - start.area) > GROWN * start.area:
-            start = self._start = now
-        slides = self._slipping and _exchanged(self._recent[0], now) > GOES_ON
-        travel = _Travel.SLID if slides else _travelled(start, now, field, mask)
-        self._slipping = travel is _Travel.SLID
+            self._since, nothing = seq, np.zeros((3, 3))
+            now = _Moment(time, motion, np.zeros(3), nothing, nothing)
+        else:
+            slid, covariance = _slid(key, found, field, gel)
+            now = _Moment(time, motion, key.slid + slid, key.covariance + covariance, key.covariance)
         self._recent.append(now)
-        if travel is not _Travel.NONE:
-            # Measured anew: from where what slides comes to rest, and on the gel that what rolls has reached.
-            self._start = now
-            return Slip(self._slipping, 0.0 if self._slipping else 1.0)
+        while len(self._recent) > 2 and time - self._recent[1].time > WINDOW - 1e-6:
+            self._recent.popleft()
+        radius = (template if key is None else key.template).radius * PX
+        slip = self._slip(radius, self._sticking(field, share), gel, field, share)
+        stopped, self._slipping = self._slipping and not slip.slipping, slip.slipping
+        if key is None or found is None or stopped or _aged(key, found):
+            core = share * _core(field.grid.points, share)
+            self._key = _Key(template, field, core, now.slid, now.covariance)
+            self._grip = share, field.displacement
+            self._last = self._before = np.zeros(5)
+        return slip
+
+    def _registered(self, key: _Key, change: Floats32, field: DisplacementField) -> Registration | None:
+        """How the picture has moved since the keyframe: on as before, not since the last frame, or as the
+        gel, whichever fits best."""
+        x, y, turn = _gel_motion(key, field).tolist()
+        expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
+        found = [
+            register(key.template, change, start, expected, SPREAD)
+            for start in (2 * self._last - self._before, self._last, expected)
+        ]
+        best = min((fit for fit in found if fit is not None), key=lambda fit: fit.residual, default=None)
+        if best is not None:
+            self._before, self._last = self._last, best.motion
+        return best
+
+    def _sticking(self, field: DisplacementField, share: Floats) -> float:
+        """The stick ratio, on the gel that was touched first, or that a contact has rolled on to."""
+        if self._grip is None:
+            return 1.0
+        before, displacement = self._grip
+        came, left = (float(np.maximum(part, 0).sum()) for part in (share - before, before - share))
+        if max(came, left) > EXCHANGED * float(share.sum()):
+            self._grip = share, field.displacement
+            return 1.0
+        moved = field.displacement - displacement
+        return stick_ratio(before, share, field.grid.points, moved, field.noise)
+
+    def _slip(
+        self, radius: float, ratio: float, gel: GelMotion, field: DisplacementField, share: Floats
+    ) -> Slip:
+        """The slip up to now. radius : of the contact, px."""
+        then, now = self._recent[0], self._recent[-1]
+        slid, stderr = now.slid.tolist(), np.sqrt(np.diag(now.covariance)).tolist()
+        speed = speed_stderr = None
+        probability = 0.0
+        if now is not then:
+            # Displacements at the RMS radius, where a turn moves the object as much as a shift.
+            lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
+            moved = (now.slid - then.slid) * lever
+            length = float(np.linalg.norm(moved))
+            way = moved / max(length, LEAST_MOVED)
+            covariance = now.covariance + then.covariance - 2 * then.inherited
+            error = math.sqrt(float((way * lever) @ covariance @ (way * lever))) + LEAST_MOVED
+            dragged = _dragged(way / lever, field, share)
+            dragged_error = math.hypot(gel.stderr, *gel.outline_stderr) + LEAST_MOVED
+            # Gel around the contact that counts as gel in contact stays behind what sticks.
+            strained = OUTLINE * float(np.linalg.norm((now.gel - then.gel) * lever))
+            slides = _normal((length - strained - SLID * radius) / error)
+            probability = slides * _normal((dragged - SLID * radius) / dragged_error)
+            speed, speed_stderr = length / time, error / time
+        slipping = probability > 0.5
         return Slip(
-            False,
-            stick_ratio(start.share, now.share, field.grid.points, now.moved - start.moved, field.noise),
+            slipping,
+            0.0 if slipping else ratio,
+            probability,
+            (slid[0], slid[1]),
+            -math.degrees(slid[2]) + 0.0,
+            speed,
+            self._since,
+            (stderr[0], stderr[1]),
+            math.degrees(stderr[2]),
+            speed_stderr,
         )
 
 
-def _touched(field: DisplacementField, mask: NDArray[np.uint8]) -> _Touched | None:
-    share = field.share(mask)
-    area = float(share.sum())
-    return _Touched(share, field.displacement, area) if area > 0 else None
+def _aged(key: _Key, found: Registration) -> bool:
+    """Whether the keyframe is to be replaced."""
+    growth, contrast = np.abs(found.motion[3:]).tolist()
+    pressed = max(growth / key.template.radius, contrast) > PRESSED
+    return found.seen < OVERLAP or found.residual > AGED or pressed
 
 
-def _exchanged(before: _Touched, now: _Touched) -> float:
-    """Share of the gel in contact that came and went: the lesser of both."""
-    gained = np.maximum(now.share - before.share, 0).sum()
-    return float(min(gained, gained - now.area + before.area) / min(now.area, before.area))
+def _slid(key: _Key, found: Registration, field: DisplacementField, gel: GelMotion) -> tuple[Floats, Floats]:
+    """Slip (3,) since the keyframe, and its covariance (3, 3), px and radians."""
+    template, inside = key.template, key.core > 0
+    share, rest = key.core[inside], field.grid.points[inside]
+    turn = found.motion[2] / template.radius
+    cos, sin = math.cos(turn), math.sin(turn)
+    away = rest + key.field.displacement[inside] - template.place
+    now = away @ np.array([[cos, sin], [-sin, cos]]) + template.place + found.motion[:2] * PX
+    under = rest
+    for _ in range(ROUNDS):
+        under = now - field.at(under)
+    slid, left = _rigid(rest - template.place, under - rest, share)
+    to_px = np.array([PX, PX, 1 / template.radius])
+    covariance = found.covariance[:3, :3] * np.outer(to_px, to_px)
+    # Displacements of the gel a pitch apart are independent.
+    variance = gel.stderr**2 + left / max(float(share.sum()) * CELL**2, 1.0)
+    return slid, covariance + variance * np.diag([1.0, 1.0, 2 / (template.radius * PX) ** 2])
 
 
-class _Travel(Enum):
-    """How a contact has moved over the gel."""
+def _gel_motion(key: _Key, field: DisplacementField) -> Floats:
+    """(3,): shift (x, y) at the template's centre, px, and turn, radians, since the keyframe, of the gel that
+    was in contact then."""
+    inside = key.core > 0
+    away = (field.grid.points + key.field.displacement)[inside] - key.template.place
+    return _rigid(away, (field.displacement - key.field.displacement)[inside], key.core[inside])[0]
 
-    NONE = 0
-    SLID = 1
-    ROLLED = 2
+
+def _core(places: Floats, share: Floats) -> Flags:
+    """Which places (..., 2) with a share (...) in the contact lie around its middle."""
+    away = places - share.ravel() @ places.reshape(-1, 2) / share.sum()
+    distance = np.hypot(away[..., 0], away[..., 1])
+    order = np.argsort(distance, axis=None)
+    filled = np.cumsum(share.flat[order])
+    return np.asarray(distance <= distance.flat[order[np.searchsorted(filled, CORE * filled[-1])]])
 
 
-def _travelled(before: _Touched, now: _Touched, field: DisplacementField, mask: NDArray[np.uint8]) -> _Travel:
-    """Whether the contact as a whole has moved over the gel, and whether it drags the gel along."""
-    exchanged = _exchanged(before, now)
-    motion = field.motion(mask) if exchanged > EXCHANGED else None
-    if motion is None or motion.unknown > UNKNOWN:
-        return _Travel.NONE
-    shares = now.share / now.area - before.share / before.area
-    x, y = np.einsum("rc,rck->k", shares, field.grid.points).tolist()
-    spacing = field.grid.spacing
-    shift = np.array([[1, 0, x / spacing], [0, 1, y / spacing]])
-    rows, columns = before.share.shape
-    share = np.asarray(cv2.warpAffine(before.share, shift, (columns, rows)), np.float64)
-    if _exchanged(before._replace(share=share), now) >= SHIFTED * exchanged:
-        return _Travel.NONE
-    along = (x * motion.mean[0] + y * motion.mean[1]) / max(math.hypot(x, y), 1e-9)
-    stderr = math.hypot(motion.stderr, max(motion.outline_stderr))
-    return _Travel.SLID if along > DRAGGED * stderr else _Travel.ROLLED
+def _rigid(places: Floats, moved: Floats, share: Floats) -> tuple[Floats, float]:
+    """(3,): the rigid motion nearest to displacements (N, 2) of places (N, 2): shift of the origin, px, and
+    turn from +x to +y, radians; the variance that it leaves of each component, px^2."""
+    share = share / share.sum()
+    middle, mean = share @ places, share @ moved
+    away = places - middle
+    across = np.column_stack([-away[:, 1], away[:, 0]])
+    turn = float(share @ (across * moved).sum(axis=1)) / max(float(share @ (away * away).sum(axis=1)), 1e-9)
+    left = moved - mean - turn * across
+    shift = mean + turn * np.array([middle[1], -middle[0]])
+    return np.array([*shift, turn]), float(share @ (left * left).sum(axis=1)) / 2
+
+
+def _dragged(motion: Floats, field: DisplacementField, share: Floats) -> float:
+    """How far the gel is displaced in the direction of a motion (3,), as a mean over a contact, px."""
+    x, y, turn = motion.tolist()
+    moved = field.displacement
+    place = field.grid.points + moved
+    away = place - np.einsum("rc,rck->k", share, place) / share.sum()
+    along = (x - turn * away[..., 1]) * moved[..., 0] + (y + turn * away[..., 0]) * moved[..., 1]
+    return float((share * along).sum() / share.sum())
+
+
+def _normal(value: float) -> float:
+    """The cumulative normal distribution."""
+    return math.erfc(-value / math.sqrt(2)) / 2
 
 
 def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, noise: float) -> float:
@@ -181,10 +307,7 @@ def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, nois
     if not share.any():
         return 0.0
     away = place - np.average(place, axis=0, weights=share)
-    distance = np.hypot(away[:, 0], away[:, 1])
-    order = np.argsort(distance)
-    filled = np.cumsum(share[order])
-    sticks = distance <= distance[order[np.searchsorted(filled, CORE * filled[-1])]]
+    sticks = _core(place, share)
     for _ in range(_ROUNDS):
         if not sticks.any():
             return 0.0
