@@ -47,12 +47,9 @@ def test_a_file_of_labels_is_read_as_it_was_written(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "not a file of labels: Invalid JSON"),
-        ("{}", "not a file of labels: .* array"),
         ([entry(), {"recording": "left"}], "entry 2, frame: Field required"),
-        ([entry(frame=1.5)], "entry 1, frame"),
         ([entry(outlins=[])], "entry 1, outlins: "),
         ([entry(outlines=[TRIANGLE[:2]])], "entry 1: an outline requires 3 points or more"),
-        ([entry(contact=None)], "entry 1: outlines require contact true"),
         ([entry(outlines=[[*TRIANGLE, [0, float("nan")]]])], r"entry 1, outlines.0.3.1: .* finite"),
         ([entry(), entry(round=2), entry()], "entry 3: the same frame and round as entry 1"),
     ],

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import random
-import signal
-import subprocess
-import sys
-import time
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from tactflow.cli.main import main
 from tactflow.sim import open_scene
 from tactflow.sources import Arrival, open_source
-from tests.cli.kill_me import image
-from tests.clock import until
 
 QUIET = ["--quiet", "--set", "sinks.zmq=null", "--set", "sinks.jsonl=null", "--set", "sinks.view=null"]
 
@@ -108,54 +99,6 @@ def test_number_records_beside_what_is_there_and_overwrite_replaces_it(tmp_path:
     out.write_bytes(b"old")
     assert main([*command[:-1], "--overwrite"]) == 0
     assert len(frames_of(out)) == 2
-
-
-def test_a_kill_at_any_moment_loses_no_frame_that_was_written(tmp_path: Path) -> None:
-    """10 processes are killed at random moments. Repaired, each file opens with the seeking reader."""
-    root = Path(__file__).resolve().parents[2]
-    moments = random.Random(6)
-    helper = subprocess.Popen(
-        [sys.executable, "-m", "tests.cli.kill_me"],
-        cwd=root,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert helper.stdin is not None
-    assert helper.stdout is not None
-    with helper:
-        for number in range(10):
-            path, counter = tmp_path / f"{number}.mcap", tmp_path / f"{number}.count"
-            print(path, counter, file=helper.stdin, flush=True)
-            child = int(helper.stdout.readline())
-            until(lambda counter=counter: counter.exists() and counter.stat().st_size)
-            time.sleep(moments.uniform(0, 0.05))
-            os.kill(child, signal.SIGKILL)
-            assert int(helper.stdout.readline()) == path.stat().st_size
-            written = int.from_bytes(counter.read_bytes(), "little")
-            with path.open("rb") as file, pytest.raises((McapError, ValueError)):
-                list(make_reader(file).iter_messages())
-            found = pixels_are_right(path)
-            # The one frame more: killed between the last byte of the frame and the counter.
-            assert written <= found <= written + 1
-            assert main(["repair", str(path), "--quiet"]) == 0
-            repaired = path.with_stem(f"{number}-repaired")
-            with repaired.open("rb") as file:
-                again = list(make_reader(file, validate_crcs=True).iter_messages("/main/results"))
-            assert len(again) == found == pixels_are_right(repaired)
-        helper.stdin.close()
-    assert helper.returncode == 0
-
-
-def pixels_are_right(path: Path) -> int:
-    """Play a recording of `kill_me`; the number of frames."""
-    source = open_source(str(path))
-    count = 0
-    for frame in iter(source.read_arrival, None):
-        assert frame.seq == count
-        assert np.array_equal(frame.image, image(frame.seq))
-        count += 1
-    return count
 
 
 def test_repair_leaves_a_whole_file_alone_and_replaces_nothing_unasked(
