@@ -114,7 +114,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive,
         metavar="N",
         help=f"end a live session after N presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE}, "
-        f"with --darkness {ENOUGH_OF_DARKNESS})",
+        f"with --darkness, or to check such a file, {ENOUGH_OF_DARKNESS})",
     )
     option("--view", action="store_true", help="show the live page, which says where to press next")
     _add_kind(parser)
@@ -184,8 +184,6 @@ def run(args: argparse.Namespace) -> int:
     TactflowError
         If options are wrong, or the recording gives no calibration.
     """
-    enough = ENOUGH_OF_DARKNESS if args.darkness else ENOUGH_TO_REFINE if args.refine else ENOUGH
-    args.presses = args.presses or enough
     verb, *words = args.what if args.what[:1] in (["check"], ["force"], ["lens"]) else ["make", *args.what]
     with notes():
         if verb == "lens":
@@ -206,6 +204,8 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
     if args.darkness and (args.refine or args.kind or args.ball_radius is None):
         raise ConfigError("calibrate --darkness: required --ball-radius MM, and neither --refine nor --kind")
+    enough = ENOUGH_OF_DARKNESS if args.darkness else ENOUGH_TO_REFINE if args.refine else ENOUGH
+    args.presses = args.presses or enough
     base = _base(args, pipeline)
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
@@ -342,6 +342,7 @@ def _darkness(
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
     then, pressed = calibration.photometric, calibration.photometric or calibration.darkness
+    args.presses = args.presses or (ENOUGH if then is not None else ENOUGH_OF_DARKNESS)
     _instruct(args, None if pressed is None else pressed.ball_radius)
     guide = None if pressed is None else Guide(args.presses, say)
     session = _find_presses(_load(args, pipeline), guide)

@@ -86,6 +86,13 @@ def test_a_rough_object_is_followed_in_all_six_numbers(motion: Motion) -> None:
     assert (np.abs(error) < 4 * np.array(pose.stderr)).all()
 
 
+def test_errors_do_not_grow_while_one_keyframe_lasts() -> None:
+    turned = [small(0, 0, 0, 0, 0, 6 * np.sin(seq / 10)) for seq in range(100)]
+    error = off(track(turned, relief=0.02), turned[-1])
+    assert np.abs(error[:3]).max() < 0.02
+    assert np.abs(error[3:]).max() < 0.5
+
+
 def ball_moved(pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """How the middle of the ball has moved along the gel (2,), mm, and its standard errors."""
     up = RADIUS - DEEP - pose.center[2]

@@ -17,14 +17,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats, Indices
+from tactflow.vision.arrays import Floats, Indices
 from tactflow.vision.pose.imprint import BLOCKS, PATCH, Imprint, Template
 from tactflow.vision.pose.rigid import rigid, vector
 
 STEPS: Final = 12
 """Steps of Gauss-Newton at most."""
-CONVERGED: Final = 1e-4
-"""Step after which it ends, mm and radians."""
+CONVERGED: Final = 0.1
+"""Length of a step after which it ends, in standard errors."""
 FREE: Final = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
 """Standard deviation of a motion of which nothing is seen, mm and radians."""
 NORMAL_NOISE: Final = 0.02
@@ -37,16 +37,19 @@ FEWEST: Final = 12
 
 
 class Gel(NamedTuple):
-    """Where the same bits of gel are in two frames.
+    """How the gel that is in contact in two frames has moved between them: the rigid motion in the plane that
+    fits it best.
 
-    before, now : (M, 2), mm. share : (M,), how they count; the sum is 1. variance : of each coordinate of
-    their mean displacement, mm^2. overlap : share of the gel in contact now that was before.
+    before, now : (2,), its middle, mm. turn : radians. variance : of each coordinate of `now`, mm^2. spread :
+    mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance / spread.
+    overlap : share of the gel in contact now that was before.
     """
 
     before: Floats
     now: Floats
-    share: Floats
+    turn: float
     variance: float
+    spread: float
     overlap: float
 
 
@@ -75,91 +78,121 @@ class _Part(NamedTuple):
     weight: Floats
 
 
+class _Comparison(NamedTuple):
+    """Imprints at one motion: how many points both show, the errors of their normals (N, 2) and how they
+    count (N,), the information of these and of all parts (6, 6), the gradient (6,) and half of the sum of
+    squares."""
+
+    shown: int
+    error: Floats
+    weight: Floats
+    by_normals: Floats
+    information: Floats
+    gradient: Floats
+    cost: float
+
+
 def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> Alignment | None:
     """The motion from a template to an imprint; None where they do not overlap.
 
     start : (4, 4), a first guess, about the template's centre.
     """
-    motion = start
-    anchored = [] if gel is None else [_anchored(template, now, gel)]
+    # A matrix that is passed on from frame to frame would cease to be a rotation.
+    motion = rigid(vector(start))
+    found = _compared(template, now, motion, gel)
+    if found is None:
+        return None
+    scale = 1.0
     for _ in range(STEPS):
-        shown, normals, height = _seen(template, now, motion)
-        if np.count_nonzero(shown) < FEWEST:
-            return None
-        parts = [normals, height, *(_gel_part(gel, points, motion) for gel, points in anchored)]
-        information, gradient = np.diag(FREE**-2.0), vector(motion) / FREE**2
-        for by, error, weight in parts:
-            information += (by.T * weight) @ by
-            gradient += by.T @ (weight * error)
-        step = np.linalg.solve(information, -gradient)
-        motion = motion @ rigid(step)
-        if np.abs(step).max() < CONVERGED:
+        step = np.asarray(scale * np.linalg.solve(found.information, -found.gradient), np.float64)
+        tried = motion @ rigid(step)
+        better = _compared(template, now, tried, gel)
+        if better is None or better.cost > found.cost:
+            # The step is too long for normals to change in proportion to it.
+            scale /= 2
+        else:
+            motion, found, scale = tried, better, 1.0
+        if step @ found.information @ step < CONVERGED**2:
             break
-    misfit = float(normals.weight @ normals.error**2)
-    naive = (normals.by.T * normals.weight) @ normals.by
-    noise = max(misfit, float(normals.weight.sum()) * NORMAL_NOISE**2)
-    honest = _efficiency(normals, template.blocks[shown]) * _without_noise(naive, noise, template)
+    total = float(found.weight.sum())
+    misfit = float(found.weight @ (found.error**2).sum(axis=1))
+    noise = max(misfit, 2 * total * NORMAL_NOISE**2)
+    honest = _efficiency(found, template.blocks) * _without_noise(found.by_normals, noise, template)
     return Alignment(
         motion,
-        np.asarray(np.linalg.inv(information - naive + honest), np.float64),
-        np.count_nonzero(shown) * template.every / now.area,
+        np.asarray(np.linalg.inv(found.information - found.by_normals + honest), np.float64),
+        found.shown * template.every / now.area,
         misfit,
-        math.sqrt(misfit / normals.weight.sum()),
-        math.sqrt(template.normals[:, :2].var(axis=0).mean()),
+        math.sqrt(misfit / (2 * total)),
+        math.sqrt(template.normals.var(axis=0).mean()),
     )
 
 
-def _seen(template: Template, now: Imprint, motion: Floats) -> tuple[Flags, _Part, _Part]:
-    """Which points (N,) both show; their normals and their mean height, in the template's axes."""
+def _compared(template: Template, now: Imprint, motion: Floats, gel: Gel | None) -> _Comparison | None:
+    """Both imprints at a motion; None where they do not overlap."""
     turn, shift = motion[:3, :3], motion[:3, 3]
     moved = template.points @ turn.T + shift
     planes = now.at(moved[:, :2] + template.center[:2])
-    shown = planes[:, 3] > 0
-    nx, ny, height, weight = planes[shown].T
-    share = template.weights[shown] * weight
-    share /= max(float(share.sum()), 1e-9)
-    across = np.column_stack([nx, ny, np.sqrt(np.maximum(1 - nx * nx - ny * ny, 0))]) @ turn[:, :2]
-    patches = min(BLOCKS**2, np.count_nonzero(shown) * template.every / PATCH**2)
-    normals = _Part(
-        template.by_normal[:, shown].reshape(-1, 6),
-        (across - template.normals[shown, :2]).T.ravel(),
-        np.tile(share * patches / NORMAL_NOISE**2, 2),
+    share = template.weights * planes[:, 3]
+    shown = int(np.count_nonzero(share))
+    if shown < FEWEST:
+        return None
+    share /= share.sum()
+    normals = planes[:, :3].copy()
+    normals[:, 2] = np.sqrt(1 - (planes[:, :2] ** 2).sum(axis=1))
+    error = normals @ turn[:, :2] - template.normals
+    patches = min(BLOCKS**2, shown * template.every / PATCH**2)
+    weight = share * (patches / NORMAL_NOISE**2)
+    by, weights = template.by_normal, np.repeat(weight, 2)
+    by_normals = (by.T * weights) @ by
+    free = vector(motion)
+    information, gradient = (
+        by_normals + np.diag(FREE**-2.0),
+        by.T @ (weights * error.ravel()) + free / FREE**2,
     )
-    height = height - template.center[2]
-    before = template.points[shown, 2]
-    back = (np.column_stack([moved[shown, :2], height]) - shift) @ turn[:, 2] - before
-    variance = HEIGHT_NOISE**2 + (now.error * float(share @ (height - before))) ** 2
-    by_height = share @ template.by_height[shown]
-    return shown, normals, _Part(by_height[None], np.array([share @ back]), np.array([1 / variance]))
+    cost = float(weights @ error.ravel() ** 2 + np.sum((free / FREE) ** 2))
+    moved[:, 2] = planes[:, 2] - template.center[2]
+    parts = [_height_part(template, share, moved - shift, turn, now.error)]
+    parts += [] if gel is None else [_gel_part(template, now, gel, motion)]
+    for part in parts:
+        weighted = part.by.T * part.weight
+        information += weighted @ part.by
+        gradient += weighted @ part.error
+        cost += float(part.weight @ part.error**2)
+    return _Comparison(shown, error, weight, by_normals, information, gradient, cost / 2)
 
 
-def _anchored(template: Template, now: Imprint, gel: Gel) -> tuple[Gel, tuple[Floats, Floats]]:
-    """(M, 3) before and now, mm from the template's centre, at the mean height of both contacts: how the gel
-    strains from the rim to the deepest point is not known."""
-    before, after = (
-        np.column_stack([places, np.full(len(places), gel.share @ imprint.at(places)[:, 2])])
-        for imprint, places in ((template.imprint, gel.before), (now, gel.now))
-    )
-    return gel, (before - template.center, after - template.center)
+def _height_part(template: Template, share: Floats, seen: Floats, turn: Floats, relative: float) -> _Part:
+    """The mean height. seen : (N, 3), the points as now seen, before they are turned back. relative : error
+    of all heights."""
+    before = template.points[:, 2]
+    error = share @ (seen @ turn[:, 2] - before)
+    sunk = share @ (seen[:, 2] - before)
+    variance = HEIGHT_NOISE**2 + (relative * sunk) ** 2
+    return _Part((share @ template.by_height)[None], np.array([error]), np.array([1 / variance]))
 
 
-def _gel_part(gel: Gel, points: tuple[Floats, Floats], motion: Floats) -> _Part:
-    before, now = points
-    error = ((now - motion[:3, 3]) @ motion[:3, :2]) - before[:, :2]
-    by = np.zeros((2, len(before), 6))
-    by[0, :, 0] = by[1, :, 1] = -1
-    by[0, :, 4], by[0, :, 5] = -before[:, 2], before[:, 1]
-    by[1, :, 3], by[1, :, 5] = before[:, 2], -before[:, 0]
-    return _Part(by.reshape(-1, 6), error.T.ravel(), np.tile(gel.share / gel.variance, 2))
+def _gel_part(template: Template, now: Imprint, gel: Gel, motion: Floats) -> _Part:
+    """The gel, at the mean height of both contacts: how it strains from the rim to the deepest point is not
+    known."""
+    turn = motion[:3, :3]
+    x, y, z = np.array([*gel.before, template.imprint.height]) - template.center
+    after = np.array([*gel.now, now.height]) - template.center
+    error = np.zeros(3)
+    error[:2] = (after - motion[:3, 3]) @ turn[:, :2] - (x, y)
+    yaw = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    error[2] = math.remainder(yaw - gel.turn, math.tau)
+    by = np.array([[-1, 0, 0, 0, -z, y], [0, -1, 0, z, 0, -x], [0, 0, 0, 0, 0, 1]])
+    return _Part(by, error, np.array([1, 1, gel.spread]) / gel.variance)
 
 
-def _efficiency(normals: _Part, blocks: Indices) -> float:
+def _efficiency(found: _Comparison, blocks: Indices) -> float:
     """Information of the normals over what their weights say, at most 1, from how far the sums over patches
     scatter."""
-    weighted = (normals.weight * normals.error).reshape(2, -1)
-    sums = np.stack([np.bincount(blocks, axis) for axis in weighted])
-    expected = float(normals.weight.sum())
-    return expected / max(float((sums**2).sum()), expected)
+    weighted = found.weight[:, None] * found.error
+    squares = sum(float((np.bincount(blocks, axis) ** 2).sum()) for axis in weighted.T)
+    expected = 2 * float(found.weight.sum())
+    return expected / max(squares, expected)
 
 
 def _without_noise(information: Floats, misfit: float, template: Template) -> Floats:

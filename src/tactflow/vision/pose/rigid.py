@@ -44,8 +44,17 @@ def adjoint(motion: Floats) -> Floats:
     ----------
     T. D. Barfoot, "State Estimation for Robotics", 2017, ch. 7.
     """
-    turn, (x, y, z) = motion[:3, :3], motion[:3, 3]
+    turn = motion[:3, :3]
     carried = np.zeros((6, 6))
     carried[:3, :3] = carried[3:, 3:] = turn
-    carried[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
+    carried[:3, 3:] = skew(motion[:3, 3]) @ turn
     return carried
+
+
+def skew(vectors: Floats) -> Floats:
+    """(..., 3, 3): the matrices of the cross products with vectors (..., 3); row i is axis i x vector."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    matrices = np.zeros((*vectors.shape, 3))
+    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
+    matrices[..., 1, 0], matrices[..., 2, 0], matrices[..., 2, 1] = z, -y, x
+    return matrices

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -15,8 +16,8 @@ from tactflow.vision.types import Depth, Pose, Scale
 
 OVERLAP: Final = 0.7
 """Share of the present contact, of object or gel, that the keyframe shows, below which it is replaced."""
-LEAST: Final = 60
-"""Cells inside the rim from which on an object is tracked: a contact of 22 px."""
+LEAST: Final = 30
+"""Cells inside the rim from which on an object is tracked: a contact of 25 px."""
 TOLERATED: Final = 82.0
 """Misfit that errors of the expected size stay below: the mean of chi squared with 44 degrees of freedom (25
 patches, two components, six unknowns) and four standard deviations."""
@@ -81,7 +82,7 @@ class PoseTracker:
         """Nothing touches the gel: what comes is another object."""
         self._key: _Keyframe | None = None
         self._since, self._origin = 0, np.zeros(3)
-        self._last = self._before = np.eye(4)
+        self._last = np.eye(4)
         self._slid = False
 
     def __call__(
@@ -113,7 +114,7 @@ class PoseTracker:
             self.reset()
             return lost
         motion, covariance, by_slopes = self._since_start(key, found)
-        self._before, self._last = self._last, motion
+        self._last = motion
         overlap = found.overlap if gel is None else min(found.overlap, gel.overlap)
         if overlap < OVERLAP or (self._slid and not slipping):
             self._key = _Keyframe(frame, template_of(frame.imprint), motion, covariance, by_slopes)
@@ -144,14 +145,11 @@ class PoseTracker:
         return found, gel
 
     def _matched(self, key: _Keyframe, now: _Frame, gel: Gel | None) -> Alignment | None:
-        """From where it is if it moves on as before, or else from where it was; None if neither fits."""
+        """From where it was in the frame before; None if it does not fit."""
         to_center = self._to_center(key)
-        for guess in (self._last @ inverse(self._before) @ self._last, self._last):
-            start = inverse(to_center) @ guess @ inverse(key.motion) @ to_center
-            found = align(key.template, now.imprint, start, gel)
-            if found is not None and found.residual < UNLIKE * found.signal:
-                return found
-        return None
+        start = inverse(to_center) @ self._last @ inverse(key.motion) @ to_center
+        found = align(key.template, now.imprint, start, gel)
+        return found if found is not None and found.residual < UNLIKE * found.signal else None
 
     def _to_center(self, key: _Keyframe) -> Floats:
         to_center = np.eye(4)
@@ -167,22 +165,28 @@ class PoseTracker:
         return motion, covariance, key.by_slopes + carry @ (BY_SLOPES * vector(found.motion))
 
     def _same_gel(self, before: _Frame, now: _Frame) -> Gel | None:
-        """The gel that is in contact in both frames."""
+        """How the gel that is in contact in both frames has moved."""
         if before.gel is None or now.gel is None or before.gel[1].shape != now.gel[1].shape:
             return None
         (old_field, old_share, old_stderr), (field, new_share, stderr) = before.gel, now.gel
         both = old_share * new_share
+        inside = both > 0
         total = float(both.sum())
         if not total:
             return None
-        inside = both > 0
         share = both[inside] / total
         rest = field.grid.points[inside] - self._scale.origin
         old, new = (self._mm * (rest + f.displacement[inside]) for f in (old_field, field))
-        variance = (old_stderr**2 + stderr**2) * float(self._mm.prod())
-        # Displacements a pitch apart are independent.
-        variance += _stretch(old, new, share) / max(total * CELL**2, 1.0)
-        return Gel(old, new, share, variance, total / float(new_share.sum()))
+        middle, moved = share @ old, share @ new
+        lever, after = old - middle, new - moved
+        spread = float(share @ (lever * lever).sum(axis=1))
+        dot = float(share @ (lever * after).sum(axis=1))
+        cross = float(share @ (lever[:, 0] * after[:, 1] - lever[:, 1] * after[:, 0]))
+        # What no rigid motion explains; displacements a pitch apart are independent.
+        stretch = (spread + float(share @ (after * after).sum(axis=1)) - 2 * math.hypot(dot, cross)) / 2
+        variance = (old_stderr**2 + stderr**2) * float(self._mm.prod()) + stretch / max(total * CELL**2, 1.0)
+        overlap = total / float(new_share.sum())
+        return Gel(middle, moved, math.atan2(cross, dot), variance, spread, overlap)
 
     def _pose(self, status: Literal["tracked", "lost"], motion: Floats, covariance: Floats) -> Pose:
         """For people: in the sensor's axes, in mm and degrees, with the error of the scale."""
@@ -194,13 +198,3 @@ class PoseTracker:
         cx, cy, cz = self._origin.tolist()
         x, y, z, rx, ry, rz = (vector(motion) * _TO_DEGREES).tolist()
         return Pose(status, self._since, (cx, cy, cz), (x, y, z), (rx, ry, rz), stated)
-
-
-def _stretch(before: Floats, now: Floats, share: Floats) -> float:
-    """Variance of each coordinate of displacements (M, 2) that no rigid motion explains, in the unit of
-    places (M, 2) squared: the gel stretches under the object."""
-    lever, moved = before - share @ before, now - before
-    moved = moved - share @ moved
-    across = np.column_stack([-lever[:, 1], lever[:, 0]])
-    turn = share @ (across * moved).sum(axis=1) / max(float(share @ (lever * lever).sum(axis=1)), 1e-12)
-    return float(share @ ((moved - turn * across) ** 2).sum(axis=1)) / 2
