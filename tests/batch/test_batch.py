@@ -171,7 +171,7 @@ def test_one_signal_finishes_what_runs_and_leaves_the_rest_for_the_next_call(
         patched.setattr(InThisProcess, "submit", interrupted)
         patched.setattr(InThisProcess, "slots", 1)
         assert call() == 130
-    assert "1 not done: call again to do the rest\nended early: interrupted" in call.stderr
+    assert "1 not done: run the command again to continue\nended early: interrupted" in call.stderr
     assert call() == 0
     assert "1 done now, 1 done before" in call.stderr
 

@@ -119,7 +119,7 @@ def test_a_second_signal_gives_up_what_runs(folder: Path, endless: tuple[subproc
     until(lambda: process.send_signal(signal.SIGINT) or process.poll() is not None)
     _, stderr = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert "2 not done: call again to do the rest" in stderr
+    assert "2 not done: run the command again to continue" in stderr
     assert statuses(folder) == {"endless": "not done", "a": "not done"}
     assert not is_running(worker)
 

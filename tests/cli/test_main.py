@@ -143,7 +143,7 @@ def test_statistics_replace_only_older_statistics(tmp_path: Path, capsys: pytest
     assert main(command) == main(command) == 0
     file.write_text("a year of work")
     assert main(command) == 2
-    assert "holds something else" in capsys.readouterr().err
+    assert "is not a statistics file" in capsys.readouterr().err
     assert file.read_text() == "a year of work"
 
 

@@ -57,8 +57,8 @@ def cameras(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        (60.0, "gives 15.0 of 60 frames/s, as its driver promises 30"),
-        (None, "gives 15.0 of 30 frames/s, and"),
+        (60.0, "delivers 15.0 of 60 frames/s, because its driver promises 30"),
+        (None, "delivers 15.0 of 30 frames/s, and"),
     ],
 )
 def test_a_slow_sensor_is_told_with_what_holds_it_down(

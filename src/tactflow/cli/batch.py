@@ -128,7 +128,7 @@ class _Call:
             runs = self._runs(result)
             write_runs(store, runs, self._args.format)
             page = write_page(store, runs, f"{Path(request.file).stem}: {len(runs)} recordings")
-            self._say(f"look at {page}")
+            self._say(f"report: {page}")
         return result
 
     def _work(self, scratch: Path, plan: Plan) -> Result:
@@ -191,7 +191,7 @@ def _closing(result: Result, done_before: int) -> Iterator[str]:
     """The summary at the end."""
     failed, outcomes = result.failed, result.outcomes.values()
     now = len(outcomes) - len(failed) - done_before
-    undone = f", {result.undone} not done: call again to do the rest" if result.undone else ""
+    undone = f", {result.undone} not done: run the command again to continue" if result.undone else ""
     yield f"{now} done now, {done_before} done before, {len(failed)} failed{undone}"
     if result.ended is not None:
         yield f"ended early: {result.ended}"

@@ -59,9 +59,9 @@ def describe(camera: CameraInfo) -> Iterator[str]:
     yield f"    {title}{camera.device} (--source {camera.index})"
     yield from (f"    also {name}" for name in camera.names[1:])
     if camera.problem:
-        yield f"    cannot be asked: {camera.problem}"
+        yield f"    cannot be queried: {camera.problem}"
     if abilities and not abilities.pictures:
-        yield "    carries no pictures, only metadata"
+        yield "    delivers only metadata, no pictures"
     for form, sizes in abilities.formats.items() if abilities else ():
         sizes_text = ", ".join(f"{width} x {height}" for width, height in sizes)
         yield f"    {form}: {sizes_text or 'any size within a range'}"

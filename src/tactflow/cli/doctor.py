@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     from tactflow.doctor.bug_report import write_bug_report
 
     pipeline = find_pipeline(args.reported)
-    # The first signal ends only the look at the source.
+    # The first signal ends only the observation.
     with ending_handled(interrupt), progress_bar("0 frames") as update:
         observation = observe(args.source, args.seconds, lambda count: update(description=f"{count} frames"))
     findings = examine(observation)

@@ -198,7 +198,7 @@ def _statistics_problem(path: str) -> str | None:
     except OSError as error:
         return f"cannot be written: {error.strerror or error}"
     if beginning not in ("", STATISTICS_BEGIN):
-        return "holds something else; choose another file, or delete it"
+        return "is not a statistics file; choose another path, or delete it"
     return None
 
 

@@ -140,7 +140,7 @@ def _advice(sensors: Sequence[Sensor], rates: Sequence[Rate], hubs: Sequence[Usb
             sharing.update(here)
             lines.append(
                 f"{joined(here)} share the USB hub {hub.root} of {hub.speed} Mbit/s: move one to another "
-                "root hub, or ask for MJPG, fewer pixels or fewer frames"
+                "root hub, or request MJPG, fewer pixels or fewer frames"
             )
     for rate in rates:
         if rate.problem:
@@ -152,10 +152,10 @@ def _advice(sensors: Sequence[Sensor], rates: Sequence[Rate], hubs: Sequence[Usb
 
 def _slow(rate: Rate) -> str:
     wanted = rate.asked or rate.promised
-    text = f"gives {rate.got or 0:.1f} of {wanted:g} frames/s"
+    text = f"delivers {rate.got or 0:.1f} of {wanted:g} frames/s"
     if rate.asked and rate.promised and rate.promised < LOW * rate.asked:
-        return f"{text}, as its driver promises {rate.promised:g}: ask for fewer pixels or format MJPG"
+        return f"{text}, because its driver promises {rate.promised:g}: request fewer pixels or MJPG"
     return (
-        f"{text}, and it shares no USB hub: give it a fixed short exposure with more light, or the "
-        "processor less to do"
+        f"{text}, and it shares no USB hub: use a fixed short exposure with more light, or reduce the load "
+        "of the processor"
     )
