@@ -86,7 +86,7 @@ class Jsonl(Sink):
             return
         empty = path.is_file() and path.stat().st_size == 0
         changes = p.overwrite or p.append or empty
-        refuse_existing(path, overwrite=changes, others="append: true to continue it, ")
+        refuse_existing(path, overwrite=changes, advice="append: true to continue it, ")
         self._out = LineFile(path, replaces=p.overwrite, every=p.flush)
 
     def wants(self) -> bool:

@@ -1,4 +1,4 @@
-"""A pipeline file as plain values, with the place of each; mistakes are shown with source line and caret."""
+"""A pipeline file as plain values with their locations; errors are shown with source line and caret."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tactflow.engine.graph import Mark
 from tactflow.system.files import read_limited
 
 SOURCE_OPTION = "a camera, a recording or a stream is given by --source"
-"""Advice for what is not the name of a pipeline."""
+"""Advice for an argument that is not the name of a pipeline."""
 Keys = tuple[str | int, ...]
-"""Where a value stands in a document: keys of mappings and indices of lists, from the root."""
+"""Path of a value in a document: keys of mappings and indices of lists, from the root."""
 
 
 def shown(value: Any) -> str:
@@ -27,12 +27,12 @@ def shown(value: Any) -> str:
 
 
 def described(value: Any) -> str:
-    """A value as messages show what they got."""
+    """A value as shown in messages."""
     return "a mapping" if isinstance(value, dict) else "a list" if isinstance(value, list) else shown(value)
 
 
 def dotted(keys: Keys) -> str:
-    """A place as messages name it.
+    """A path as shown in messages.
 
     >>> dotted(("stages", "hull", "when", 0))
     'stages.hull.when.0'
@@ -41,21 +41,21 @@ def dotted(keys: Keys) -> str:
 
 
 class Document:
-    """The values of a pipeline file, where each was written, and the mistakes that were found in them.
+    """The values of a pipeline file, the location of each, and the errors found so far.
 
     root : mappings, lists, text, numbers, booleans and None. file : its name in messages; or the origin of
-    values that no file holds, such as an option of the command line.
+    values outside a file, such as an option of the command line.
     """
 
     def __init__(self, file: str, root: Any = None, *, line: int = 0) -> None:
         self.root = root
         self.lines: list[str] = []
-        # Of each value where its key, and where it was written.
+        # The locations of the key and of the value.
         self.marks: dict[Keys, tuple[Mark, Mark]] = {(): (Mark(file, line, line),) * 2}
         self.mistakes: dict[tuple[Mark, str], None] = {}
 
     def get(self, *keys: str | int) -> Any:
-        """The value at a place; None if there is none."""
+        """The value at a path, or None."""
         value = self.root
         for key in keys:
             if isinstance(value, dict):
@@ -67,7 +67,7 @@ class Document:
         return value
 
     def mapping(self, *keys: str | int) -> dict[str, Any]:
-        """The mapping at a place; empty if there is something else."""
+        """The mapping at a path; empty if it is not a mapping."""
         value = self.get(*keys)
         return value if isinstance(value, dict) else {}
 
@@ -76,24 +76,24 @@ class Document:
         return keys[-1] in self.mapping(*keys[:-1])
 
     def mark(self, *keys: str | int) -> Mark:
-        """Where a value was written; for a missing value, where the mapping around it begins."""
+        """The location of a value; for a missing value, of the mapping around it."""
         return self._marks(keys)[1]
 
     def key_mark(self, *keys: str | int) -> Mark:
-        """Where the key of a value was written."""
+        """The location of the key of a value."""
         return self._marks(keys)[0]
 
     def _marks(self, keys: Keys) -> tuple[Mark, Mark]:
         return self.marks.get(keys) or (self.mark(*keys[:-1]),) * 2
 
     def set(self, keys: Keys, value: Any, mark: Mark, key_mark: Mark | None = None) -> None:
-        """Replace a value, or add it with the mappings around it.
+        """Set a value, and create the mappings around it if needed.
 
-        mark, key_mark : of the value, and of a new key where that has another.
+        mark : location of the value. key_mark : location of a new key, if different.
 
         Raises
         ------
-        ConfigError : the keys lead through a value that has no parts.
+        ConfigError : the path leads through a value that is neither a mapping nor a list.
         """
         parent: Any = self.root
         place: Keys = ()
@@ -108,24 +108,24 @@ class Document:
         parent[place[-1]] = value
         place = created or place
         known, _ = self.marks.get(place, (key_mark or mark, mark))
-        # What was inside the old value is gone.
+        # Discard the locations inside the old value.
         self.marks = {keys: marks for keys, marks in self.marks.items() if keys[: len(place)] != place}
         self.marks[place] = known, mark
 
     def report(self, keys: Keys, message: str, *, at_key: bool = False) -> None:
-        """Record a mistake in a value, or in its key."""
+        """Record an error in a value, or in its key."""
         mark = self.key_mark(*keys) if at_key else self.mark(*keys)
         self.report_at(mark, f"{dotted(keys)}: {message}" if keys else message)
 
     def report_at(self, mark: Mark, message: str) -> None:
-        """Record a mistake at a place; the same one only once."""
+        """Record an error at a location, once."""
         self.mistakes[mark, message] = None
 
     def raise_if_mistaken(self) -> None:
-        """Raise a ConfigError that holds every mistake, those of the file in its order."""
+        """Raise a ConfigError with all errors, those of the file in its order."""
         if self.mistakes:
-            found = sorted(self.mistakes, key=lambda item: (not item[0].line, item[0].line, item[0].column))
-            raise ConfigError(*[self._block(mark, message) for mark, message in found])
+            ordered = sorted(self.mistakes, key=lambda item: (not item[0].line, item[0].line, item[0].column))
+            raise ConfigError(*[self._block(mark, message) for mark, message in ordered])
 
     def _block(self, mark: Mark, message: str) -> str:
         # Text from a file may hold line breaks and control characters.
@@ -137,7 +137,7 @@ class Document:
 
 
 def _index(parent: Any, key: str | int, place: Keys) -> str | int:
-    """The key of a part of `parent`, which stands at `place`; in a list a number."""
+    """The key in a mapping, or the index in a list. place : path of `parent`."""
     if isinstance(parent, dict):
         return key
     if not isinstance(parent, list):
@@ -152,7 +152,7 @@ def _printable(text: str) -> str:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML file. Duplicate keys and the like are recorded in the document.
+    """Read a YAML file. Errors such as duplicate keys are recorded in the document.
 
     Raises
     ------
@@ -183,11 +183,11 @@ def read_document(path: Path) -> Document:
 
 
 def parse_value(text: str) -> Any:
-    """A value that the command line gives as YAML.
+    """Parse a YAML value of the command line.
 
     Raises
     ------
-    ConfigError : what is wrong with it, without a place.
+    ConfigError : invalid YAML; the message has no location.
 
     >>> parse_value("[1, 2e-3]")
     [1, 0.002]
@@ -200,7 +200,7 @@ def parse_value(text: str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's plain values; dates stay text, and 1e-3 is a number as in YAML 1.2."""
+    """Plain YAML values; dates stay text, and 1e-3 is a number as in YAML 1.2."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -216,7 +216,7 @@ _SCALARS = frozenset(_TAG + name for name in ("null", "bool", "int", "float", "s
 
 
 def _parse(text: str, document: Document) -> bool:
-    """Fill a document from YAML; False if it cannot be read, which is recorded."""
+    """Fill a document from YAML. Returns False, and records the error, if it cannot be parsed."""
     file = document.mark().file
     try:
         loader = _Loader(text)
@@ -237,12 +237,12 @@ def _parse(text: str, document: Document) -> bool:
 
 
 def _end(file: str, before: str) -> Mark:
-    """The place that comes after some text of a file."""
+    """The location after some text of a file."""
     return Mark(file, before.count("\n") + 1, len(before) - before.rfind("\n"))
 
 
 def _yaml_message(error: yaml.MarkedYAMLError, text: str) -> str:
-    """What PyYAML says, with advice for the usual mistakes."""
+    """PyYAML's message, with advice for common mistakes."""
     where = error.problem_mark
     if where is not None and "\t" in [*text.splitlines(), ""][where.line][: where.column + 1]:
         return "a tab character; YAML is indented with blanks"
@@ -255,14 +255,14 @@ def _yaml_message(error: yaml.MarkedYAMLError, text: str) -> str:
 
 
 class _Values:
-    """Turns PyYAML's nodes into values and records their places; aliases are written out."""
+    """Converts PyYAML's nodes to values and records their locations; aliases are expanded."""
 
     def __init__(self, loader: _Loader, document: Document) -> None:
         self._loader = loader
         self._document = document
 
     def value(self, node: yaml.Node, keys: Keys) -> Any:
-        """The plain value of a node that stands at `keys`."""
+        """The plain value of a node at a path."""
         self._document.marks[keys] = (self._mark(node),) * 2
         if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, keys)
@@ -286,11 +286,11 @@ class _Values:
             if key_node.tag != _TAG + "str":
                 hint = f"; put {key} in quotes" if isinstance(key, str) else ""
                 self._report(key_node, f"a key must be text{hint}")
-            elif (there := first.setdefault(key, mark)) is not mark:
-                where = f"line {there.line + 1}, column {there.column + 1}"
+            elif (earlier := first.setdefault(key, mark)) is not mark:
+                where = f"line {earlier.line + 1}, column {earlier.column + 1}"
                 self._report(key_node, f"{key}: duplicate key; it is already in {where}")
         self._loader.flatten_mapping(node)
-        # Merged keys come first. Without those that are overridden, an alias finds no duplicates here.
+        # Merged keys come first. Remove overridden ones, which are no duplicates for an alias of this node.
         node.value = list(
             {key.value: (key, value) for key, value in node.value if isinstance(key.value, str)}.values()
         )

@@ -1,4 +1,4 @@
-"""Which files a pipeline reads and writes, so that nothing writes over them."""
+"""The files that a pipeline reads and writes, so that no sink overwrites an input."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tactflow.engine.contract import Sink, StageParams
 from tactflow.system.files import expanded, is_device
 
 FileId = tuple[int, int]
-"""Device and inode: the same for all names of a file, links too."""
+"""Device and inode: the same for all names of a file, including links."""
 
 
 def file_id(path: str | Path) -> FileId | None:
-    """The identity of a file or folder; None if nothing is there, or a device."""
+    """The identity of a file or folder; None for devices and missing files."""
     try:
         status = os.stat(path)
     except (OSError, ValueError):
@@ -26,9 +26,9 @@ def file_id(path: str | Path) -> FileId | None:
 
 
 def files_named(params: BaseModel, directory: Path) -> Iterator[Path]:
-    """Every path that parameters may mean: each text in them, also without options behind a `?`.
+    """Every text in the parameters as a path, also without options after a `?`.
 
-    directory : where a relative path is looked for besides the current directory.
+    directory : for relative paths, besides the current directory.
     """
     for text in _texts(params.model_dump()):
         for name in {text, text.partition("?")[0]} - {""}:
@@ -36,11 +36,11 @@ def files_named(params: BaseModel, directory: Path) -> Iterator[Path]:
 
 
 def files_written(cls: type, params: StageParams) -> list[str]:
-    """The real paths of the files and folders that a sink writes, without devices; none for a stage."""
+    """The real paths of the files and folders that a sink writes, without devices; empty for a stage."""
     if not issubclass(cls, Sink):
         return []
     paths = [str(output.path) for output in cls.outputs(params)]
-    # No file has a name with NUL; the sink will say so.
+    # The sink reports names with NUL, which no file can have.
     return [os.path.realpath(path) for path in paths if "\0" not in path and not is_device(path)]
 
 

@@ -1,4 +1,4 @@
-"""Reads a pipeline file into a `Pipeline` that is known to be right, or reports every mistake in it."""
+"""Reads a pipeline file into a validated `Pipeline`, or reports all errors in it."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ def load_pipeline(
     """Read and check a pipeline file.
 
     path : the file.
-    overrides : values to replace. A text is what `--set` takes: `a.b.c=VALUE`, with VALUE in YAML, null for a
-        whole sink or stage removes it.
+    overrides : values to replace. A text is an argument of `--set`: `a.b.c=VALUE`, with VALUE in YAML; null
+        for a whole sink or stage removes it.
     extra_sinks : option of the command line, such as "--jsonl" -> settings of the sink it adds. The sink's id
-        is the option's name, with a number if that is taken.
-    source_values : parameters of the source stage to replace; their keys are names of parameters.
-    sensor : which sensor of a file with `sensors:`; None is the first.
+        is the name of the option, with a number if necessary.
+    source_values : parameters of the source stage to replace, by the name of the parameter.
+    sensor : name of a sensor under `sensors:`; None is the first.
 
     Raises
     ------
-    ConfigError : the message holds every mistake with file, line, column, source line and a caret.
+    ConfigError : all errors with file, line, column, source line and caret.
     """
     document = _read(path, overrides)
     add_sinks(document, extra_sinks or {})
@@ -87,7 +87,7 @@ def load_pipeline(
 
 
 def sensor_names(path: Path, overrides: Sequence[Override | str] = ()) -> list[str]:
-    """The sensors under `sensors:` of a pipeline file, in order; empty if it has no such key.
+    """The names under `sensors:` of a pipeline file, in order; empty without that key.
 
     Raises
     ------
@@ -99,15 +99,12 @@ def sensor_names(path: Path, overrides: Sequence[Override | str] = ()) -> list[s
 
 
 def _read(path: Path, overrides: Sequence[Override | str]) -> Document:
-    """The document with its overrides."""
+    """Read the document and apply overrides."""
     document = read_document(path)
     if not isinstance(document.root, dict):
-        found = (
-            "the file is empty"
-            if document.root is None
-            else f"expected a mapping, got {described(document.root)}"
-        )
-        document.report((), f"{found}; required: a mapping with sensor, stages and sinks")
+        is_empty = document.root is None
+        problem = "the file is empty" if is_empty else f"expected a mapping, got {described(document.root)}"
+        document.report((), f"{problem}; required: a mapping with sensor, stages and sinks")
         document.raise_if_mistaken()
     for override in overrides:
         apply(document, override)
@@ -115,7 +112,7 @@ def _read(path: Path, overrides: Sequence[Override | str]) -> Document:
 
 
 def _drafts(document: Document, directory: Path) -> list[Draft]:
-    """The stages and sinks of the file, without those whose id is wrong."""
+    """The stages and sinks of the file with valid ids."""
     drafts: dict[str, Draft] = {}
     for section in _SECTIONS:
         for id_ in document.mapping(section):
@@ -137,16 +134,17 @@ def _resolve(draft: Draft, directory: Path, document: Document) -> None:
     use = settings.get("use", draft.id)
     if not isinstance(use, str):
         return
-    # From the command line, and in a packaged pipeline, a loose file lies in the current folder.
-    own = is_packaged(directory) or ("use" in settings and not document.mark(*place).line)
+    # For the command line and packaged pipelines, a loose file is relative to the current folder.
+    is_option = "use" in settings and not document.mark(*place).line
+    folders = [Path(), directory] if is_option or is_packaged(directory) else [directory]
     try:
-        draft.component = resolve(use, draft.section, *([Path()] if own else []), directory)
+        draft.component = resolve(use, draft.section, *folders)
     except ConfigError as error:
         document.report(place, str(error), at_key=place == draft.keys)
 
 
 def _source(document: Document, drafts: Sequence[Draft]) -> Draft | None:
-    """The source of frames; a pipeline without one, or with several, is a mistake."""
+    """The source of frames; none, or several of them, are an error."""
     stages = [draft for draft in drafts if draft.section == "stages"]
     sources = [draft for draft in stages if draft.component and draft.component.kind == "source"]
     readable = document.has("stages") and isinstance(document.get("stages"), dict | None)
@@ -159,17 +157,17 @@ def _source(document: Document, drafts: Sequence[Draft]) -> Draft | None:
 
 
 def _configure(draft: Draft, document: Document) -> None:
-    """Read the parameters of a stage or sink, and with them the ports that depend on them."""
+    """Validate the parameters of a stage or sink, and determine the ports that depend on them."""
     draft.params = _params(draft, document)
     if draft.component is not None and draft.params is not None:
         draft.component = configured(draft.component, draft.params)
     elif draft.component is not None and declares(draft.component.cls):
-        # Its ports are not known, so that nothing is said of what is connected to it.
+        # Its ports are unknown, so do not report errors of its connections.
         draft.component = None
 
 
 def _params(draft: Draft, document: Document) -> StageParams | None:
-    """The parameters as the component's own model; None if they are wrong."""
+    """The parameters as the model of the component; None if they are invalid."""
     if draft.component is None:
         return None
     reserved = {key for key in RESERVED if key != "max_rate" or draft.section == "sinks"}
@@ -184,7 +182,7 @@ def _params(draft: Draft, document: Document) -> StageParams | None:
 def _check_files(
     drafts: Sequence[Draft], pipeline: Path, calibration: Path | None, document: Document
 ) -> None:
-    """Report sinks that write the same file, or one that the run reads: source, reference, code, pipeline."""
+    """Report sinks that write the same file, or a file that the run reads."""
     readers = {file_id(pipeline): "the pipeline file"}
     if calibration:
         readers[file_id(calibration)] = "the calibration"
@@ -211,10 +209,8 @@ def _check_files(
 
 
 def _calibration(document: Document, directory: Path) -> Path | None:
-    """The calibration file that the pipeline names, or the default of a kind of sensor.
-
-    A missing file is a mistake.
-    """
+    """The calibration file named by the pipeline, or the default of a kind of sensor; reports a missing
+    one."""
     name = document.get("calibration")
     if not isinstance(name, str):
         return None
@@ -231,28 +227,28 @@ def _calibration(document: Document, directory: Path) -> Path | None:
 
 
 def _check_needs(drafts: Sequence[Draft], document: Document) -> None:
-    """Report parameters that need an input which is not connected."""
+    """Report parameters that require an unconnected input."""
     if document.mistakes:
-        # Another mistake may be why it is not connected.
+        # Another error may be the cause.
         return
     for draft in drafts:
         for port, name in draft.params.needed_inputs().items() if draft.params else ():
             if draft.inputs.get(port) is None:
-                what = f"{getattr(draft.params, name)} needs {port}, which no stage gives"
+                problem = f"{getattr(draft.params, name)} needs {port}, which no stage gives"
                 place = (*draft.keys, name)
-                document.report(place, f"{what}; add a stage that does", at_key=not document.has(*place))
+                document.report(place, f"{problem}; add a stage that does", at_key=not document.has(*place))
 
 
 def _node(draft: Draft, entry: Entry, document: Document) -> Node:
-    """The node that a right draft describes."""
+    """The node of a valid draft."""
     assert draft.component is not None, "a stage without one was reported"
     assert draft.params is not None, "parameters that are wrong were reported"
     cls = draft.component.cls
-    # A picture for people must never stop the run.
+    # A viewer must never stop the run.
     default = OnError(action="disable" if issubclass(cls, Sink) and cls.observer else "stop")
     mark = draft.mark
     if draft.component.kind == "source" and not (origin := document.mark(*draft.keys, "source")).line:
-        # What the command line makes it read may not be there: then the file is not to blame.
+        # A source of the command line that cannot be opened is not an error in the file.
         mark = origin
     gates = [
         Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
@@ -275,7 +271,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
 
 
 def _settings(document: Document, sensor: str, drafts: Sequence[Draft]) -> dict[str, Any]:
-    """The values of the file with all overrides, for one sensor."""
+    """The values of the file with all overrides, for a sensor."""
     sections: dict[str, dict[str, Any]] = {section: {} for section in _SECTIONS}
     for draft in drafts:
         sections[draft.section][draft.id] = document.get(*draft.keys)
@@ -295,5 +291,5 @@ def _warnings(document: Document, drafts: Sequence[Draft]) -> list[str]:
 
 
 def _takes_calibration(cls: type) -> bool:
-    """Whether the constructor of a stage asks for the calibration."""
+    """Whether the constructor of a stage takes the calibration."""
     return "calibration" in inspect.signature(cls).parameters

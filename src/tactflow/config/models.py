@@ -1,7 +1,7 @@
-"""What a pipeline file may say, apart from the parameters of its stages and sinks.
+"""Models of a pipeline file, without the parameters of its stages and sinks.
 
-From these models come both the checks of a file and its JSON Schema. What depends on several parts of a file
-(wiring, gates, sensors) is checked elsewhere in this package.
+They validate a file and give its JSON Schema. Constraints between parts of a file (wiring, gates, sensors)
+are checked elsewhere in this package.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from tactflow.engine.graph import ErrorAction, OnError, Queue
 
 STATISTICS = "stats"
-"""The topic of a run's statistics, so that no sensor may have this name."""
+"""Reserved name of a sensor: the topic of statistics."""
 
 WORD = "^[A-Za-z0-9_-]+$"
 
 MAX_THREADS: Final = 1024
-"""OpenCV starts as many threads as it is asked for, and the system refuses some ten thousand. Chosen by hand:
-more than a computer has processors."""
+"""Maximum number of OpenCV's threads; the system refuses some ten thousand. Chosen by hand: more than a
+computer has processors."""
 
 
 def is_word(text: str) -> bool:
-    """True for a word of ASCII letters, digits, `_` and `-`, such as every id is.
+    """Whether a text is a valid id: ASCII letters, digits, `_` and `-`.
 
     >>> is_word("marker_mask"), is_word("left hand")
     (True, False)
@@ -39,14 +39,14 @@ def _not_the_topic(name: str) -> str:
 
 
 _EMPTY = BeforeValidator(lambda value: {} if value is None else value)
-"""A key with nothing after it is an empty mapping."""
+"""A key without a value is an empty mapping."""
 
 Word = Annotated[str, StringConstraints(pattern=WORD)]
 Sensor = Annotated[Word, AfterValidator(_not_the_topic)]
 
 
 class Part(BaseModel):
-    """Base of all parts of a pipeline file: unknown keys are mistakes, and no value is converted."""
+    """Base of all parts of a pipeline file: unknown keys are errors, values are not converted."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -66,7 +66,7 @@ class Gate(Part):
 
 
 def _gates(value: Any) -> Any:
-    """One gate or several, each perhaps only the name of its signal, as a list of mappings."""
+    """Normalise one or several gates, or names of signals, to a list of mappings."""
     gates = value if isinstance(value, list) else [] if value is None else [value]
     return [gate if isinstance(gate, dict) else {"signal": gate} for gate in gates]
 
@@ -76,7 +76,7 @@ def _on_error(value: Any) -> Any:
 
 
 class Entry(Part):
-    """What stages and sinks have in common. Every key that is not named here is a parameter."""
+    """Keys of stages and sinks. All other keys are parameters."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -112,13 +112,13 @@ _USE = (
 
 
 class StageEntry(Entry):
-    """A stage of a pipeline, besides its parameters."""
+    """A stage, without its parameters."""
 
     use: str = Field("", description=_USE.format("stage"))
 
 
 class SinkEntry(Entry):
-    """A sink of a pipeline, besides its parameters."""
+    """A sink, without its parameters."""
 
     use: str = Field("", description=_USE.format("sink"))
     max_rate: float | None = Field(
@@ -127,9 +127,9 @@ class SinkEntry(Entry):
 
 
 class Changes(Part):
-    """What one of several sensors changes: the keys of `PipelineFile` that may differ between sensors.
+    """Changes of the file for a sensor: the keys of `PipelineFile` that may differ between sensors.
 
-    The values are checked where they are laid over the file's.
+    The values are validated after merging.
     """
 
     calibration: Any = None
@@ -166,4 +166,4 @@ class PipelineFile(Part):
 
 
 RESERVED = frozenset(field.alias or name for name, field in SinkEntry.model_fields.items())
-"""Keys of a stage or sink that belong to the engine and so cannot be names of parameters."""
+"""Keys of stages and sinks that must not be names of parameters."""

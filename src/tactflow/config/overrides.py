@@ -1,4 +1,4 @@
-"""Changes to a pipeline file from outside it: `--set a.b.c=VALUE`, settings in Python, sinks of options."""
+"""Overrides of a pipeline file: `--set a.b.c=VALUE`, settings in Python, sinks of options."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from tactflow.system.spelling import did_you_mean
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One value that replaces another.
+    """A replacement for a value.
 
     key : dotted path, as in "stages.hull.min_area". value : a Python object; None for a whole stage or sink
-    removes it. origin : what a message about the value begins with, in place of file, line and column.
+    removes it. origin : stands for file, line and column in messages.
     """
 
     key: str
@@ -30,21 +30,21 @@ class Override:
 
 
 def from_settings(settings: Mapping[str, Any]) -> list[Override]:
-    """Overrides from a program's `{"stages.hull.min_area": 50}`, or `{"stages": {"hull": {"min_area": 50}}}`.
+    """Overrides from `{"stages.hull.min_area": 50}` or `{"stages": {"hull": {"min_area": 50}}}`.
 
-    Settings of stages are merged with those of the file; anything else replaces what is there.
+    Settings of stages are merged with those of the file; other values are replaced.
 
     >>> from_settings({"sinks.zmq": None})
     [Override(key='sinks.zmq', value=None, origin='settings')]
     >>> [override.key for override in from_settings({"stages": {"hull": {"min_area": 50}}})]
     ['stages.hull.min_area']
     """
-    found = dict(settings)
+    flat = dict(settings)
     for key in ("stages", *(f"stages.{id_}" for id_ in _part(settings, "stages"))):
-        if part := _part(found, key):
-            del found[key]
-            found |= {f"{key}.{name}": value for name, value in part.items()}
-    return [Override(key, value, "settings") for key, value in found.items()]
+        if part := _part(flat, key):
+            del flat[key]
+            flat |= {f"{key}.{name}": value for name, value in part.items()}
+    return [Override(key, value, "settings") for key, value in flat.items()]
 
 
 def _part(settings: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -53,7 +53,7 @@ def _part(settings: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 
 
 def as_yaml(value: Any) -> str:
-    """A value as `--set` takes it: JSON, which is YAML too.
+    """A value for `--set`, as JSON, which is also YAML.
 
     >>> import numpy as np
     >>> from pathlib import Path
@@ -64,11 +64,11 @@ def as_yaml(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A Python value as YAML would hold it: mappings, lists, text, numbers, booleans and None.
+    """Convert a Python value to mappings, lists, text, numbers, booleans and None.
 
     Raises
     ------
-    ConfigError : a text, such as the name of a file, that UTF-8 cannot write.
+    ConfigError : a text, such as a file name, that is not UTF-8.
 
     >>> import numpy as np
     >>> plain({"size": (1, np.float32(0.5))})
@@ -83,9 +83,9 @@ def plain(value: Any) -> Any:
 
 
 def apply(document: Document, override: Override | str, base: Keys = ()) -> None:
-    """Put an override, or the text of a `--set`, into the document; mistakes are recorded there.
+    """Apply an override, or an argument of `--set`, to the document, which records errors.
 
-    base : where its key begins.
+    base : path to which its key is relative.
     """
     if isinstance(override, str):
         origin, (key, _, text) = f"--set {public_setting(override)}", override.partition("=")
@@ -110,7 +110,7 @@ def apply(document: Document, override: Override | str, base: Keys = ()) -> None
 
 
 def add_sinks(document: Document, extra: Mapping[str, Mapping[str, Any]]) -> None:
-    """Add the sinks of options such as `--jsonl`; each gets an id that is free."""
+    """Add the sinks of options such as `--jsonl`, with unused ids."""
     for option, settings in extra.items():
         use = id_ = option.lstrip("-")
         taken = {*document.mapping("stages"), *document.mapping("sinks")}

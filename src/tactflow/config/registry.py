@@ -1,4 +1,4 @@
-"""What `use:` can name: built-in stages and sinks, plug-ins, classes in modules and in loose files."""
+"""Resolves `use:` to built-in stages and sinks, plug-ins, and classes in modules or loose files."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ Section = Literal["stages", "sinks"]
 
 
 def resolve(use: str, section: Section, *folders: Path) -> Component:
-    """Find the class that `use` names and read its contract.
+    """Find and validate the class named by `use`.
 
     use : a built-in name, the name of an installed plug-in, `package.module:Class`, or `./file.py:Class`
         (`./file.py` alone where the file holds one class).
-    section : "stages" or "sinks", the part of the pipeline file it stands in.
-    folders : where a loose file is looked for, in this order.
+    section : "stages" or "sinks", its part of the pipeline file.
+    folders : to search for a loose file, in this order.
 
     Raises
     ------
-    ConfigError : nothing has that name, two things have it, or the class breaks the contract of stages.
+    ConfigError : the name is unknown or ambiguous, or the class violates the contract.
     """
     file, separator, name = use.rpartition(":")
     if not separator and _is_file(use):
         file, name = use, ""
     if _is_file(file):
-        found = component(_find_class(_load_file(folders, file), name, section), use, file, RESERVED)
+        resolved = component(_find_class(_load_file(folders, file), name, section), use, file, RESERVED)
     elif separator:
-        found = component(_find_class(_load_module(file), name, section), use, f"module {file}", RESERVED)
+        resolved = component(_find_class(_load_module(file), name, section), use, f"module {file}", RESERVED)
     else:
-        found = _named(use, section)
-    if (found.kind == "sink") != (section == "sinks"):
-        right = "sinks" if found.kind == "sink" else "stages"
-        raise ConfigError(f"{use} is a {found.kind}; it belongs under {right}:")
-    return found
+        resolved = _named(use, section)
+    if (resolved.kind == "sink") != (section == "sinks"):
+        right = "sinks" if resolved.kind == "sink" else "stages"
+        raise ConfigError(f"{use} is a {resolved.kind}; it belongs under {right}:")
+    return resolved
 
 
 def catalogue() -> tuple[list[Component], list[str]]:
-    """Every built-in and installed stage and sink that can be loaded, stages first, by name, and one message
-    for each that cannot be used."""
+    """All built-in and installed stages and sinks, stages first, by name; and a message for each that cannot
+    be used."""
     components: list[Component] = []
     problems: list[str] = []
     sections: tuple[Section, ...] = get_args(Section)
@@ -77,7 +77,7 @@ def catalogue() -> tuple[list[Component], list[str]]:
 
 
 def names(section: Section) -> list[str]:
-    """Names of the built-ins and plug-ins of a section; nothing is imported for it."""
+    """Names of the built-ins and plug-ins of a section, without importing them."""
     return sorted({*_builtins(section), *(entry.name for entry in plugins(f"tactflow.{section}"))})
 
 
@@ -91,24 +91,24 @@ def _builtins(section: Section) -> list[str]:
 
 
 def _named(name: str, section: Section) -> Component:
-    # First, as looking for plug-ins takes some milliseconds.
+    # Built-ins first, because searching for plug-ins takes some milliseconds.
     if name in _builtins(section):
         module = f"tactflow.{section}.{name}"
         return component(_find_class(_load_module(module), "", section), name, "built-in", RESERVED)
-    found = [entry for entry in plugins(f"tactflow.{section}") if entry.name == name]
-    if len(found) > 1:
+    entries = [entry for entry in plugins(f"tactflow.{section}") if entry.name == name]
+    if len(entries) > 1:
         raise ConfigError(
-            f"{name} is claimed by {' and by '.join(map(_plugin_origin, found))}; name the class instead "
-            f"(use: {' or '.join(entry.value for entry in found)}) or uninstall one of them"
+            f"{name} is claimed by {' and by '.join(map(_plugin_origin, entries))}; name the class instead "
+            f"(use: {' or '.join(entry.value for entry in entries)}) or uninstall one of them"
         )
-    if found:
-        module, _, attribute = found[0].value.partition(":")
-        origin = _plugin_origin(found[0])
+    if entries:
+        module, _, attribute = entries[0].value.partition(":")
+        origin = _plugin_origin(entries[0])
         cls = _find_class(_load_module(module.strip(), origin), attribute.strip(), section)
         return component(cls, name, origin, RESERVED)
-    other: Section = "sinks" if section == "stages" else "stages"
-    if name in names(other):
-        raise ConfigError(f"{name} is under {section}: but belongs under {other}:")
+    opposite: Section = "sinks" if section == "stages" else "stages"
+    if name in names(opposite):
+        raise ConfigError(f"{name} is under {section}: but belongs under {opposite}:")
     raise ConfigError(
         f"there is no {section[:-1]} called {name or repr(name)}{did_you_mean(name, names(section))}"
         + ("" if closest(name, names(section)) else "; a class of your own is named as ./file.py:Class")
@@ -138,9 +138,9 @@ def _load_module(name: str, owner: str = "") -> ModuleType:
 
 
 def _load_file(folders: Sequence[Path], file: str) -> ModuleType:
-    """Run a Python file as a module of its own, once for each version of the file."""
+    """Run a Python file as a module, once for each version of the file."""
     try:
-        # The same folder may be given twice.
+        # Both folders may be the same.
         paths = list(dict.fromkeys((folder / file).resolve() for folder in folders))
         path = next((path for path in paths if path.exists()), paths[0])
         source = read_limited(path)
@@ -157,7 +157,7 @@ def _load_file(folders: Sequence[Path], file: str) -> ModuleType:
         return sys.modules[name]
     module = ModuleType(name)
     module.__file__ = str(path)
-    # Dataclasses and annotations look their module up by name while the file runs.
+    # Dataclasses and annotations look up their module by name while the file runs.
     sys.modules[name] = module
     try:
         exec(compile(source, str(path), "exec"), module.__dict__)
@@ -168,7 +168,7 @@ def _load_file(folders: Sequence[Path], file: str) -> ModuleType:
 
 
 def _failure(what: str, error: BaseException, file: str | None = None) -> str:
-    """One line on why a module cannot be loaded, with the place in the code."""
+    """Why a module cannot be loaded, with the location in the code."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: cannot load {what}: {error.msg}"
     text = f"cannot load {what}: {type(error).__name__}: {error}"
@@ -186,21 +186,21 @@ def code_place(trace: TracebackType | None, file: str | None = None) -> str | No
 
 def _find_class(module: ModuleType, name: str, section: Section) -> type:
     """The class called `name`, or the one public stage or sink class that the module defines."""
-    # What is built into Python has no file.
+    # Modules built into Python have no file.
     where = getattr(module, "__file__", None) or module.__name__
-    here = {
+    public = {
         key: value
         for key, value in vars(module).items()
         if inspect.isclass(value) and value.__module__ == module.__name__ and key[0] != "_"
     }
-    usable = {key: value for key, value in here.items() if kind_of(value)}
+    usable = {key: value for key, value in public.items() if kind_of(value)}
     if name:
-        found: Any = module
+        attribute: Any = module
         for part in name.split("."):
-            found = getattr(found, part, None)
-        if inspect.isclass(found):
-            return found
-        raise ConfigError(f"{where} has no class {name}{did_you_mean(name, usable or here, 'it has ')}")
+            attribute = getattr(attribute, part, None)
+        if inspect.isclass(attribute):
+            return attribute
+        raise ConfigError(f"{where} has no class {name}{did_you_mean(name, usable or public, 'it has ')}")
     if len(set(usable.values())) == 1:
         return next(iter(usable.values()))
     wanted = "Sink" if section == "sinks" else "Stage or Source"

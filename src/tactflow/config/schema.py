@@ -1,4 +1,4 @@
-"""JSON Schema of a pipeline file, for editors: its models, with the parameters of every component."""
+"""JSON Schema of a pipeline file for editors, including the parameters of every component."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactflow.engine.graph import Component
 def pipeline_schema(components: Sequence[Component]) -> dict[str, Any]:
     """JSON Schema (2020-12) of a pipeline file.
 
-    Where an id names one of the components, its parameters are checked; after `use:` any are allowed.
+    Parameters are validated if the id names a component; with `use:`, any are allowed.
 
     >>> from tactflow.config.registry import catalogue
     >>> sorted(pipeline_schema(catalogue()[0])["properties"])[:3]

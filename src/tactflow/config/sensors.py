@@ -1,11 +1,11 @@
-"""`sensors:` in a pipeline file: the same graph for each of several sensors, with changes for each.
+"""`sensors:` in a pipeline file: the same graph for several sensors, with changes for each.
 
     sensors:
       left:  {stages: {capture: {source: /dev/video0}}}
       right: {stages: {capture: {source: /dev/video2}, preprocess: {rotate: 270}}}
 
-The changes of a sensor are laid over the rest of the file; null removes a stage, a sink or a parameter.
-`{sensor}` in any text of a sink stands for the sensor's name.
+The changes of a sensor are merged into the rest of the file; null removes a stage, a sink or a parameter.
+`{sensor}` in any text of a sink is replaced by the sensor's name.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ PLACEHOLDER = "{sensor}"
 
 
 def names(document: Document) -> list[str]:
-    """The sensors that a file names under `sensors:`, in order; empty if it has none."""
+    """The names under `sensors:`, in order; empty without that key."""
     return list(document.mapping("sensors"))
 
 
 def select(document: Document, chosen: str | None) -> str:
-    """Turn the document into that of one sensor; returns the sensor's name.
+    """Reduce the document to one sensor; returns the sensor's name.
 
-    chosen : a name of `sensors:`, or None for the first one, or for the only one of a file without it.
+    chosen : a name under `sensors:`; None for the first one, or for the only one of a file without that key.
     """
     known = names(document)
     if not document.has("sensors"):
@@ -37,8 +37,8 @@ def select(document: Document, chosen: str | None) -> str:
             document.report((), f"there is no sensor {chosen!r}; the file's only sensor is {name}")
     else:
         if document.has("sensor"):
-            there = document.key_mark("sensors")
-            message = f"the names stand under sensors ({there}) already; leave this one out"
+            mark = document.key_mark("sensors")
+            message = f"the names stand under sensors ({mark}) already; leave this one out"
             document.report(("sensor",), message, at_key=True)
         if chosen is not None and chosen not in known:
             hint = did_you_mean(chosen, known)
@@ -46,20 +46,20 @@ def select(document: Document, chosen: str | None) -> str:
         name = chosen if chosen in known else known[0] if known else "main"
         for key in document.mapping("sensors", name):
             if key in Changes.model_fields:
-                _lay_over(document, ("sensors", name, key), (key,))
+                _merge(document, ("sensors", name, key), (key,))
     if document.mapping("sinks"):
         document.root["sinks"] = _filled_in(document.root["sinks"], name)
     return name
 
 
-def _lay_over(document: Document, change: Keys, target: Keys) -> None:
-    """Put a value of `sensors:` over the one of the file; mappings are merged."""
+def _merge(document: Document, change: Keys, target: Keys) -> None:
+    """Replace a value of the file by one of `sensors:`; mappings are merged."""
     value, mark, key_mark = document.get(*change), document.mark(*change), document.key_mark(*change)
     if isinstance(value, dict):
         if not isinstance(document.get(*target), dict):
             document.set(target, {}, mark, key_mark)
         for key in value:
-            _lay_over(document, (*change, key), (*target, key))
+            _merge(document, (*change, key), (*target, key))
     elif value is None and len(target) > 1 and document.has(*target):
         del document.mapping(*target[:-1])[str(target[-1])]
     else:

@@ -1,4 +1,4 @@
-"""Which pipeline file a command means."""
+"""Finding the pipeline file of a command."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from tactflow.system.spelling import closest
 
 
 def packaged_pipelines() -> list[str]:
-    """Names of the pipelines that come with the package, without `.yaml`."""
+    """Names of the shipped pipelines, without `.yaml`."""
     folder = files("tactflow.pipelines")
     return sorted(item.name.removesuffix(".yaml") for item in folder.iterdir() if item.name.endswith(".yaml"))
 
 
 def described_pipelines() -> dict[str, str]:
-    """Name -> what it is for: the first sentence of the comment at the top of its file."""
-    found = {}
+    """Name -> description: the first sentence of the comment at the top of its file."""
+    descriptions = {}
     for name in packaged_pipelines():
         lines = _packaged(name).read_text(encoding="utf-8").splitlines()
         comment = " ".join(line[2:] for line in takewhile(lambda line: line.startswith("# "), lines))
-        found[name] = re.split(r"\. |\.$", comment)[0]
-    return found
+        descriptions[name] = re.split(r"\. |\.$", comment)[0]
+    return descriptions
 
 
 def find_pipeline(name: str | None) -> Path:
-    """The file that PIPELINE names.
+    """The file for the argument PIPELINE.
 
-    Without a name: `./pipeline.yaml` if it is there, else the packaged default. A name that is not a file,
-    such as `classic` or `pipelines/classic.yaml`, finds the packaged pipeline of that name.
+    None: `./pipeline.yaml` if it exists, else the shipped default. A name that is not a file, such as
+    `classic` or `pipelines/classic.yaml`, is a shipped pipeline.
 
-    Raises ConfigError, with the names that there are, for a word that is neither.
+    Raises ConfigError, with the valid names, if it is neither.
     """
     if name is None:
         local = Path("pipeline.yaml")
@@ -55,7 +55,7 @@ def find_pipeline(name: str | None) -> Path:
 
 
 def is_packaged(folder: Path) -> bool:
-    """Whether a folder is the one in which the pipelines of the package stand."""
+    """Whether a folder is that of the shipped pipelines."""
     return folder.resolve() == _packaged("default").parent.resolve()
 
 

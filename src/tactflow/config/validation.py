@@ -1,4 +1,4 @@
-"""Checks values against pydantic models and reports every error at its place in the document."""
+"""Validates values with pydantic, and reports every error at its location in the document."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _YAML_TERMS = {
     r" after validation": "",
     rf"match pattern '{re.escape(WORD)}'": "be a word of letters, digits, _ and -",
 }
-"""Words of pydantic -> words for those who write YAML."""
+"""Pydantic's wording -> the terms of YAML."""
 _WITHOUT_VALUE = ("missing", "extra_forbidden", "value_error", "assertion_error", "too_short", "too_long")
-"""Errors that the value itself does not explain."""
+"""Types of errors whose message does not show the value."""
 
 
 def validate(
@@ -38,13 +38,13 @@ def validate(
     without: Collection[str] = (),
     noun: str = "key",
 ) -> Model | None:
-    """The mapping at `keys` as its model; None if it has mistakes, which are recorded.
+    """The mapping at `keys` as its model; None if it has errors, which are recorded.
 
-    without : keys of the mapping that do not belong to the model. noun : what messages call its keys.
+    without : keys of the mapping that do not belong to the model. noun : for its keys, in messages.
     """
     values = {key: value for key, value in document.mapping(*keys).items() if key not in without}
     try:
-        # Pydantic's strict rules for JSON fit YAML: a list may become a tuple, but text and booleans never
+        # Pydantic's strict rules for JSON suit YAML: a list may become a tuple, but text and booleans never
         # become numbers.
         return model.model_validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
@@ -53,13 +53,13 @@ def validate(
 
 
 def validated(model: type[StageParams], values: Mapping[str, Any], name: str, *, origin: str) -> StageParams:
-    """The parameters that a program gives a stage or sink, as its own model.
+    """Validate parameters from Python.
 
-    name : what a message calls the stage. origin : what it begins with, in place of file, line and column.
+    name : of the stage or sink, for messages. origin : stands for file, line and column in messages.
 
     Raises
     ------
-    ConfigError : every mistake in the values.
+    ConfigError : all errors in the values.
     """
     try:
         return model.model_validate(values)
@@ -79,9 +79,9 @@ def report(
     also: Collection[str] = (),
     noun: str = "key",
 ) -> None:
-    """Record each error of a validation at its own value; those of a union together, as one mistake.
+    """Record each error at its value; those of a union together.
 
-    keys : what was validated. also : keys that may stand there besides those of the model.
+    keys : path of the validated mapping. also : its valid keys besides those of the model.
     """
     groups: dict[Keys, list[tuple[ErrorDetails, Keys]]] = {}
     for detail in error.errors(include_url=False):
@@ -107,14 +107,15 @@ def report(
 
 
 def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, Keys]:
-    """The value that an error is about, and the rest of its location: the member of a union, and in it."""
+    """The path of the invalid value, and the rest of the error's location: the member of a union, and the
+    part of it."""
     place, rest = keys, list(detail["loc"])
     while rest:
         value = document.get(*place)
         if isinstance(value, dict) and rest[0] in value:
             place = (*place, rest.pop(0))
         elif isinstance(rest[0], int) and (not isinstance(value, list) or rest[0] < len(value)):
-            # One item may stand for a list of one.
+            # A list of one may be written as its item.
             index = rest.pop(0)
             place = (*place, index) if isinstance(value, list) else place
         else:
@@ -125,7 +126,7 @@ def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, 
 
 
 def _words(members: Sequence[tuple[ErrorDetails, Keys]], value: Any) -> str:
-    """One message for the errors of a value: several where the members of a union were tried."""
+    """One message for the errors of a value; a union has one for each of its members."""
     texts, choices, got = [], [], ""
     for detail, rest in members:
         texts.append("".join(f"{key}: " for key in rest[1:]) + _message(detail))
@@ -133,14 +134,14 @@ def _words(members: Sequence[tuple[ErrorDetails, Keys]], value: Any) -> str:
             choices += re.findall("'([^']*)'", detail["ctx"]["expected"])
         if detail["type"] not in _WITHOUT_VALUE:
             got = f", got {described(value)}"
-    first, *others = dict.fromkeys(texts)
-    text = " or ".join([first, *(other.removeprefix("should be ") for other in others)]) + got
+    first, *more = dict.fromkeys(texts)
+    text = " or ".join([first, *(alternative.removeprefix("should be ") for alternative in more)]) + got
     guess = closest(value, choices) if isinstance(value, str) else None
     return f"{text}; did you mean {guess}?" if guess else text
 
 
 def _message(detail: ErrorDetails) -> str:
-    """What pydantic says, in YAML's terms."""
+    """Pydantic's message in the terms of YAML."""
     if detail["type"] == "missing":
         item = isinstance(detail["loc"][-1], int)
         return "this item of the list is missing" if item else "required, but not given"
@@ -155,7 +156,7 @@ def _message(detail: ErrorDetails) -> str:
 
 
 def _fields(model: type[BaseModel], location: Keys) -> dict[str, FieldInfo]:
-    """The fields of the (nested) model at a location, by the names they have in a file."""
+    """The fields of the (nested) model at a location, by their names in a file."""
     models: list[type[BaseModel]] = [model]
     for part in location:
         field = _named(models).get(str(part))

@@ -19,10 +19,10 @@ class Draft:
     """A stage or sink of the file before its inputs are connected.
 
     mark : of its key.
-    component : None when `use` could not be resolved; what depends on it is then not judged.
-    params : None when they are wrong.
-    inputs, gates : filled by `connect`; for each gate the port, and the signal that says what closed means.
-    edges : every output it takes, with the place that says so.
+    component : None if `use` could not be resolved; no errors are reported for nodes that depend on it.
+    params : None if invalid.
+    inputs, gates : set by `connect`; for each gate the port, and the signal that defines a closed gate.
+    edges : every output that it uses, with the location in the file.
     """
 
     id: str
@@ -36,7 +36,7 @@ class Draft:
 
     @property
     def keys(self) -> Keys:
-        """Where it stands in the document."""
+        """Its path in the document."""
         return (self.section, self.id)
 
     @property
@@ -46,10 +46,10 @@ class Draft:
 
 
 def connect(drafts: Sequence[Draft], document: Document) -> None:
-    """Connect every input and gate by name or as `in:` and `when:` say; mistakes are recorded.
+    """Connect every input and gate, by name or by `in:` and `when:`; errors are recorded.
 
-    An input takes the output of its name from the nearest stage above it, in a sink from the last stage that
-    has it.
+    By default, an input takes the output of its name from the nearest stage above; in a sink, from the last
+    stage that has it.
     """
     wiring = _Wiring(drafts, document)
     for draft in drafts:
@@ -61,7 +61,7 @@ def connect(drafts: Sequence[Draft], document: Document) -> None:
 
 
 def ordered(drafts: Sequence[Draft], document: Document) -> list[Draft]:
-    """Sort so that every output comes before its users, else in the order of the file; reports a cycle."""
+    """Sort topologically, else in the order of the file; reports a cycle."""
     by_id = {draft.id: draft for draft in drafts}
     done: dict[str, Draft] = {}
     chain: list[str] = []
@@ -147,9 +147,9 @@ class _Wiring:
                 self._gate(gate, keys, draft)
 
     def _reference(self, text: Any, place: Keys, user: Draft, by_port: bool = False) -> Ref | None:
-        """The output that `stage.port`, `stage`, or (with `by_port`) the name of a port means."""
+        """The output named by `stage.port`, `stage`, or (with `by_port`) the name of a port."""
         if not isinstance(text, str):
-            # The model of the file reports it.
+            # Reported by the model of the file.
             return None
         document = self._document
         stage, dot, port = text.partition(".")
@@ -159,7 +159,7 @@ class _Wiring:
                 return ref
         producer = self._by_id.get(stage)
         if producer is None:
-            # An unknown signal may come from a stage that could not be found.
+            # An unknown signal may be that of an unresolved stage.
             if self._complete or dot or not by_port:
                 document.report(place, self._unknown(text, user, by_port))
         elif producer.section == "sinks":
@@ -190,7 +190,7 @@ class _Wiring:
         return f"there is no stage {stage!r}{did_you_mean(stage, ids, 'stages: ')}"
 
     def _above(self, user: Draft) -> list[Draft]:
-        """The stages an input may take from by name, nearest first."""
+        """The stages whose outputs an input may take by name, nearest first."""
         stages = self._stages if user.section == "sinks" else self._stages[: self._stages.index(user)]
         return stages[::-1]
 
@@ -241,7 +241,7 @@ class _Wiring:
         draft.edges.append((ref, self._document.mark(*place)))
 
     def _meaning(self, ref: Ref, signal: SignalPort, visited: Sequence[str] = ()) -> SignalPort:
-        """The signal that defines what a closed gate means: behind a stage that holds one, the held one."""
+        """The signal that defines a closed gate: for a stage that holds a signal, the held one."""
         producer = self._by_id[ref.node]
         only_holds = signal.closed is None and producer.id not in visited
         for source in producer.inputs.values() if only_holds else ():

@@ -1,4 +1,4 @@
-"""Calling a stage without the engine: a stage that needs a `Frame` gets one made of the picture."""
+"""Calling a stage without the engine: a `Frame` is created from the picture."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from tactflow.engine.frame import NO_PICTURE, Frame
 from tactflow.engine.ports import Port
 
 FPS = 30.0
-"""Rate of the frames that are made here, Hz: that of recordings which do not say their own."""
+"""Rate of the created frames, Hz: the default of recordings."""
 
 
 def with_frames_made(process: Callable[..., Any], inputs: Sequence[Port]) -> Callable[..., Any]:
-    """`process` with its parameter `frame: Frame` optional; the first call is the reference.
+    """`process` with an optional parameter `frame: Frame`; the first call is the reference.
 
-    Positional arguments are the other inputs, in order; the frame is made of the first array among them. A
-    stage whose only input is the frame takes the picture in its place.
+    Positional arguments are the other inputs, in order; the frame is created from the first array among them.
+    A stage whose only input is the frame takes the picture instead.
 
     process : of a stage. inputs : its ports.
 

@@ -1,4 +1,4 @@
-"""Run-time checks of values against the port types of a node (`--check`)."""
+"""Checks of values against port types at run time (`--check`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactflow.engine.ports import ArrayPort, Port, Ports, SignalPort, port_type
 
 
 def read_only(value: Any) -> Any:
-    """The value; of an array a view that cannot be written through."""
+    """The value; for an array, a read-only view."""
     if isinstance(value, np.ndarray):
         value = value.view()
         value.flags.writeable = False
@@ -20,7 +20,7 @@ def read_only(value: Any) -> Any:
 
 
 def check_values(ports: Ports, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-    """Raise TypeError or ValueError, naming the port, unless every value is what its port promises.
+    """Raise TypeError or ValueError, naming the port, unless every value matches its port type.
 
     Named dimensions must agree among all inputs and outputs of a tick.
     """

@@ -1,4 +1,4 @@
-"""A sink that carries every result of a run into Python."""
+"""A sink that passes every result of a run to a function."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Collect(Sink):
     params: Params
 
     def write(self, result: Tick) -> None:
-        """Hand the result over."""
+        """Pass the result on."""
         self.params.take(result)
 
 
@@ -40,19 +40,19 @@ def with_collector(
     pictures: bool = True,
     references: bool = False,
 ) -> Pipeline:
-    """The pipeline with a sink that hands every result to a function.
+    """Add a sink that passes every result to a function.
 
-    A result holds every output of every stage, but for stages that wait for a sink (`on_demand`). Asked for
-    are those that `kind` names and those that no other stage reads; the others are in it where they were
-    computed anyway, so that collecting does not defeat what the pipeline skips.
+    A result holds the outputs of all stages except those that run only for a sink (`on_demand`). The sink
+    requests the ports that `kind` names and those that no other stage reads. The others are included if they
+    were computed anyway, so that collecting does not force work that the pipeline skips.
 
     Parameters
     ----------
-    pipeline : loaded. kind : class of the results. take : gets each of them, in order.
-    name : id of the sink, with a point in it, which no id of a pipeline file has.
+    pipeline : loaded. kind : class of the results. take : called with each of them, in order.
+    name : id of the sink; a dot in it keeps it distinct from the ids of pipeline files.
     sinks : keep the pipeline's own sinks.
-    background : call `take` in a thread of its own, where it may block.
-    pictures : also collect outputs that are (H, W, 3) uint8 and that `kind` does not name.
+    background : call `take` in its own thread, where it may block.
+    pictures : also collect (H, W, 3) uint8 outputs that `kind` does not name.
     references : also collect a reference image that is not part of the source.
     """
     nodes = {id_: node for id_, node in pipeline.nodes.items() if sinks or node.component.kind != "sink"}
@@ -67,7 +67,7 @@ def with_collector(
     read = {ref for node in stages for ref in [*node.inputs.values(), *(gate.signal for gate in node.gates)]}
     inputs = {port: ref for port, ref in outputs.items() if port in known or ref not in read}
     passive = {port: ref for port, ref in outputs.items() if port not in inputs}
-    # Any value: whether it is what its port promises is checked where it is made.
+    # Accept any value: the stage that returns it checks it.
     ports = Ports([Port(port, object, True) for port in inputs], (), ResultParameter(0, len(inputs), kind))
     policy = {"threaded": True, "when_live": "latest"} if background else {}
     cls: type[Collect] = type("Collect", (Collect,), {"takes_references": references, **policy})
@@ -79,13 +79,14 @@ def with_collector(
 
 
 def _named_outputs(stages: Sequence[Node]) -> dict[str, tuple[Ref, Port]]:
-    """Name in a result -> the output; where several stages give a port, the plain name is the last one's."""
-    found: dict[str, list[tuple[Ref, Port]]] = {}
+    """Name in a result -> output. If several stages have the port, its plain name refers to the last one."""
+    by_name: dict[str, list[tuple[Ref, Port]]] = {}
     for node in stages:
         for port in node.component.ports.outputs:
-            found.setdefault(port.name, []).append((Ref(node.id, port.name), port))
-    several = [output for outputs in found.values() if len(outputs) > 1 for output in outputs]
-    return {str(ref): (ref, port) for ref, port in several} | {name: o[-1] for name, o in found.items()}
+            by_name.setdefault(port.name, []).append((Ref(node.id, port.name), port))
+    ambiguous = [output for outputs in by_name.values() if len(outputs) > 1 for output in outputs]
+    plain = {name: outputs[-1] for name, outputs in by_name.items()}
+    return {str(ref): (ref, port) for ref, port in ambiguous} | plain
 
 
 def _is_picture(port: Port) -> bool:

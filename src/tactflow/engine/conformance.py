@@ -1,4 +1,4 @@
-"""Reading a class as a stage, sink or source, and building one (see `tactflow.engine.contract`)."""
+"""Validating and constructing stages, sinks and sources (see `tactflow.engine.contract`)."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from tactflow.engine.graph import Component, Kind
 from tactflow.engine.ports import Ports, read_ports
 
 BASES: dict[Kind, type[Part]] = {"source": Source, "stage": Stage, "sink": Sink}
-"""What each kind inherits from."""
+"""Base class of each kind."""
 
 METHODS: dict[Kind, str] = {"source": "frames", "stage": "process", "sink": "write"}
 """The method whose annotations are the ports."""
 
 OFFERED = ("sensor", "directory", "skipping", "control", "calibration")
-"""What a constructor may ask for besides `params`."""
+"""Optional constructor arguments besides `params`."""
 
 
 def kind_of(cls: type[Any]) -> Kind | None:
-    """What a class is, by what it inherits from; None if it is not a part of a pipeline."""
+    """The kind of a class by its base class; None if it is not a part of a pipeline."""
     return next((kind for kind, base in BASES.items() if issubclass(cls, base)), None)
 
 
 def component(cls: type[Any], name: str, origin: str, reserved: Collection[str]) -> Component:
-    """Read a class as a stage, sink or source.
+    """Validate a class, and describe it as a stage, sink or source.
 
-    name, origin : as in `Component`. reserved : names that a parameter may not have.
+    name, origin : as in `Component`. reserved : names that parameters must not have.
 
     Raises
     ------
-    ConfigError : the class breaks the contract; every message begins with the place of the class.
+    ConfigError : the class violates the contract; each message starts with the location of the class.
     """
     kind = kind_of(cls)
     if kind is None:
         bases = [BASES[kind].__name__ for kind, method in METHODS.items() if hasattr(cls, method)]
-        fitting = " or ".join(bases or [base.__name__ for base in BASES.values()])
-        raise _broken(cls, f" must inherit from {fitting} of tactflow")
+        candidates = " or ".join(bases or [base.__name__ for base in BASES.values()])
+        raise _broken(cls, f" must inherit from {candidates} of tactflow")
     problems = list(_problems(cls, kind, reserved))
     if problems:
         raise _broken(cls, *problems)
@@ -54,21 +54,21 @@ def declares(cls: type[Any]) -> bool:
     return issubclass(cls, Stage) and cls.declare.__func__ is not Stage.declare.__func__  # type: ignore[attr-defined]
 
 
-def configured(found: Component, params: StageParams) -> Component:
-    """The component with the ports and the memory that it has with these parameters."""
-    if not declares(found.cls):
-        return found
-    declared = found.cls.declare(params)
-    return replace(found, ports=Ports(declared.inputs, declared.outputs), memory=declared.memory)
+def configured(component: Component, params: StageParams) -> Component:
+    """The component with its ports and memory for these parameters."""
+    if not declares(component.cls):
+        return component
+    declared = component.cls.declare(params)
+    return replace(component, ports=Ports(declared.inputs, declared.outputs), memory=declared.memory)
 
 
 def build(cls: type[Any], params: StageParams, offered: Mapping[str, Any]) -> Part:
-    """Construct a part of a pipeline with what its constructor asks for.
+    """Construct a part of a pipeline with the arguments that its constructor takes.
 
     offered : value for each name of `OFFERED`.
     """
-    wanted = inspect.signature(cls).parameters
-    part: Part = cls(params, **{name: value for name, value in offered.items() if name in wanted})
+    parameters = inspect.signature(cls).parameters
+    part: Part = cls(params, **{name: value for name, value in offered.items() if name in parameters})
     return part
 
 
@@ -99,7 +99,7 @@ def _problems(cls: type[Part], kind: Kind, reserved: Collection[str]) -> Iterato
 
 
 def _broken(cls: type, *problems: str) -> ConfigError:
-    """The error for a class that breaks the contract, with the place of the class."""
+    """The error for a class that violates the contract, with its location."""
     try:
         place = f"{inspect.getsourcefile(cls)}:{inspect.getsourcelines(cls)[1]}"
     except (OSError, TypeError):

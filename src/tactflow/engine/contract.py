@@ -1,19 +1,19 @@
-"""What a stage, a sink and a source are: the classes that a pipeline is built of inherit from these.
+"""Base classes of stages, sinks and sources, the parts of a pipeline.
 
-This file is the reference. Each class attribute below may be set and each method overridden; everything has
-the default that stands here.
+This file is the reference. Subclasses may set each class attribute and override each method below; the
+defaults are given here.
 
-All three kinds are built from their parameters, as in `Invert(Invert.Params())`, and can be called without
-the engine. A constructor that takes more than `params` is given, by name, what it asks for:
+A part is constructed from its parameters, as in `Invert(Invert.Params())`, and can be used without the
+engine. A constructor may also take, by name:
 
     sensor : str              name of the sensor
-    directory : Path          folder of the pipeline file, against which relative paths are read
+    directory : Path          folder of the pipeline file, for relative paths
     skipping : bool           whether the run may skip work
     control : Control         handle on the run, see `tactflow.engine.control`
     calibration : Path | None the sensor's calibration file, if the pipeline names one
 
-For each run, `open()` is called once before the first frame, and `close()` once at the end for every
-part whose `open()` was started, also after an error.
+In each run, `open()` is called once before the first frame, and `close()` once at the end for every part
+whose `open()` was started, even after an error.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WhenLive = Literal["block", "latest"]
 
 
 class StageParams(BaseModel):
-    """Base of all parameters: frozen, unknown keys refused, finite numbers only.
+    """Base class of parameters: frozen, finite numbers only; unknown keys are errors.
 
     >>> from pydantic import Field
     >>> class Params(StageParams):
@@ -45,30 +45,30 @@ class StageParams(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
     def needed_inputs(self) -> Mapping[str, str]:
-        """Optional inputs that these settings cannot do without: port -> the parameter that needs it."""
+        """Optional inputs that are required with these settings: port -> the parameter that requires it."""
         return {}
 
     def unused_inputs(self) -> Collection[str]:
-        """Optional inputs that these settings make no use of: they are not connected, and nothing is computed
-        for them."""
+        """Optional inputs that are unused with these settings, so that they are neither connected nor
+        computed."""
         return ()
 
     def changed(self, **values: Any) -> Self:
-        """A copy with other values; they are not validated again."""
+        """A copy with changed values, which are not validated."""
         return self.model_copy(update=values)
 
 
 class Part:
-    """What stages, sinks and sources have in common."""
+    """Common base of stages, sinks and sources."""
 
     Params: ClassVar[type[StageParams]] = StageParams
-    """The parameters that stand in the pipeline file; an inner class."""
+    """The parameters in the pipeline file; an inner class."""
 
     description: str | None = None
-    """For people: what it reads or where it writes. May be set by the constructor or by `open`."""
+    """What it reads or where it writes, for messages. May be set by the constructor or by `open`."""
 
     params: Any
-    """Its parameters. Every part keeps them, whether or not its constructor calls that of this class."""
+    """Its parameters, even if its constructor does not call `super().__init__`."""
 
     def __new__(cls, params: Any = None, *_: Any, **__: Any) -> Self:
         """Keep the parameters."""
@@ -83,20 +83,20 @@ class Part:
         """
 
     def open(self) -> None:
-        """Take what the run needs: files, sockets, devices.
+        """Open files, sockets, devices.
 
         Raises
         ------
-        StageError from a stage or a sink, SourceError from a source: what is wrong, and what to do.
+        StageError from a stage or a sink, SourceError from a source, with a remedy.
         """
 
     def close(self) -> None:
-        """Give it back. Called once after `open` was started, in the reverse order of opening."""
+        """Release resources. Called once if `open` was started, in the reverse order of opening."""
 
 
 class Declared(NamedTuple):
-    """What `Stage.declare` returns: the ports, in the order in which `process` takes inputs and returns a
-    tuple of outputs, and the memory."""
+    """The result of `Stage.declare`: ports, in the order of the arguments of `process` and of the tuple that
+    it returns, and memory."""
 
     inputs: Sequence[Port]
     outputs: Sequence[Port]
@@ -106,14 +106,14 @@ class Declared(NamedTuple):
 class Stage(Part):
     """Computes outputs from inputs, frame by frame.
 
-    Its ports are read from the annotations of `process`, which every stage defines:
+    Its ports are the annotations of `process`, which every stage defines:
 
-    - an input for each parameter, named like it; `X | None` marks an input that may be absent.
-    - one output named after the type returned, or one for each field of a NamedTuple (a number is a field
-      such as `brightness: float`). `process` may return `Absent("reason")` instead; `None` is
+    - each parameter is an input of its name; `X | None` marks an input that may be absent.
+    - the output is named after the returned type; each field of a NamedTuple is an output (a number is a
+      field such as `brightness: float`). `process` may return `Absent("reason")` instead; `None` means
       `Absent("none")`.
 
-    What a stage returns it must not change later; what it receives it must not change at all.
+    A stage must not modify its inputs, nor its outputs after returning them.
 
     >>> from tactflow.ports import Image
     >>> class Invert(Stage):
@@ -126,34 +126,33 @@ class Stage(Part):
     """
 
     memory: ClassVar[Memory]
-    """Required. "pure": the outputs depend on the inputs alone, so the stage may be left out of a frame that
-    nobody asks for, and results may be reused. "stateful": it sees every accepted frame, in order."""
+    """Required. "pure": outputs depend on the inputs alone, so that the stage may be skipped if its outputs
+    are not requested, and its results reused. "stateful": it processes every accepted frame, in order."""
 
     on_demand: ClassVar[bool] = False
-    """Whether it waits in pipelines for a sink that may be added. That nothing needs it is then not worth a
-    warning, and collecting every port leaves it out."""
+    """Whether it runs only for a sink that may be added. No warning is given if no sink needs it, and
+    collecting all ports leaves it out."""
 
     watches: ClassVar[str | None] = None
-    """A signal of stages below that it wants to know from the frame before, by the name of its port."""
+    """Port of a signal of later stages whose value in the previous frame it needs, see `watched`."""
 
     watched: bool = False
-    """The value of that signal, set by the engine before `process`: of the last stage that has it. True where
-    it is not known: it is absent, or computed in another segment. False before the first frame, and where no
-    stage has it."""
+    """The value of that signal, set by the engine before `process`, from the last stage that has it. True if
+    unknown (absent, or computed in another segment). False before the first frame, and if no stage has it."""
 
     wants_reference: str | None = None
-    """Why a new reference is needed, a short snake_case word, or None. `process` sets it on `self`; the
-    engine clears it and makes the next frame a reference in a new epoch, so that all stages are reset. With
-    all stages in one segment, the default, it is the very next frame; else the source is asked to retake."""
+    """The reason for requesting a new reference, in snake_case, or None. `process` sets it on `self`; the
+    engine clears it and makes a frame the reference of a new epoch, which resets all stages: the next frame
+    if all stages are in one segment, as by default; else the source is asked to retake."""
 
     process: Callable[..., Any]
-    """Computes the outputs of one frame; see above."""
+    """Computes the outputs of a frame, see above."""
 
     @classmethod
     def declare(cls, params: Any) -> Declared | None:  # noqa: ARG003 (for stages whose ports are settings)
-        """Ports and memory, for a stage in which these depend on its parameters.
+        """Ports and memory, if they depend on the parameters.
 
-        None, the default: ports are the annotations of `process`, and `memory` is that of the class.
+        None, the default: the ports are the annotations of `process`, the memory is that of the class.
 
         >>> class Mean(Stage):
         ...     memory = "pure"
@@ -168,15 +167,15 @@ class Stage(Part):
         return None
 
     def reset(self) -> None:
-        """Forget everything: a new reference follows (`Frame.epoch` has grown)."""
+        """Clear the state: a new reference follows, in a new epoch."""
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
     """A file or folder that a sink writes.
 
-    path : where it is. kind : what it is. parameter : the one that names it. refuses_existing : that `open`
-    fails if there is something in it; the sink itself must check.
+    path : its location. kind : its type. parameter : name of the parameter with the path. refuses_existing :
+    whether `open` fails if it has content; the sink itself must check this.
     """
 
     path: Path
@@ -189,8 +188,9 @@ class Output:
 class Publication:
     """An address at which a sink publishes.
 
-    backlog : messages that may wait there for each subscriber. keys : folder that says who may read; None:
-    everybody who can reach the address. linger : time to deliver the last messages at the end, s.
+    backlog : messages queued for each subscriber at most. keys : folder with the keys of admitted
+    subscribers; None admits every client that can reach the address. linger : time to deliver the last
+    messages, s.
     """
 
     address: str
@@ -200,11 +200,11 @@ class Publication:
 
 
 class Sink(Part):
-    """Takes results out of the run.
+    """Writes, publishes or shows results.
 
-    Its inputs are read from the annotations of `write`, which every sink defines and which returns nothing:
-    single ports as for a stage, or a result, which has the frame, the ports that its class names, and the
-    reasons of what is missing; `tick: Tick` is the frame and the ports that are named next to it.
+    Its inputs are the annotations of `write`, which every sink defines: single ports as for a stage, or a
+    result with the frame, the ports that its class names, and the reasons for missing values; `tick: Tick`
+    has the frame and the ports that are named next to it.
 
     >>> from tactflow import Result
     >>> class Print(Sink):
@@ -215,77 +215,76 @@ class Sink(Part):
     """
 
     threaded: ClassVar[bool] = False
-    """Whether it runs in a thread of its own: for one that is slow or may have to wait."""
+    """Whether it runs in its own thread: for a sink that is slow or may block."""
 
     when_live: ClassVar[WhenLive] = "block"
-    """What happens in a live run while it is busy. "block": every frame waits for it, nothing is lost
-    (files). "latest": it gets the newest frame when it is ready again (messages, pictures)."""
+    """Policy in a live run while the sink is busy. "block": frames wait, nothing is lost (files). "latest":
+    it gets the newest frame when it is ready again (messages, pictures)."""
 
     queue_capacity: ClassVar[int] = 4
-    """Frames that may wait in front of its thread."""
+    """Length of the queue in front of its thread, frames."""
 
     observer: ClassVar[bool] = False
-    """Whether it only looks on: it does not count in the latency, and an error disables it instead of ending
-    the run."""
+    """Whether it only shows results: it does not count for the latency, and an error disables it instead of
+    ending the run."""
 
     takes_references: ClassVar[bool] = False
-    """Whether it gets every reference frame even while it wants nothing, and a reference image that is not
-    part of the source (`Frame.seq` -1)."""
+    """Whether it gets every reference frame even if it wants none, and a reference image that is not part of
+    the source (`Frame.seq` -1)."""
 
     def wants(self) -> bool:
-        """Whether the next frame is of interest. What no sink wants is not computed.
+        """Whether it wants the next frame. Values that no sink wants are not computed.
 
-        Asked once a frame by the capturing thread: it must be quick and safe to call from any thread.
+        Called once per frame by the capturing thread: it must be fast and thread-safe.
         """
         return True
 
     def counters(self) -> Mapping[str, int]:
-        """What it has done, for the statistics: name -> number. From any thread."""
+        """Counters for the statistics: name -> number. Thread-safe."""
         return {}
 
     @classmethod
     def outputs(cls, params: Any) -> Sequence[Output]:  # noqa: ARG003 (for sinks that write files)
-        """The files and folders that a sink with these parameters writes; not standard output, no devices.
+        """The files and folders that a sink with these parameters writes, without standard output and
+        devices.
 
-        Two sinks that write the same file are refused, and a run of several sensors watches over them.
+        Two sinks that write the same file are an error. A run of several sensors monitors these files.
         """
         return ()
 
     @classmethod
     def on_restart(cls, params: Any) -> StageParams:
-        """The parameters with which it goes on when its sensor is started again in the same run.
-
-        For a sink that can continue its file. The others keep their parameters.
-        """
-        kept: StageParams = params
-        return kept
+        """The parameters after a restart of its sensor in the same run, for a sink that can continue."""
+        unchanged: StageParams = params
+        return unchanged
 
     @classmethod
     def binds(cls, params: Any) -> Mapping[str, str]:  # noqa: ARG003 (for sinks that listen)
-        """The addresses that it takes for itself alone: parameter -> address; not those of `publishes`.
+        """The addresses that it binds exclusively: parameter -> address; without those of `publishes`.
 
-        Several sensors with one address are refused. An address that picks a free port is left out.
+        Several sensors with the same address are an error. An address that picks a free port is left out.
         """
         return {}
 
     @classmethod
     def publishes(cls, params: Any) -> Publication | None:  # noqa: ARG003 (for sinks that publish)
-        """Where it publishes messages over ZeroMQ that a relay of several sensors can pass on, or None."""
+        """The address at which it publishes over ZeroMQ, for which a relay can forward several sensors; or
+        None."""
         return None
 
     @classmethod
     def among(cls, params: Any, folder: Path, address: str | None) -> StageParams:  # noqa: ARG003
-        """The same parameters for one of several sensors that run side by side.
+        """The parameters in a run of several sensors.
 
-        folder : theirs alone, for what they tell each other; removed at the end. address : where a sink that
-        `publishes` does so instead, if a relay publishes for all of them; else None.
+        folder : shared by the sensors of the run, removed at its end. address : for a sink that `publishes`,
+        the address of the relay that publishes for all sensors; else None.
         """
-        kept: StageParams = params
-        return kept
+        unchanged: StageParams = params
+        return unchanged
 
 
 class Recorder(Sink):
-    """A sink that can be told to record. All of this may be called from any thread."""
+    """A sink whose recording can be started and stopped, from any thread."""
 
     @property
     def recording(self) -> bool:
@@ -293,16 +292,16 @@ class Recorder(Sink):
         return False
 
     def start_recording(self) -> None:
-        """Begin a recording; nothing if it is recording. Raises StageError if that is not possible."""
+        """Start a recording, unless one is running. Raises StageError if that is not possible."""
 
     def stop_recording(self) -> None:
-        """Finish the recording; nothing if there is none."""
+        """Finish the recording, if any."""
 
 
 class Source(Part):
-    """Where frames come from: the first stage of a pipeline.
+    """Provides the frames: the first stage of a pipeline.
 
-    It defines `frames(self) -> Iterator[Frame]`, an iterator that ends where the source ends.
+    It defines `frames(self) -> Iterator[Frame]`, which ends with the source.
 
     >>> import numpy as np
     >>> class Black(Source):
@@ -316,30 +315,30 @@ class Source(Part):
     """
 
     live: bool = False
-    """Whether frames come by themselves, at their own pace: then those that come too fast are dropped."""
+    """Whether frames arrive at their own pace; those that arrive too fast are dropped."""
 
     total: int | None = None
-    """How many frames there will be, where that is known."""
+    """Number of frames, if known."""
 
     pictures: bool = False
-    """Whether frames are pictures in files of their own, which may show moments far apart."""
+    """Whether each frame is a picture file, so that frames may show moments far apart."""
 
     @property
     def missed(self) -> int:
-        """Frames that a newer one overtook before they were taken; each leaves a gap in `Frame.seq`."""
+        """Number of frames that a newer one replaced before they were read: gaps in `Frame.seq`."""
         return 0
 
     @property
     def state(self) -> str:
-        """In words, for people: `running`, `reconnecting since 3 s`."""
+        """State in words: `running`, `reconnecting since 3 s`."""
         return "running"
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame, in order, until the end or `stop`."""
+        """All frames in order, until the end or `stop`."""
         raise NotImplementedError
 
     def stop(self) -> None:
-        """End `frames` soon, also where it waits for the next frame. From any thread."""
+        """End `frames` soon, even while it waits for the next frame. Thread-safe."""
 
     def retake(self) -> None:
-        """Take the next frames as a new reference, in a new epoch. From any thread."""
+        """Take the next frames as a new reference, in a new epoch. Thread-safe."""

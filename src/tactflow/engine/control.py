@@ -1,4 +1,4 @@
-"""What a stage or sink may ask of the run it belongs to."""
+"""Control of a run by its stages and sinks."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from tactflow.engine.graph import Pipeline
 
 
 class Control(Protocol):
-    """A handle on the run, given to a stage or sink whose constructor has a parameter `control`.
+    """A handle on the run, for a stage or sink whose constructor has a parameter `control`.
 
-    All methods may be called from any thread and return at once.
+    All methods are thread-safe and return immediately.
     """
 
     def stop(self, reason: str = "signal") -> None:
-        """End the run soon: no more frames are captured, those under way are finished."""
+        """End the run: capture no more frames, and finish pending ones."""
 
     def pause(self, paused: bool) -> None:
         """Pause or resume capturing. A recording waits; a live source's frames are dropped."""
@@ -27,24 +27,25 @@ class Control(Protocol):
 
     @property
     def hurried(self) -> bool:
-        """Whether the run was asked to end before its source did: slow readers are no longer waited for."""
+        """Whether the run was stopped before the end of its source, so that it no longer waits for slow
+        readers."""
 
     def step(self) -> None:
-        """While paused, let one frame through."""
+        """While paused, process one frame."""
 
     def retake_reference(self) -> None:
         """Take the next frames as a new reference."""
 
     def snapshot(self) -> Mapping[str, Any]:
-        """The run's statistics so far, as in the statistics file."""
+        """The statistics so far, as in the statistics file."""
 
     @property
     def source(self) -> Source | None:
-        """The source stage's instance, once it is built."""
+        """The source, once it is constructed."""
 
     @property
     def pipeline(self) -> Pipeline:
-        """What is run."""
+        """The pipeline of the run."""
 
     def recorder(self) -> Recorder | None:
-        """The first sink that can be told to record, or None."""
+        """The first sink that can record, or None."""

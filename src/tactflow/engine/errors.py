@@ -1,4 +1,4 @@
-"""Every error tactflow raises on purpose.
+"""The exceptions of tactflow.
 
 TactflowError
 +-- ConfigError        the command line or the pipeline file is wrong (exit 2)
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 
 class TactflowError(Exception):
-    """An error with a message for the user: what is wrong, what was expected, what to try.
+    """An error whose message states what is wrong, what was expected and a remedy.
 
     >>> issubclass(ConfigError, TactflowError), SourceError.exit_code
     (True, 4)
@@ -20,9 +20,9 @@ class TactflowError(Exception):
 
 
 class ConfigError(TactflowError):
-    """The command line or the pipeline file is wrong; nothing was started.
+    """An error in the command line or the pipeline file; nothing was started.
 
-    mistakes : each a text for the user; all are reported at once.
+    mistakes : messages, all reported at once.
 
     >>> ConfigError("pipeline.yaml:3:1  colour: unknown key").mistakes
     ('pipeline.yaml:3:1  colour: unknown key',)

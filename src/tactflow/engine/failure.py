@@ -14,7 +14,7 @@ from tactflow.engine.graph import Node
 
 
 def describe_failure(node: Node, frame: Frame, values: Sequence[Any], error: Exception) -> StageError:
-    """An error that says which node failed on which frame, where in its code, and with what inputs.
+    """Describe which node failed in which frame, where in its code, and with which inputs.
 
     values : of its inputs, in the order of its ports.
     """
@@ -22,10 +22,10 @@ def describe_failure(node: Node, frame: Frame, values: Sequence[Any], error: Exc
         return StageError(f"{node.id}, frame {frame.seq} ({node.mark}): {error}")
     engine = os.path.dirname(__file__)
     entries = traceback.extract_tb(error.__traceback__)
-    # The first entries are the engine's own calls; after them comes the node's own code.
+    # The calls of the engine come first, then the code of the node.
     own = next((entry for entry in entries if os.path.dirname(entry.filename) != engine), None)
     if own is None:
-        # The engine refused what it returned.
+        # The engine rejected the returned value.
         code = getattr(node.component.cls, METHODS[node.component.kind]).__code__
         where = f"{code.co_filename}:{code.co_firstlineno}"
     else:

@@ -1,4 +1,4 @@
-"""What travels: frames, ticks, and values that are absent for a reason."""
+"""Frames, ticks, and values that are absent for a reason."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
-"""Pixels of a picture at most; see `tactflow/__init__.py`."""
+"""Maximum number of pixels of a picture; see `tactflow/__init__.py`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +23,11 @@ class Frame:
     seq : index of the frame at the source, from 0; a dropped frame leaves a gap. -1 for a reference image
         that was loaded from a file and is not part of the source.
     t : capture time, s: for a recording, time from its start; for a live source, Unix time.
-    image : (H, W, 3) uint8 BGR, as it came from the source, not writeable.
-    captured : monotonic clock (`time.perf_counter`) when the source handed the frame over, s; where it is 0,
-        the run says when it got the frame.
+    image : (H, W, 3) uint8 BGR, the raw picture, read-only.
+    captured : monotonic clock (`time.perf_counter`) when the source delivered the frame, s; if it is 0, the
+        run sets the time at which it received the frame.
     reference : True if this frame shows the untouched gel that later frames are compared with.
-    epoch : grows by one each time a new reference is taken; stages are reset between epochs.
+    epoch : incremented with each new reference; stages are reset between epochs.
 
     >>> Frame("main", 36, 1.2, np.zeros((600, 800, 3), np.uint8)).seq
     36
@@ -43,13 +43,13 @@ class Frame:
 
 
 NO_PICTURE = np.zeros((0, 0, 3), np.uint8)
-"""The image of a frame whose pixels were not kept or never sent."""
+"""The image of a frame without pixels."""
 NO_PICTURE.flags.writeable = False
 
 
 @dataclass(frozen=True, slots=True)
 class Absent:
-    """Stands in the place of a value that this tick does not have; false in a condition.
+    """Placeholder for a missing value; false in a condition.
 
     reason : a short snake_case word.
 
@@ -64,13 +64,13 @@ class Absent:
 
 
 class Tick(Mapping[str, Any]):
-    """What the pipeline computed for one frame: a mapping from port names to values.
+    """The values computed for one frame: a mapping from port names to values.
 
-    A value that is not there is an `Absent`. Where two stages have an output of the same name, the name alone
-    means the last one; each of them is also called `stage.port`.
+    A missing value is an `Absent`. If two stages have an output of the same name, the name refers to the last
+    one; `stage.port` refers to each of them.
 
-    A subclass that annotates attributes names the ports that it takes; each is a property that is None
-    where the value is absent. A sink whose `write` takes the subclass gets these ports::
+    The annotated attributes of a subclass name ports; each becomes a property that is None if the value is
+    absent. A sink whose `write` takes the subclass gets these ports::
 
         class Brightness(Tick):
             brightness: float | None
@@ -79,9 +79,9 @@ class Tick(Mapping[str, Any]):
     ----------
     frame : the captured frame; its image is the raw one.
     values : port -> value or `Absent`. Not copied.
-    skipped : port -> reason, for values that were not computed in this tick: absent ones, and those that
-        repeat the last frame's (`unchanged`, `at_rest`). "reference" -> reason, where a stage asked for this
-        frame to become a new reference. None: the reasons of the absent values.
+    skipped : port -> reason, for values that were not computed in this tick: absent values, and repeated ones
+        (`unchanged`, `at_rest`). "reference" -> reason, if a stage requested this frame as a new reference.
+        None: the reasons of the absent values.
 
     Examples
     --------
@@ -113,7 +113,7 @@ class Tick(Mapping[str, Any]):
 
     @classmethod
     def port_types(cls) -> dict[str, Any]:
-        """Port that the class names -> its annotation."""
+        """Ports named by the class -> annotation."""
         hints = get_type_hints(cls, include_extras=True)
         return {port: hint for port, hint in hints.items() if not port.startswith("_")}
 
@@ -135,24 +135,25 @@ class Tick(Mapping[str, Any]):
     __hash__ = object.__hash__
 
     def value(self, port: str) -> Any:
-        """The value of a port; None where it is absent or no stage gives it."""
+        """The value of a port; None if it is absent or there is no such port."""
         value = self._values.get(port)
         return None if isinstance(value, Absent) else value
 
     def replace(self, **values: Any) -> Self:
-        """A copy with other values for some ports."""
+        """A copy with changed values of some ports."""
         copied = copy(self)
         copied._values = {**self._values, **values}
         return copied
 
     def __repr__(self) -> str:
-        frame, named = self.frame, vars(type(self)).get("__annotations__") or self
-        there = ", ".join(port for port in named if self.value(port) is not None)
-        return f"<{type(self).__name__} {frame.sensor} {frame.seq} at {frame.t:.3f} s: {there or 'nothing'}>"
+        frame, ports = self.frame, vars(type(self)).get("__annotations__") or self
+        present = ", ".join(port for port in ports if self.value(port) is not None)
+        name = type(self).__name__
+        return f"<{name} {frame.sensor} {frame.seq} at {frame.t:.3f} s: {present or 'nothing'}>"
 
 
 def _property_of(port: str) -> property:
     def value(tick: Tick) -> Any:
         return tick.value(port)
 
-    return property(value, doc=f"The port {port}; None where it is absent.")
+    return property(value, doc=f"The port {port}; None if it is absent.")

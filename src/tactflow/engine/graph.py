@@ -31,11 +31,11 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """A stage or sink class that `use:` can name.
+    """A stage or sink class, as named by `use:`.
 
-    name : what `use:` says. cls, params : the class, and the model of its parameters. ports : read from its
-    annotations. memory : always "pure" for sources and sinks. origin : where it comes from, for people
-    ("built-in", "plug-in NAME VERSION", a file, a module).
+    name : as in `use:`. cls, params : the class, and the model of its parameters. ports : from its
+    annotations. memory : always "pure" for sources and sinks. origin : for messages ("built-in", "plug-in
+    NAME VERSION", a file, a module).
     """
 
     name: str
@@ -62,9 +62,9 @@ class Ref:
 class Gate:
     """Runs a stage only while a signal is True.
 
-    signal : the boolean port. reason : why outputs are absent while it is closed.
-    otherwise : "absent" makes the outputs `Absent(reason)`; "repeat" gives the last outputs again (absent if
-    there are none yet).
+    signal : the boolean port. reason : of the absent outputs while the gate is closed.
+    otherwise : "absent" makes the outputs `Absent(reason)`; "repeat" repeats the last outputs (absent if
+    there are none).
     """
 
     signal: Ref
@@ -100,12 +100,11 @@ class OnError(BaseModel, frozen=True, extra="forbid", strict=True):
 class Node:
     """One stage or sink of a pipeline.
 
-    inputs : every input port of the component -> the output it is connected to, or None for an optional
-    input that nothing provides. mark : the place that set it up. gates : all must be open for it to run.
-    segment : name given in the file, or None. queue : in front of its segment. max_rate : a sink's limit in
-    Hz. marks : key of the node -> the place of its value, for those that the plan may refuse.
-    passive_inputs : names in a sink's result -> outputs that it holds where the tick has computed them for
-    others; they are never a reason to compute anything.
+    inputs : every input port of the component -> connected output, or None for an unconnected optional input.
+    mark : location of its definition. gates : all must be open for it to run. segment : name in the file, or
+    None. queue : in front of its segment. max_rate : limit of a sink, Hz. marks : key of the node -> location
+    of its value, for errors of the plan. passive_inputs : names in a sink's result -> outputs that are
+    included if they were computed for other nodes, but never requested.
     """
 
     id: str
@@ -124,12 +123,12 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """A pipeline that is known to be right. `nodes` is ordered so that every input comes before its user.
+    """A validated pipeline. `nodes` is in topological order: producers come before consumers.
 
-    file, directory : where it was read from. nodes : id -> node. skipping : whether work may be skipped.
-    opencv_threads : None leaves them to OpenCV. runs : sensors of the same file, each with a run of its own.
-    calibration : the sensor's calibration file, or None. warnings : what the user should know before the run.
-    settings : what the file and all overrides come to, as plain values that can be written as YAML again.
+    file, directory : of the pipeline file. nodes : id -> node. skipping : whether work may be skipped.
+    opencv_threads : None leaves the number to OpenCV. runs : number of sensors in the file, each with its own
+    run. calibration : the sensor's calibration file, or None. warnings : for the user, before the run.
+    settings : the file with all overrides, as plain values that can be written as YAML.
     """
 
     file: str

@@ -15,11 +15,11 @@ T = TypeVar("T")
 class Link(Generic[T]):
     """One producer, one consumer, at most `capacity` items.
 
-    when_full : "block" makes the producer wait (nothing is lost); "latest" keeps one slot and overwrites it;
-    "drop_oldest" discards the oldest item. Order is kept, so a consumer never sees an older item after a
-    newer one. End of stream is a flag, not an item: it cannot be dropped.
+    when_full : "block" makes the producer wait (nothing is lost); "latest" has one slot and overwrites it;
+    "drop_oldest" discards the oldest item. The order is preserved. The end of the stream is a flag, not an
+    item, so that it cannot be dropped.
 
-    drops, delivered : items so far.
+    drops, delivered : number of items so far.
     """
 
     def __init__(self, name: str, capacity: int, when_full: FullPolicy) -> None:
@@ -35,7 +35,7 @@ class Link(Generic[T]):
         self._blocked = 0.0
 
     def put(self, item: T, *, keep: bool = False) -> None:
-        """Offer an item. `keep` marks one that no policy may drop, such as a reference frame."""
+        """Add an item. keep : never drop it, as for a reference frame."""
         with self._changed:
             self._offered += 1
             if len(self._items) >= self.capacity and not self._make_room():
@@ -51,7 +51,7 @@ class Link(Generic[T]):
             self._changed.notify_all()
 
     def _make_room(self) -> bool:
-        """Drop the oldest item that may be dropped. The caller holds the lock."""
+        """Drop the oldest item that may be dropped, if the policy allows. The caller holds the lock."""
         if self.when_full == "block":
             return False
         for index, (_, keep) in enumerate(self._items):
@@ -74,19 +74,19 @@ class Link(Generic[T]):
             return item
 
     def discard(self) -> None:
-        """Count the item delivered last as dropped: the consumer could not match it with its other inputs."""
+        """Count the last delivered item as dropped: the consumer could not match it with its other inputs."""
         with self._changed:
             self.delivered -= 1
             self.drops += 1
 
     def close(self) -> None:
-        """End of stream: what is queued is still delivered, what is offered later is dropped."""
+        """End the stream: queued items are still delivered, later ones are dropped."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def abort(self) -> None:
-        """The consumer is gone: drop what is queued and never block the producer again."""
+        """The consumer has ended: drop queued items, and never block the producer again."""
         with self._changed:
             self._closed = self._aborted = True
             self.drops += len(self._items)
@@ -94,7 +94,7 @@ class Link(Generic[T]):
             self._changed.notify_all()
 
     def stats(self) -> dict[str, Any]:
-        """Its entry in the statistics file. After the run, offered == delivered + drops."""
+        """The entry in the statistics file. After the run, offered == delivered + drops."""
         with self._changed:
             return {
                 "policy": self.when_full,

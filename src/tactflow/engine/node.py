@@ -1,4 +1,4 @@
-"""A stage or sink while it runs: its instance, where its inputs come from, what it has done."""
+"""A stage or sink at run time: its instance, inputs and statistics."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from tactflow.engine.rate import RateLimit
 from tactflow.engine.stats import NodeStats, SignalStats
 
 Slots = Mapping[tuple[str, str], int]
-"""(node id, port name) of every output -> its place in a tick's table of values, from 1."""
+"""(node id, port name) of every output -> its slot in a tick's table of values, from 1."""
 
 CONTACT = "contact"
-"""The output that statistics count although it is not boolean: what results report as contact."""
+"""An output that is counted like a signal although it is not boolean."""
 
 UNCONNECTED = 0
-"""The place in that table that always holds None, for optional inputs that are connected to nothing."""
+"""The slot that always holds None, for unconnected optional inputs."""
 
 _NONE = Absent("none")
 _NO_DEMAND = Absent("no_demand")
 
 
 class TickState:
-    """One frame's journey: a table of values that segments fill in, each its own part.
+    """The values of one frame, which each segment fills in for its own nodes.
 
     index : number of the tick in this run. demand : ids of the sinks that want it. values : one per slot;
-    `Absent` where there is none. reasons : slot -> why its value was not computed in this tick, for values
-    that are absent or repeated. renewed : why a stage had this frame made a reference; None if none did.
+    `Absent` if missing. reasons : slot -> why its value was not computed in this tick, for absent and
+    repeated values. renewed : the reason if a stage requested this frame as a reference, else None.
     """
 
     __slots__ = ("demand", "frame", "index", "reasons", "renewed", "values")
@@ -49,19 +49,19 @@ class TickState:
 
 
 class RunningNode:
-    """A stage or sink at run time. Used by the one thread of its segment.
+    """A stage or sink at run time, used by the thread of its segment.
 
-    skipping : whether gates may close and results be reused. check : whether values are checked against the
+    skipping : whether gates may close and results be reused. check : whether to check values against their
     port types.
 
     Attributes
     ----------
     instance : of the class; `sink` or `stage` is the same object, the other is None.
-    slots : where its outputs go. gates : each with the slot of its signal.
-    signals : output port -> (slot, how often it was true); of a `contact`, how often there was one.
-    makers, signal_makers : nodes of the same segment that make its inputs, and the signals of its gates.
-    pulled : index of the last tick in which it was evaluated. disabled : it failed and is not called again.
-    last : the outputs of its last run, for gates that repeat them and for inputs that come again.
+    slots : of its outputs. gates : each with the slot of its signal.
+    signals : output port -> (slot, counts of true values); for `contact`, counts of present values.
+    makers, signal_makers : nodes of the same segment that produce its inputs and the signals of its gates.
+    pulled : index of the last tick in which it was evaluated. disabled : whether it failed and is not called
+    any more. last : the outputs of its last run, for repeating gates and repeated inputs.
     """
 
     def __init__(self, node: Node, instance: Part, slots: Slots, *, skipping: bool, check: bool) -> None:
@@ -103,18 +103,18 @@ class RunningNode:
         self._last_inputs: Sequence[Any] | None = None
 
     def reset(self) -> None:
-        """A new reference follows: forget what was learned from the last one."""
+        """Clear the state before a new reference."""
         self.forget()
         if self.stage is not None:
             self.stage.wants_reference = None
             self.stage.reset()
 
     def forget(self) -> None:
-        """Repeat nothing from before."""
+        """Discard the last outputs, so that they are not repeated."""
         self.last = self._last_inputs = None
 
     def closed_gate(self, table: Sequence[Any]) -> tuple[Gate, int] | None:
-        """The gate that keeps it from running in this tick, with the slot of its signal, or None.
+        """The closed gate that decides about the outputs in this tick, with the slot of its signal, or None.
 
         A gate that makes the outputs absent takes precedence over one that repeats them.
         """
@@ -127,7 +127,7 @@ class RunningNode:
         return closed
 
     def inputs(self, tick: TickState) -> Sequence[Any] | Absent:
-        """Its inputs, None for optional ones that are absent; the `Absent` of a required one."""
+        """Its inputs, None for absent optional ones; or the `Absent` of a required input."""
         table = tick.values
         values = [table[slot] for slot in self._input_slots]
         if tick.reasons:
@@ -138,12 +138,12 @@ class RunningNode:
                     values[number] = None
         return values
 
-    def had(self, inputs: Sequence[Any]) -> bool:
-        """Whether it would give its last outputs again: it is pure, and had these very inputs then."""
+    def is_unchanged(self, inputs: Sequence[Any]) -> bool:
+        """Whether its last outputs are still valid: it is pure, and had the same inputs."""
         return self._last_inputs is not None and all(map(is_, inputs, self._last_inputs))
 
     def __call__(self, inputs: Sequence[Any], tick: TickState) -> Sequence[Any]:
-        """Run it; one value per output port, `Absent` where there is none."""
+        """Run it. Returns one value per output port, `Absent` if missing."""
         arguments = [read_only(value) for value in inputs] if self._check else inputs
         if (result := self._ports.result) is not None:
             end = result.place + result.count
@@ -157,7 +157,7 @@ class RunningNode:
         return outputs
 
     def _tick(self, kind: type[Tick], tick: TickState) -> Tick:
-        """What a sink gets of a tick: its inputs, and why some were not computed."""
+        """The result for a sink: its inputs, and the reasons for those that were not computed."""
         table, reasons = tick.values, tick.reasons
         values = {name: table[slot] for name, slot in self._shown}
         skipped = {name: reasons[slot] for name, slot in self._shown if slot in reasons}
@@ -180,20 +180,16 @@ class RunningNode:
             self._read_signals(tick)
 
     def _inherited_reason(self, tick: TickState) -> str | None:
-        """Why its outputs are repeated ones: the reason of its inputs, where all that are connected have one.
+        """Why its outputs are repeated: the reason of the first input, if all connected inputs have one.
 
-        This goes by the data alone, not by whether the node had run before, so that an observer changes no
-        reason either.
+        This depends on the data alone, not on earlier runs of the node, so that an observer changes no
+        reasons either.
         """
-        first, reasons = None, tick.reasons
-        for slot in self._connected_slots:
-            if slot not in reasons:
-                return None
-            first = first or reasons[slot]
-        return first
+        reasons = [tick.reasons.get(slot) for slot in self._connected_slots]
+        return reasons[0] if reasons and all(reasons) else None
 
     def skip(self, tick: TickState, absent: Absent, *, repeat: bool = False) -> None:
-        """Enter what its outputs are where it does not run: absent, or with `repeat` its last ones again."""
+        """Enter its outputs without running it: `absent`, or with `repeat` the last ones."""
         self.stats.skips[absent.reason] += 1
         last = self.last if repeat else None
         for number, slot in enumerate(self.slots):
@@ -205,15 +201,15 @@ class RunningNode:
     def _read_signals(self, tick: TickState) -> None:
         for port, (slot, signal) in self.signals.items():
             value = tick.values[slot]
-            is_there = not isinstance(value, Absent)
-            if is_there and port != CONTACT:
-                # NumPy's True is not Python's, which gates look for.
-                tick.values[slot] = is_there = bool(value)
-            signal.add(is_there)
+            is_true = not isinstance(value, Absent)
+            if is_true and port != CONTACT:
+                # Gates compare with Python's True, which NumPy's is not.
+                tick.values[slot] = is_true = bool(value)
+            signal.add(is_true)
 
 
 def _outputs(result: Any, count: int) -> Sequence[Any]:
-    """What a node returned, as one value per output port; None stands for absent."""
+    """The return value of a node as one value per output port; None stands for absent."""
     values: list[Any]
     if isinstance(result, tuple):
         values = [_NONE if value is None else value for value in result]

@@ -1,11 +1,11 @@
-"""From a pipeline to segments and links.
+"""Division of a pipeline into segments, connected by links.
 
-Stages of one segment call each other directly in one thread; between segments stands a `Link`. By default:
-capture | compute | each threaded sink. Any node may be given a segment of its own in the pipeline file.
+The stages of a segment call each other directly, in one thread; segments are connected by a `Link`. By
+default: capture | compute | each threaded sink. The pipeline file may assign nodes to other segments.
 
-Every link hands over the whole tick, so a segment needs links only from the segments directly before it
-(the transitive reduction of the segment graph): whatever lies further up is in the tick already. That
-also leaves a single place where a live source drops frames: in front of the first segment after it.
+Every link passes the whole tick, so that a segment needs links only from its direct predecessors (the
+transitive reduction of the segment graph). So a live source drops frames in a single place, before the first
+segment after it.
 """
 
 from __future__ import annotations
@@ -19,17 +19,14 @@ from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline, Queue
 CAPTURE = "capture"
 COMPUTE = "compute"
 Demand = frozenset[str] | None
-"""Ids of the sinks that need a node; None where it is needed in every tick."""
+"""Ids of the sinks that need a node; None if every tick needs it."""
 BLOCK_CAPACITY = 4
-"""Frames that may wait in front of a segment of stages: enough to even out uneven ones. Chosen by hand."""
+"""Length of the queue before a segment of stages, frames; evens out varying durations. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkPlan:
-    """A link to be made: from one segment, the producer, to another, the consumer.
-
-    capacity : ticks that it holds. when_full : what happens to one more.
-    """
+    """A link between two segments. capacity : number of ticks. when_full : policy."""
 
     producer: str
     consumer: str
@@ -38,16 +35,16 @@ class LinkPlan:
 
     @property
     def name(self) -> str:
-        """The link's id in statistics and pictures."""
+        """The id in statistics and graphs."""
         return f"{self.producer}->{self.consumer}"
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How a pipeline is run.
+    """How to run a pipeline.
 
-    segments : name -> node ids in order of evaluation; the source's segment comes first.
-    links : between segments. pruned : stages that are not built because no sink needs them.
+    segments : name -> node ids in order of evaluation; the source's segment is the first.
+    links : between segments. pruned : stages that are not constructed, because no sink needs them.
     """
 
     pipeline: Pipeline
@@ -56,63 +53,62 @@ class Plan:
     pruned: Sequence[Node]
 
     def segment_of(self, node_id: str) -> str:
-        """The segment that runs a node."""
+        """The segment of a node."""
         return next(name for name, nodes in self.segments.items() if node_id in nodes)
 
     def roots(self, segment: str) -> dict[str, Demand]:
-        """What a segment evaluates of itself: its sinks, stages that remember, and what other segments take.
+        """The roots of a segment: sinks, nodes that need every tick, and inputs of other segments.
 
-        Gates of other segments are assumed to be open: too much may be computed, never too little.
+        Gates in other segments are assumed to be open: too much may be computed, never too little.
         """
         demand: dict[str, Demand] = dict.fromkeys(self.pipeline.nodes, frozenset())
-        found: dict[str, Demand] = {}
-        # Every input comes before its user, so that going backwards all users of a node are known.
+        roots: dict[str, Demand] = {}
+        # In reverse topological order, all users of a node come before it.
         for node in reversed(list(self.pipeline.nodes.values())):
             if node in self.pruned:
                 continue
             own: Demand = frozenset({node.id} if node.component.kind == "sink" else ())
             own = None if remembers(node, self.pipeline) else own
-            demand[node.id] = need = _both(demand[node.id], own)
+            demand[node.id] = need = _union(demand[node.id], own)
             is_inside = node.id in self.segments[segment]
             if is_inside and own != frozenset():
-                found[node.id] = need
+                roots[node.id] = need
             for maker in dependencies(node):
-                demand[maker] = _both(demand[maker], need)
+                demand[maker] = _union(demand[maker], need)
                 if maker in self.segments[segment] and not is_inside:
-                    found[maker] = _both(found.get(maker, frozenset()), need)
-        return {id_: found[id_] for id_ in self.segments[segment] if id_ in found}
+                    roots[maker] = _union(roots.get(maker, frozenset()), need)
+        return {id_: roots[id_] for id_ in self.segments[segment] if id_ in roots}
 
     @property
     def idle(self) -> list[Node]:
-        """Stages that no sink needs, without those that wait for a sink: perhaps a mistake."""
+        """Stages that no sink needs, perhaps by mistake; without those that run only for a sink."""
         return [node for node in self.pruned if not node.component.cls.on_demand]
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know before the run."""
+        """Warnings for the user, before the run."""
         return [f"{node.mark}  {node.id}: not run, because no sink needs its output" for node in self.idle]
 
 
 def dependencies(node: Node) -> set[str]:
-    """Ids of the nodes whose outputs a node reads, as inputs or as gates."""
+    """Ids of the nodes whose outputs a node uses, as inputs or as gates."""
     return {ref.node for ref in node.inputs.values() if ref} | {gate.signal.node for gate in node.gates}
 
 
 def remembers(node: Node, pipeline: Pipeline) -> bool:
-    """Whether a node must see every tick: it has memory, or a gate that repeats its last outputs."""
+    """Whether a node needs every tick: it is stateful, or has a gate that repeats its last outputs."""
     repeats = pipeline.skipping and any(gate.otherwise == "repeat" for gate in node.gates)
     return node.component.memory == "stateful" or repeats
 
 
-def _both(first: Demand, second: Demand) -> Demand:
+def _union(first: Demand, second: Demand) -> Demand:
     return None if first is None or second is None else first | second
 
 
 def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
-    """Prune what no sink needs, cut the rest into segments, and choose the links between them.
+    """Prune unneeded stages, divide the rest into segments, and choose the links between them.
 
-    pipeline : without `plan_problems`. live : the source does not wait; its frames are dropped rather than
-    delayed.
+    pipeline : without `plan_problems`. live : whether frames are dropped rather than delayed.
     """
     pruned, members, before = _cut(pipeline)
     links: list[LinkPlan] = []
@@ -126,16 +122,16 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
 
 
 def plan_problems(pipeline: Pipeline) -> list[tuple[Mark, str]]:
-    """What keeps a pipeline from being planned: every mistake, at the place that is to be changed."""
+    """The errors that prevent a plan, each with the location of the cause."""
     _, members, before = _cut(pipeline)
     return [*_circles(pipeline, before, members), *_idle_queues(pipeline, members)]
 
 
 def _cut(pipeline: Pipeline) -> tuple[list[Node], dict[str, list[str]], dict[str, set[str]]]:
-    """Pruned nodes; segment -> its nodes, beginning with the source's; segment -> those of its inputs."""
+    """Pruned nodes; segment -> its nodes, the source's first; segment -> segments of its inputs."""
     source = pipeline.source
     needed = {source.id, *(sink.id for sink in pipeline.sinks)}
-    # Every input comes before its user.
+    # In reverse topological order.
     for node in reversed(list(pipeline.nodes.values())):
         if node.id in needed:
             needed |= dependencies(node)
@@ -154,12 +150,12 @@ def _cut(pipeline: Pipeline) -> tuple[list[Node], dict[str, list[str]], dict[str
 
 
 def _segment_for(node: Node, inputs: set[str], first: str, before: Mapping[str, set[str]]) -> str:
-    """The segment of a node for which the file names none.
+    """The segment of a node without one in the file.
 
-    It is the segment that its inputs reach last, so that two segments never wait for each other; where its
-    inputs come from segments side by side, one of its own.
+    It is the last segment of its inputs, so that two segments never wait for each other; if its inputs come
+    from parallel segments, one of its own.
 
-    inputs : segments that they are in. first : that of the source.
+    inputs : segments of its inputs. first : segment of the source.
     """
     if issubclass(node.component.cls, Sink) and node.component.cls.threaded:
         return node.id
@@ -183,7 +179,7 @@ def _ancestors(name: str, before: Mapping[str, Iterable[str]]) -> set[str]:
 def _circles(
     pipeline: Pipeline, before: Mapping[str, set[str]], members: Mapping[str, list[str]]
 ) -> Iterator[tuple[Mark, str]]:
-    """Each set of segments that wait for each other, once, at a node that was put into one of them."""
+    """Each cycle of segments, reported at a node that the file assigns to one of them."""
     reported: set[str] = set()
     for name in before:
         if name in reported or name not in _ancestors(name, before):
@@ -217,7 +213,7 @@ def _link(
 
 
 def _idle_queues(pipeline: Pipeline, members: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mark, str]]:
-    """Queues with which the plan can do nothing."""
+    """Queue settings that have no effect."""
     for ids in members.values():
         queued = [pipeline.nodes[id_] for id_ in ids if pipeline.nodes[id_].queue != Queue()]
         for node in queued:

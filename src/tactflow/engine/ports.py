@@ -1,8 +1,8 @@
-"""Ports: what a stage or sink takes and gives, read from the annotations of its method.
+"""Ports: inputs and outputs of a stage or sink, read from the annotations of its method.
 
-Each parameter of `process` or `write` is an input port; one annotated with a `Tick` stands for the ports that
-its class names. The return annotation of `process` gives the output ports: one named after its type, or one
-per field of a NamedTuple.
+Each parameter of `process` or `write` is an input; one annotated with a `Tick` stands for the ports that its
+class names. The return annotation of `process` gives the outputs: one named after its type, or one per field
+of a NamedTuple.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from tactflow.engine.frame import Absent, Frame, Tick
 class ArrayPort:
     """Type of a port that carries an array; used as `Annotated[NDArray[...], ArrayPort(...)]`.
 
-    name : default name of the port. shape : one entry per axis, an int (exact) or a str (a dimension with
-    that name). dtype : numpy dtype name. unit : what one unit of the value means.
+    name : default name of the port. shape : one entry per axis, an int (exact) or a str (a named dimension).
+    dtype : numpy dtype name. unit : of the values.
     """
 
     name: str
@@ -38,9 +38,9 @@ class ArrayPort:
 class SignalPort:
     """Type of a boolean port that can gate stages.
 
-    closed : the reason given while it is False. otherwise : what a gated stage's outputs are then, unless its
-    `when:` says something else: "absent", or "repeat" for the last ones again. closed None: both are those of
-    the signal that the stage itself takes, for a stage that only holds another's signal.
+    closed : the reason while it is False. otherwise : outputs of a gated stage then, unless its `when:` says
+    otherwise: "absent", or "repeat" for the last ones. closed None: both are taken from the input signal, for
+    a stage that only holds a signal.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class ResultParameter:
-    """The parameter of a sink that takes a result: `count` of the inputs, from `place` on, as a `kind`."""
+    """A parameter of a sink that takes a result: `count` of the inputs, from index `place`, as a `kind`."""
 
     place: int
     count: int
@@ -73,7 +73,7 @@ class ResultParameter:
 class Ports:
     """The ports of a stage or sink class: inputs in the order of the parameters, and outputs.
 
-    result : the parameter that stands for several inputs; None where there is none.
+    result : the parameter that stands for several inputs, or None.
     """
 
     inputs: Sequence[Port]
@@ -89,7 +89,7 @@ def read_ports(cls: type, method: str) -> Ports:
 
     Raises
     ------
-    ConfigError : the annotations do not say what the ports are; the message starts with `file:line`.
+    ConfigError : the annotations do not define ports; the message starts with `file:line`.
     """
     function = inspect.unwrap(getattr(cls, method))
     try:
@@ -101,15 +101,15 @@ def read_ports(cls: type, method: str) -> Ports:
 
 
 def ports_of(kind: type[Tick]) -> list[Port]:
-    """The input ports that the annotations of a subclass of Tick name."""
+    """The input ports named by the annotations of a subclass of Tick."""
     return [_input(name, annotation) for name, annotation in kind.port_types().items()]
 
 
 def mismatch(output: Port, input_: Port) -> str | None:
-    """Say why a value of `output` cannot be given to `input_`, or None if it can.
+    """Why `output` cannot be connected to `input_`, or None if it can.
 
-    Classes must be the same or a subclass. Arrays must agree in rank, in each dimension (an exact size fits a
-    named one), in dtype and in unit. A signal fits any signal and a plain bool.
+    A class must be the same or a subclass. Arrays must agree in rank, in each dimension (an exact size
+    matches a named one), in dtype and in unit. A signal matches any signal and bool.
     """
     offered, wanted = port_type(output.annotation), port_type(input_.annotation)
     if wanted is Any or wanted is object:
@@ -162,7 +162,7 @@ def _ports(function: Callable[..., Any], method: str) -> Ports:
         elif method != "write" or result is not None:
             raise _PortError("only a sink may take a result, once; a stage can take the port frame: Frame")
         else:
-            # A port that a parameter names too is asked for by that parameter.
+            # A port that is also a parameter of its own is passed there.
             ports = [port for port in ports_of(annotation) if port.name not in named]
             result = ResultParameter(len(inputs), len(ports), annotation)
             inputs += ports
@@ -241,7 +241,7 @@ def _outputs(annotation: Any) -> tuple[Port, ...]:
 
 
 def _single_type(annotation: Any, what: str) -> tuple[Any, bool]:
-    """The one type of `X | Absent | None`, and whether the value may be absent."""
+    """X of `X | Absent | None`, and whether the value may be absent."""
     members = [member for member in _members(annotation) if member not in (Absent, type(None))]
     if len(members) != 1:
         raise _PortError(
@@ -265,7 +265,7 @@ def _array_misfit(offered: ArrayPort, wanted: ArrayPort) -> str | None:
     if len(offered.shape) != len(wanted.shape):
         return f"{len(offered.shape)} axes where {len(wanted.shape)} are wanted"
     for have, want in zip(offered.shape, wanted.shape, strict=True):
-        # An exact size is a case of a named one, but a named size need not be the exact one.
+        # An exact size matches a named one, but not conversely.
         if have != want and not (isinstance(want, str) and isinstance(have, int)):
             return f"axis of size {have} where {want} is wanted"
     if offered.dtype != wanted.dtype:

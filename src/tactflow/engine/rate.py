@@ -1,16 +1,13 @@
-"""Thinning a stream to a rate, by the frames' own times."""
+"""Limiting the rate of a stream, by the times of its frames."""
 
 from __future__ import annotations
 
 SLACK = 5e-7
-"""Times of a recording are multiples of 1 / fps in floating point; so much, s, they may be off."""
+"""Tolerance for the rounding of times in a recording, which are multiples of 1 / fps, s."""
 
 
 class RateLimit:
-    """Says which frames of a stream are taken, at most `rate` a second.
-
-    rate : Hz, > 0; None takes every frame.
-    """
+    """Selects frames of a stream, at most `rate` per second. rate : Hz, > 0; None selects all."""
 
     __slots__ = ("_due", "_rate")
 
@@ -19,7 +16,7 @@ class RateLimit:
         self._due = float("-inf")
 
     def due(self, t: float) -> bool:
-        """Whether a frame captured at t, s, is taken; asked once a frame, in the order of their times."""
+        """Whether to take a frame captured at t, s. Call once per frame, in the order of their times."""
         rate = self._rate
         if rate is None:
             return True

@@ -1,4 +1,4 @@
-"""Runs a planned pipeline: one thread a segment, one tick a frame."""
+"""Runs a pipeline: one thread per segment, one tick per frame."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from tactflow.system.signals import INTERRUPTED
 logger = logging.getLogger("tactflow")
 
 CLOSE_SECONDS = 10.0
-"""Time without progress, s, after which a run that was stopped names the stage that hangs. Chosen by hand:
-the slowest stage takes a second."""
+"""Time without progress after which a stopped run reports the hanging stage, s. Chosen by hand: the slowest
+stage takes a second."""
 LEAVE_SECONDS = 1.0
-"""Time for the threads to leave the code they are in when a run ends at once, s. Chosen by hand: the slowest
-stage takes as long."""
+"""Time for threads to end after an interrupt, s. Chosen by hand: the slowest stage takes as long."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """How a run ended.
+    """The outcome of a run.
 
-    error : None, or why it stopped; failure : the same as an exception. stats : as in the statistics file.
+    error : the error that ended it, or None; failure : the same as an exception. stats : as in the statistics
+    file.
     """
 
     exit_code: int
@@ -48,7 +48,7 @@ class RunResult:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """A glance at a run that is under way."""
+    """Progress of a run."""
 
     frames: int
     dropped: int
@@ -56,10 +56,10 @@ class Progress:
 
 
 class Runner:
-    """One run of a pipeline; what sinks may ask of it is documented in `tactflow.engine.control.Control`.
+    """One run of a pipeline. Its interface for sinks is documented in `tactflow.engine.control.Control`.
 
-    pipeline : validated. max_frames : stop after so many captured frames. check : check arrays against
-    their port types, and hand inputs over read-only, in every tick.
+    pipeline : validated. max_frames : stop after this number of captured frames. check : check values against
+    their port types, and pass read-only inputs.
 
     Raises
     ------
@@ -112,14 +112,15 @@ class Runner:
     ) -> RunResult:
         """Open everything, run to the end of the source, close everything.
 
-        on_progress : called in this thread about every `interval_s` seconds. Never raises a TactflowError;
-        it is in the result. A KeyboardInterrupt raised in this thread ends the run at once; one while the
-        run is being closed is raised after that.
+        Returns errors in the result instead of raising them. A KeyboardInterrupt in this thread ends the run
+        immediately; if the run is being closed, it is raised afterwards.
+
+        on_progress : called in this thread about every `interval_s` seconds.
         """
         self._began = time.perf_counter()
         try:
             self._open()
-            # Opening may take long: a camera that wakes up.
+            # Opening a camera may take long.
             self._began = time.perf_counter()
             if not self._stopping.is_set():
                 self._start()
@@ -133,7 +134,7 @@ class Runner:
                 link.abort()
             until = time.perf_counter() + LEAVE_SECONDS
             for thread in self._threads.values():
-                # An interrupt may have come before it was started.
+                # The interrupt may have come before the start of the thread.
                 if thread.is_alive():
                     thread.join(max(0.0, until - time.perf_counter()))
         finally:
@@ -156,7 +157,7 @@ class Runner:
             self._source.stop()
 
     def fail(self, error: TactflowError, cause: BaseException | None = None) -> None:
-        """Record the error that ends the run (the first one counts) and stop capturing."""
+        """Stop the run because of an error; the first one is reported."""
         if cause is not None:
             error.__cause__ = cause
             logger.debug("%s", "".join(traceback.format_exception(cause)))
@@ -185,7 +186,7 @@ class Runner:
         return self._hurried
 
     def step(self) -> None:
-        # Steps that wait are forgotten when it goes on.
+        # Pending steps are discarded on resuming.
         with self._turn:
             self._steps += self._paused
             self._turn.notify_all()
@@ -195,7 +196,7 @@ class Runner:
         return self._source
 
     def calls(self) -> dict[str, int]:
-        """The number of the call of a stage that each segment is in; without those that wait."""
+        """Segment -> number of its current call of a stage; without waiting segments."""
         return {name: segment.calls for name, segment in list(self._segments.items()) if segment.at_work}
 
     def recorder(self) -> Recorder | None:
@@ -203,14 +204,14 @@ class Runner:
         return next((sink for sink in sinks if isinstance(sink, Recorder)), None)
 
     def progress(self) -> Progress:
-        """How far the run is."""
+        """The progress so far."""
         dropped = sum(self._dropped())
         return Progress(self._frames, dropped, time.perf_counter() - self._began)
 
     # -- opening and closing ------------------------------------------------------------------------------
 
     def _open(self) -> None:
-        """Build and open the source first, then stages, then sinks: a missing recording truncates no file."""
+        """Open the source first, then stages, then sinks, so that a missing recording truncates no file."""
         pipeline = self.pipeline
         source = self._build(pipeline.source, SourceError)
         assert isinstance(source, Source)
@@ -219,7 +220,7 @@ class Runner:
         pruned = {node.id for node in self.plan.pruned}
         for node in pipeline.nodes.values():
             if self._stopping.is_set():
-                # Nothing that is not open yet is opened now: no file is emptied for a run without a frame.
+                # Open nothing more, so that a run without frames empties no file.
                 return
             if node.component.kind == "source" or node.id in pruned:
                 continue
@@ -229,7 +230,7 @@ class Runner:
             )
 
     def _build(self, node: Node, kind: type[TactflowError]) -> Part:
-        """Construct a node's class with what its constructor asks for, and open it."""
+        """Construct and open the part of a node."""
         pipeline = self.pipeline
         values = (pipeline.sensor, pipeline.directory, pipeline.skipping, self, pipeline.calibration)
         try:
@@ -267,7 +268,7 @@ class Runner:
             thread.start()
 
     def _lead_new_references(self) -> None:
-        """Let the segment that sees each frame before all other stages do make frames references."""
+        """Let the first segment with stages turn frames into references on request."""
         first = self._segments[self._source_segment]
         if first.only_sinks:
             consumers = [link.consumer for link in self.plan.links if link.producer == first.name]
@@ -283,13 +284,13 @@ class Runner:
         return self._source is not None and self._source.live
 
     def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
-        """Wait for the threads: as long as it takes until the source has ended, not for ever after a stop."""
+        """Wait for the threads: without limit for the end of the source, with a limit after a stop."""
         done, since = -1, time.perf_counter()
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
             self._threads[alive[0]].join(interval_s)
             if on_progress is not None:
                 on_progress(self.progress())
-            # Draining a long queue is not hanging.
+            # Draining a long queue counts as progress.
             before, done = done, sum(s.calls for s in self._segments.values())
             done += sum(link.delivered for link in self._links)
             now = time.perf_counter()
@@ -305,14 +306,14 @@ class Runner:
                 )
 
     def _close(self) -> None:
-        """Close whatever was opened, last opened first; every one gets its turn.
+        """Close all opened parts in reverse order, even if some fail.
 
-        What a thread still is in is left as it is: to close a video while it is read, or a file while it is
-        written, may wait for ever.
+        A part that a thread still uses is not closed: closing a video while it is read, or a file while it is
+        written, may block forever.
         """
         in_use = {self._segments[name].current for name, t in self._threads.items() if t.is_alive()}
         opened, self._opened = self._opened, []
-        # An interrupt ends what one of them does, and is raised when the others are closed.
+        # An interrupt during one of them is raised after closing the others.
         with ExitStack() as stack:
             for node_id, instance in opened:
                 if node_id not in in_use:
@@ -375,7 +376,7 @@ class Runner:
                 self.stop("max_frames")
 
     def _may_go_on(self) -> bool:
-        """While paused: whether the frame just captured is to be handled; waits for that, or lets it go."""
+        """While paused, whether to process the captured frame; a recording waits for that."""
         with self._turn:
             if not self._is_live:
                 self._turn.wait_for(lambda: not self._paused or self._steps or self._stopping.is_set())
@@ -386,14 +387,14 @@ class Runner:
     # -- statistics ---------------------------------------------------------------------------------------
 
     def _dropped(self) -> tuple[int, int]:
-        """Frames dropped in front of the first segment of stages, and before they could be taken."""
+        """Frames dropped before the first segment of stages, and replaced within the source."""
         source = self._segments.get(self._source_segment)
         links = [link for link, only_sinks in source.outputs if only_sinks is None] if source else []
         missed = 0 if self._source is None else self._source.missed
         return max((link.drops for link in links), default=0), missed
 
     def snapshot(self) -> dict[str, Any]:
-        # A sink may ask while others are still being opened.
+        # A sink may call this while others are still being opened.
         nodes = list(self.nodes.values())
         dropped, missed = self._dropped()
         stages = {node.id: node.stats.entry() for node in nodes if node.sink is None}
@@ -421,7 +422,7 @@ class Runner:
 def _wants(node: RunningNode, frame: Frame) -> bool:
     """Whether a node is a sink that wants a frame.
 
-    One that takes references gets all of them; no other gets a reference image from outside the source.
+    A sink that takes references gets all of them; others get no reference image from outside the source.
     """
     sink = node.sink
     if sink is None or node.disabled:

@@ -1,9 +1,8 @@
-"""What runs in one thread: the nodes of a segment, evaluated for one tick after another.
+"""The nodes of a segment, evaluated in one thread for one tick after another.
 
-A value is computed only when somebody asks for it: a sink that wants the frame, or a stage that must see
-every frame because it remembers. These are the roots; from each, what it needs is pulled, and nothing twice
-in a tick. The makers of a node's gate signals are pulled first, its inputs only if the gates are open, so
-that a closed gate runs none of the work before it.
+Values are computed on demand. The roots are sinks that want the frame and stateful stages, which must process
+every frame; evaluating a root pulls what it needs, each node once per tick. The signals of a node's gates are
+pulled first, its inputs only if the gates are open, so that a closed gate spares all work before it.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ _ERROR = Absent("error")
 
 
 class NodeFailedError(Exception):
-    """Ends a segment because one of its nodes failed for good."""
+    """Ends a segment after a fatal error of one of its nodes."""
 
 
 class NewReferences:
-    """Makes frames references, on their way into the first segment of stages.
+    """Turns requested frames into references, before the first segment of stages.
 
     slot : of the source's frames. sinks : ids of those that take every reference.
     """
@@ -48,11 +47,11 @@ class NewReferences:
         self._epoch = 0
 
     def ask(self, reason: str) -> None:
-        """Make the next frame a reference."""
+        """Request the next frame as a reference."""
         self._reason = reason
 
     def enter(self, tick: TickState) -> None:
-        """Give a tick's frame its epoch, and make it a reference if one was asked for."""
+        """Set the epoch of a tick's frame, and turn it into a reference if requested."""
         frame, reason = tick.frame, self._reason
         if reason is not None and frame.epoch == self._epoch:
             self._taken += 1
@@ -68,14 +67,14 @@ class NewReferences:
 class Segment:
     """Evaluates the nodes of one segment for a tick.
 
-    name, run : of the plan, and whose segment it is.
+    name : in the plan. run : that it belongs to.
 
     Attributes
     ----------
-    inputs, outputs : links; an output with the ids of the sinks that it leads to, or None where it leads to
-    stages too. nodes : in order of evaluation. current : id of the node that runs just now. calls : how many
-    calls of nodes were begun. epoch : of the last tick; a new one makes all nodes forget. references : makes
-    frames references that its stages ask for; None where other stages may have seen those frames already.
+    inputs, outputs : links; an output with the ids of the sinks that it leads to, or None if it also leads to
+    stages. nodes : in order of evaluation. current : id of the running node. calls : number of calls of nodes
+    so far. epoch : of the last tick; a new one resets all nodes. references : turns frames into references on
+    request of its stages; None if other stages may have processed those frames already.
     """
 
     def __init__(self, name: str, run: Runner) -> None:
@@ -83,13 +82,13 @@ class Segment:
         self.run = run
         ids = run.plan.segments[name]
         self.nodes = [run.nodes[id_] for id_ in ids if id_ in run.nodes]
-        mine = {node.id: node for node in self.nodes}
+        by_id = {node.id: node for node in self.nodes}
         for node in self.nodes:
-            node.makers = _of(mine, [ref.node for ref in node.node.inputs.values() if ref])
+            node.makers = _existing(by_id, [ref.node for ref in node.node.inputs.values() if ref])
             if node.gates:
-                node.signal_makers = _of(mine, [gate.signal.node for gate in node.node.gates])
+                node.signal_makers = _existing(by_id, [gate.signal.node for gate in node.node.gates])
         roots = run.plan.roots(name)
-        self._roots = [(mine[id_], sinks) for id_, sinks in roots.items() if id_ in mine]
+        self._roots = [(by_id[id_], sinks) for id_, sinks in roots.items() if id_ in by_id]
         self._watchers = [
             (node.stage, maker, slot)
             for node in self.nodes
@@ -106,22 +105,22 @@ class Segment:
 
     @property
     def at_work(self) -> bool:
-        """Whether a stage runs just now. A sink may wait for those who take its results."""
+        """Whether a stage is running. (A running sink may be waiting for its readers.)"""
         current = self.current
         return current in self.run.nodes and self.run.nodes[current].sink is None
 
     @property
     def only_sinks(self) -> bool:
-        """Whether it holds no stage."""
+        """Whether it has no stages."""
         return all(node.sink is not None for node in self.nodes)
 
     def handle(self, tick: TickState) -> None:
-        """Compute this segment's part of a tick and hand the tick on."""
+        """Compute this segment's part of a tick, and pass the tick on."""
         self._execute(tick)
         self._forward(tick)
 
     def _execute(self, tick: TickState) -> None:
-        """Compute what this tick needs from this segment."""
+        """Evaluate the roots of this segment."""
         if self.references is not None:
             self.references.enter(tick)
         if tick.frame.epoch != self.epoch:
@@ -135,14 +134,14 @@ class Segment:
             if node.pulled != tick.index:
                 node.stats.skips["no_demand"] += 1
         for stage, maker, slot in self._watchers:
-            # Another segment may be ahead or behind.
+            # The value of another segment may be of another frame.
             stage.watched = maker not in self.nodes or tick.values[slot] is not False
         self.current = None
         if tick.demand and self._data_sinks:
             self.run.latency.add(perf_counter() - tick.frame.captured)
 
     def _pull(self, node: RunningNode, tick: TickState) -> None:
-        """Run a node after what it needs, unless a gate, an absent input or unchanged inputs spare that."""
+        """Evaluate a node and what it needs, unless a gate, an absent or unchanged inputs make it skip."""
         index = node.pulled = tick.index
         if node.gates:
             for maker in node.signal_makers:
@@ -153,7 +152,7 @@ class Segment:
                 gate, slot = closed
                 repeat = gate.otherwise == "repeat"
                 if not repeat:
-                    # There is nothing: what was before must not be repeated after it either.
+                    # Earlier outputs must not be repeated after absent ones.
                     node.forget()
                 signal = tick.values[slot]
                 node.skip(tick, signal if isinstance(signal, Absent) else Absent(gate.reason), repeat=repeat)
@@ -167,7 +166,7 @@ class Segment:
         inputs = node.inputs(tick)
         if isinstance(inputs, Absent):
             node.skip(tick, inputs)
-        elif node.had(inputs):
+        elif node.is_unchanged(inputs):
             assert node.last is not None
             node.stats.skips["unchanged"] += 1
             node.publish(tick, node.last)
@@ -189,7 +188,7 @@ class Segment:
             self._renew(node.stage, node.id, tick.frame)
 
     def _renew(self, stage: Stage, name: str, frame: Frame) -> None:
-        """Have the next frame made a reference, which a stage asked for."""
+        """Take a new reference, on request of a stage."""
         reason, stage.wants_reference = stage.wants_reference, None
         assert reason is not None
         logger.info("frame %d: %s takes a new reference: %s", frame.seq, name, reason.replace("_", " "))
@@ -218,13 +217,13 @@ class Segment:
             raise NodeFailedError
 
     def _forward(self, tick: TickState) -> None:
-        """Hand the tick to the next segments. One that holds only sinks gets it only if one of them asked."""
+        """Pass the tick to the next segments; to those with sinks only, if one of them wants it."""
         for link, only_sinks in self.outputs:
             if only_sinks is None or not only_sinks.isdisjoint(tick.demand):
                 link.put(tick, keep=tick.frame.reference)
 
     def _next_tick(self) -> TickState | None:
-        """The next tick that all links into this segment have; None at the end of the stream."""
+        """The next tick that all input links provide; None at the end of the stream."""
         if len(self.inputs) == 1:
             return self.inputs[0].get()
         heads = [link.get() for link in self.inputs]
@@ -259,13 +258,13 @@ class Segment:
                 link.close()
 
 
-def _of(mine: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode]:
-    """Those of the nodes that are among `mine`, each once."""
-    return [mine[id_] for id_ in dict.fromkeys(ids) if id_ in mine]
+def _existing(nodes: Mapping[str, RunningNode], ids: Sequence[str]) -> list[RunningNode]:
+    """The nodes with these ids, if they exist, each once."""
+    return [nodes[id_] for id_ in dict.fromkeys(ids) if id_ in nodes]
 
 
 def _last_with(port: str | None, nodes: Iterable[RunningNode]) -> list[tuple[RunningNode, int]]:
-    """The last of the nodes that has a signal, and where it enters it; an empty list where none has."""
+    """The last node that has a signal, and the slot of it; an empty list if there is none."""
     if port is None:
         return []
     return [(node, node.signals[port][0]) for node in nodes if port in node.signals][-1:]

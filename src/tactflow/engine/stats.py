@@ -20,12 +20,9 @@ _OFFSET = -log(_SMALLEST) * _BINS_PER_E
 
 
 class Durations:
-    """A histogram of durations with bins of equal ratio; quantiles are good to 1 %.
+    """A histogram of durations with logarithmic bins; quantiles are accurate to 1 %. Thread-safe.
 
-    Covers 0.1 us to about 5 h; shorter and longer ones count in the outermost bins. Any thread may
-    add and ask.
-
-    total : their sum, s.
+    Covers 0.1 us to about 5 h; values outside count in the outermost bins. total : sum of the durations, s.
     """
 
     def __init__(self) -> None:
@@ -42,11 +39,11 @@ class Durations:
 
     @property
     def count(self) -> int:
-        """How many were counted."""
+        """Number of durations."""
         return sum(self._bins)
 
     def quantile(self, q: float) -> float | None:
-        """The duration that a share `q` in [0, 1] does not exceed, s; None when nothing was counted."""
+        """The quantile q in [0, 1], s; None without durations."""
         with self._lock:
             counts = list(accumulate(self._bins))
         if not counts[-1]:
@@ -55,17 +52,17 @@ class Durations:
         return _SMALLEST * exp((index + 0.5) / _BINS_PER_E)
 
     def milliseconds(self, q: float) -> float | None:
-        """`quantile` in ms, rounded to 4 digits after the point."""
+        """`quantile` in ms, rounded to 4 decimals."""
         value = self.quantile(q)
         return None if value is None else round(value * 1000, 4)
 
 
 @dataclass(slots=True)
 class NodeStats:
-    """What a stage or sink did. Written by the one thread that runs it.
+    """Statistics of a stage or sink, written by the thread of its segment.
 
-    skips : reason -> frames in which it did not run. errors : frames in which it failed. durations : of its
-    runs.
+    skips : reason -> number of frames in which it did not run. errors : number of frames in which it failed.
+    durations : of its runs.
     """
 
     skips: Counter[str] = field(default_factory=Counter)
@@ -73,7 +70,7 @@ class NodeStats:
     durations: Durations = field(default_factory=Durations)
 
     def entry(self) -> dict[str, Any]:
-        """Its entry in the statistics file."""
+        """The entry in the statistics file."""
         return {
             "runs": self.durations.count,
             "skips": dict(self.skips),
@@ -86,9 +83,8 @@ class NodeStats:
 
 @dataclass(slots=True)
 class SignalStats:
-    """How often a boolean port was True, or there was a contact, and how often that began.
-
-    last : its value in the last tick.
+    """Counts of a boolean port, or of contacts. true : ticks in which it was true. rises : changes to true.
+    last : value in the last tick.
     """
 
     true: int = 0
@@ -102,5 +98,5 @@ class SignalStats:
         self.last = value
 
     def entry(self) -> dict[str, int]:
-        """Its entry in the statistics file."""
+        """The entry in the statistics file."""
         return {"true": self.true, "rises": self.rises}

@@ -1,7 +1,7 @@
-"""Result messages as rows of tables: the columns follow from the JSON Schema of the message.
+"""Result messages as rows of tables, with columns derived from the JSON Schema of the message.
 
-Every table has the same columns whatever a pipeline computes, so that tables of several runs can be
-concatenated; what a message lacks is null.
+All tables have the same columns, whatever the pipeline computes, so that tables of several runs can be
+concatenated; values missing in a message are null.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from typing import Any, NamedTuple
 from tactflow.message.schema import message_schema, resolved
 
 LEFT_OUT = ("schema", "contacts", "markers", "field")
-"""Keys of a message without a column in `frames`: the first never changes, two have tables of their own, and
-a displacement field has thousands of numbers a frame, which the JSON lines have."""
+"""Keys without a column in `frames`: the first is constant, two have their own tables, and a displacement
+field has thousands of numbers per frame."""
 PAIRS = {"size": ("width", "height"), "axes": ("major", "minor"), "shear": ("1", "2"), "shear_mm": ("1", "2")}
-"""Names of the parts of a pair that are not x and y."""
+"""Pair -> names of its parts, if not x and y."""
 XYZ = ("x", "y", "z")
 
 
 class Column(NamedTuple):
-    """One column of a table.
+    """A column of a table.
 
-    name : `contact_center_x`. path : keys and indices that lead to the value in a message.
+    name : such as `contact_center_x`. path : keys and indices of the value in a message.
     kind : number, integer, string, boolean, numbers, points (a list of pairs) or words (name -> text).
-    description : for people.
+    description : with unit.
     """
 
     name: str
@@ -54,7 +54,7 @@ MARKER_COLUMNS = (
     Column("status", (), "string", "tracked, inferred or lost"),
     Column("stderr", (), "number", "standard error of the position, px; null when unknown"),
 )
-"""Of the table `markers`, behind `seq`."""
+"""Columns of the table `markers`, after `seq`."""
 
 
 @cache
@@ -83,7 +83,7 @@ def contact_columns() -> Sequence[Column]:
 def _columns(
     part: Mapping[str, Any], defs: Mapping[str, Any], names: tuple[str, ...], path: tuple[str | int, ...]
 ) -> Iterator[Column]:
-    """The columns of one part of the schema; names, path : where it stands, as words and as keys."""
+    """The columns of a part of the schema; names, path : its location, as words and as keys."""
     part = resolved(part, defs)
     description = part.get("description", "")
     name, kind = "_".join(names), part.get("type", "string")

@@ -1,4 +1,4 @@
-"""The parts of a result message, read back."""
+"""Decoding of result messages."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _UNKNOWN = float("nan")
 
 
 def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Port -> value or `Absent`, and the reasons of what was skipped.
+    """Port -> value or `Absent`, and the reasons for skipped values.
 
-    Raises KeyError, TypeError or ValueError for what is no result message.
+    Raises KeyError, TypeError or ValueError if it is not a result message.
     """
     skipped = {str(port): str(reason) for port, reason in message["skipped"].items()}
     values: dict[str, Any] = {
@@ -47,7 +47,7 @@ def _optional(decode: Callable[[Any], T], value: Any) -> T | None:
 
 
 def _numbers(value: Any) -> Any:
-    """A number, or a tuple of numbers; None where it is not known."""
+    """A number, or a tuple of numbers; None if unknown."""
     return tuple(map(_numbers, value)) if isinstance(value, list | tuple) else _optional(float, value)
 
 
@@ -121,7 +121,7 @@ def _force(force: Any) -> Force:
 
 
 def _pose(pose: Any) -> Pose:
-    """Without its covariance, the variances alone."""
+    """Without a covariance in the message, only the variances are known."""
     variances = np.diag(np.square(np.array(pose["stderr"], np.float64)))
     covariance = np.array(pose.get("covariance", variances), np.float64).reshape(6, 6)
     center, translation, rotation = (_numbers(pose[key]) for key in ("center", "translation", "rotation"))

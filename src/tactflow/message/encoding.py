@@ -1,6 +1,6 @@
-"""Results as dicts, lists and arrays that `orjson` writes as the message `tactflow.frame/1`.
+"""Encoding of results as dicts, lists and arrays, which `orjson` writes as the message `tactflow.frame/1`.
 
-Numbers are written with full precision: the shortest decimal that reads back as the same double.
+Numbers have full precision: the shortest decimal that reads back as the same double.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ FLOW_DETAILS = (
     *("stderr", "rotation", "divergence", "residual"),
     *("rotation_stderr", "divergence_stderr", "shear_stderr", "shear"),
 )
-"""Attributes of `Flow` that only a detailed message has."""
+"""Attributes of `Flow` in detailed messages only."""
 SLIP_DETAILS = ("translation_stderr", "rotation_stderr", "speed_stderr")
-"""Attributes of `Slip` that only a detailed message has."""
+"""Attributes of `Slip` in detailed messages only."""
 _EXPLAINED = frozenset({"contact", "flow", "markers", "reference"})
-"""What `skipped` of a message may name: the ports that every message has, and the reference."""
+"""Keys of `skipped` in a message: the ports of every message, and the reference."""
 
 
 def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
-    """The message of a result. Raises ValueError, with the field's name, for a number that is not finite."""
+    """The message of a result. Raises ValueError with the name of the field for a number that is not
+    finite."""
     contact, flow, markers, scale = result.contact, result.flow, result.markers, result.scale
     message: dict[str, Any] = {
         "schema": SCHEMA,
@@ -88,7 +89,7 @@ def _contact(contact: Contact, scale: Scale | None, depth: Depth | None, detail:
 
 
 def _mean_normal(normals: NDArray[np.float32]) -> list[float] | None:
-    """Unit vector along the sum of normals (n, 3); None where there are none."""
+    """Unit vector along the sum of normals (n, 3); None without normals."""
     total = normals.sum(axis=0, dtype=np.float64)
     length = float(np.linalg.norm(total))
     return (total / length).tolist() if length else None
@@ -137,14 +138,14 @@ def _field(field: DisplacementField) -> dict[str, Any]:
 
 
 def _finite(value: Any, name: str) -> Any:
-    """The value as the encoder takes it. Standard errors and probabilities may be NaN, written as null."""
+    """Check and convert for the encoder. NaN is allowed in standard errors and probabilities (null)."""
     if isinstance(value, dict):
         return {key: _finite(part, f"{name}.{key}") for key, part in value.items()}
     if isinstance(value, tuple):
         return [_finite(part, name) for part in value]
     if isinstance(value, np.ndarray):
         value = np.ascontiguousarray(value, np.float64)
-        # A sum of squares is finite only if every number is: one pass, no temporary array.
+        # The sum of squares is finite only if all numbers are; this needs no temporary array.
         total = float(np.vdot(value, value))
     elif isinstance(value, float | np.floating):
         value = total = float(value)

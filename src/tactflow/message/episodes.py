@@ -1,4 +1,4 @@
-"""What datasets for training policies share: a constant rate, and the same markers in every frame."""
+"""Common parts of datasets for training policies: a constant rate, and the same markers in every frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
-    """For each multiple of 1 / fps since the first result, the result whose time is nearest.
+    """The result nearest in time for each multiple of 1 / fps since the first result.
 
     >>> from types import SimpleNamespace
     >>> times = [5.0, 5.02, 5.21, 5.3]
@@ -30,7 +30,7 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
     for result in results:
         if before is None:
             before, begin = result, result.t
-        # Halves go to the earlier one.
+        # In a tie, take the earlier one.
         while begin + index / fps < (before.t + result.t) / 2:
             yield before
             index += 1
@@ -43,8 +43,8 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
 class AlignedMarkers:
     """The N markers of a dataset in one frame.
 
-    origin : (N, 2) float64, places in the reference frame of this recording, px. offset : (N, 2) float64, how
-    far they have moved since, px. status : (N,) uint8, values of `MarkerStatus`. All are finite.
+    origin : (N, 2) float64, positions in the reference frame of this recording, px. offset : (N, 2) float64,
+    displacements since, px. status : (N,) uint8, values of `MarkerStatus`. All are finite.
     """
 
     origin: NDArray[np.float64]
@@ -53,19 +53,19 @@ class AlignedMarkers:
 
 
 class MarkerOrder:
-    """Gives the markers of all recordings of a sensor the order that they have in the first one.
+    """Sorts the markers of all recordings of a sensor as in the first one.
 
-    Each recording finds its markers anew, some of which it may miss. Those belong together whose places in
+    Each recording detects its markers anew, and may miss some. Two are the same marker if their positions in
     the reference frames are closer than half the distance between neighbours.
 
-    origin : (N, 2) float64, px, places in the first recording; None until a frame has markers.
+    origin : (N, 2) float64, px, positions in the first recording; None until a frame has markers.
 
     >>> order = MarkerOrder()
     >>> first = np.array([[10.0, 10.0], [20.0, 10.0], [30.0, 10.0]])
-    >>> seen = np.zeros(3, np.uint8)
-    >>> _ = order.align(Markers(first, first, seen, np.zeros(3)))
+    >>> tracked = np.zeros(3, np.uint8)
+    >>> _ = order.align(Markers(first, first, tracked, np.zeros(3)))
     >>> later = first[[2, 0]] + 0.5
-    >>> aligned = order.align(Markers(later, later + [[2.0, 0.0], [1.0, 0.0]], seen[:2], np.zeros(2)))
+    >>> aligned = order.align(Markers(later, later + [[2.0, 0.0], [1.0, 0.0]], tracked[:2], np.zeros(2)))
     >>> aligned.offset[:, 0], aligned.status
     (array([1., 1., 2.]), array([0, 2, 0], dtype=uint8))
     """
@@ -79,12 +79,11 @@ class MarkerOrder:
     def align(self, markers: Markers) -> AlignedMarkers:
         """The markers in the order of the first recording.
 
-        One that this recording does not have is filled with the displacement of its nearest neighbour, and is
-        lost.
+        A marker that this recording misses gets the displacement of its nearest neighbour, and is lost.
 
         Raises
         ------
-        StageError : less than half of the markers are where those of the first recording were.
+        StageError : fewer than half of the markers are at the positions of the first recording.
         """
         if self.origin is None:
             self.origin = markers.origin
@@ -95,7 +94,7 @@ class MarkerOrder:
         return AlignedMarkers(origin, markers.displacement[self._nearest], status.astype(np.uint8))
 
     def lost(self) -> AlignedMarkers:
-        """All markers, for a frame that has none: unmoved and lost. Only after `align`."""
+        """All markers, unmoved and lost, for a frame without markers. Only after `align`."""
         assert self.origin is not None
         count = len(self.origin)
         return AlignedMarkers(self.origin, np.zeros((count, 2)), np.full(count, MarkerStatus.LOST, np.uint8))
@@ -104,7 +103,7 @@ class MarkerOrder:
         distance, nearest = (
             KDTree(origin).query(first) if len(origin) else (np.full(len(first), np.inf), None)
         )
-        # A single marker has no neighbour, which is then infinitely far away.
+        # For a single marker, the distance to its neighbour is infinite.
         neighbours = KDTree(first).query(first, [2])[0]
         self._is_missing = np.asarray(distance > np.median(neighbours) / 2)
         if nearest is None or 2 * self._is_missing.sum() > len(first):
@@ -117,7 +116,7 @@ class MarkerOrder:
 
 
 class Moments:
-    """Running minimum, maximum, mean and standard deviation of arrays of one shape; NaN is passed over.
+    """Running minimum, maximum, mean and standard deviation of arrays of the same shape; ignores NaN.
 
     >>> moments = Moments()
     >>> for values in ([1.0, np.nan], [3.0, np.nan]):
@@ -135,7 +134,7 @@ class Moments:
         self._max: NDArray[np.float64] | float = -np.inf
 
     def add(self, values: NDArray[np.generic]) -> None:
-        """Count one frame's values."""
+        """Add the values of a frame."""
         numbers = values.astype(np.float64)
         known = np.isfinite(numbers)
         self.frames += 1
@@ -146,10 +145,10 @@ class Moments:
         self._max = np.maximum(self._max, np.where(known, numbers, -np.inf))
 
     def summary(self) -> dict[str, NDArray[np.float64]]:
-        """The four by name, of the values' shape; 0 where none was known."""
+        """The four statistics by name, of the values' shape; 0 without known values."""
         known = np.asarray(self._count) > 0
         count = np.maximum(self._count, 1)
         mean = self._sum / count
         std = np.sqrt(np.maximum(self._squares / count - mean**2, 0))
-        found = {"min": self._min, "max": self._max, "mean": mean, "std": std}
-        return {name: np.where(known, values, 0.0) for name, values in found.items()}
+        statistics = {"min": self._min, "max": self._max, "mean": mean, "std": std}
+        return {name: np.where(known, values, 0.0) for name, values in statistics.items()}

@@ -1,7 +1,5 @@
-"""What the pipeline found in one frame: in Python, and as the message `tactflow.frame/1`.
-
-The schema of the message is in `tactflow.message.schema`.
-"""
+"""The result of a frame, in Python and as the message `tactflow.frame/1` (schema:
+`tactflow.message.schema`)."""
 
 from __future__ import annotations
 
@@ -24,22 +22,21 @@ if TYPE_CHECKING:
 
 
 class Result(Tick):
-    """What was found in one frame; a mapping from port names to values, with properties for the well-known.
+    """The result of a frame: a mapping from port names to values, with properties for the well-known ports.
 
-    Pixels are those of the processed frame, x right, y down; a property is None where nothing was found, or
-    no stage of the pipeline computes it. `result["brightness"]` is the output of a stage of your own.
+    Pixels are those of the processed frame, x right, y down. A property is None if nothing was found, or no
+    stage of the pipeline computes it. `result["brightness"]` is the output of a stage of your own.
 
-    frame : as captured: `seq`, `t`, and the raw image, (0, 0, 3) where pictures were not kept.
-    skipped : port -> why it was not computed in this frame: `unchanged` and `at_rest` repeat the last value.
+    frame : as captured: `seq`, `t`, and the raw image; (0, 0, 3) if pictures were not kept.
+    skipped : port -> why it was not computed in this frame; `unchanged` and `at_rest` repeat the last value.
     image : (H, W, 3) uint8 BGR, the processed frame.
-    contact, flow, markers : what touches the gel, how the gel has moved inside, and its dots.
+    contact, flow, markers : contact with the gel, displacement of the gel inside it, and markers.
     contact_mask : (H, W) uint8, 255 in contact.
-    scale, depth, force : millimetres per pixel, how far the gel is pushed in, and by which force; only with a
-        calibration that knows it.
-    field, slip, normals : displacement between the dots, whether the contact slips, and the normals of the
-        gel's surface; only where a stage of that name stands in the pipeline.
-    pose : how the object has moved since it was touched; with the stage of that name and a calibration.
-    features : of a stage `network` that gives some.
+    scale, depth, force : millimetres per pixel, indentation and force; only with a calibration of them.
+    field, slip, normals : displacement field of the gel, slip of the contact, and normals of the gel's
+        surface; only with the stages of these names.
+    pose : motion of the object since it was touched; with the stage of that name and a calibration.
+    features : output of a stage `network`.
 
     >>> import tactflow
     >>> result = next(tactflow.stream(source="sim:press", max_frames=1))
@@ -75,14 +72,14 @@ class Result(Tick):
 
     @classmethod
     def port_types(cls) -> dict[str, Any]:
-        """The types of the ports. Importing this module alone does not import OpenCV."""
+        """The types of the ports. (Importing this module alone does not import OpenCV.)"""
         from tactflow.vision.flow.displacement_field import DisplacementField
 
         return get_type_hints(cls, localns={"DisplacementField": DisplacementField}, include_extras=True)
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """Every separate contact, that with the most pixels first; empty without one."""
+        """All separate contacts, the one with the most pixels first; empty without contact."""
         contact = self.contact
         return () if contact is None else contact.separate or (contact,)
 
@@ -103,7 +100,7 @@ class Result(Tick):
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the processed frame, px; of the raw one where no stage processes it."""
+        """(width, height) of the processed frame, px; of the raw one if no stage processes it."""
         if self._size is not None:
             return self._size
         image = self.value("image")
@@ -111,9 +108,9 @@ class Result(Tick):
         return width, height
 
     def to_dict(self, *, detail: bool = False, field: bool = False) -> dict[str, Any]:
-        """The result message as plain dicts, lists and numbers; options as for `encode_message`.
+        """The result message as dicts, lists and numbers; options as for `encode_message`.
 
-        Of a result that was received, the message as it came.
+        For a received result, the original message.
         """
         if self._message is not None:
             return self._message
@@ -125,7 +122,7 @@ class Result(Tick):
         return encode_message(self, detail=detail, field=field).decode()
 
     def kept(self, *, pictures: bool) -> Self:
-        """A copy to keep: its arrays are read-only, and it is without pictures unless they are asked for."""
+        """A copy with read-only arrays, optionally without pictures."""
         kept = copy(self)
         kept._size = self.size
         values = {port: _read_only(value) for port, value in self.items()}
@@ -137,7 +134,7 @@ class Result(Tick):
 
     @classmethod
     def from_message(cls, message: Mapping[str, Any] | bytes | str) -> Self:
-        """Build a result from a received message; it has no pictures, masks or height maps.
+        """Decode a message; the result has no pictures, masks or height maps.
 
         Raises
         ------
@@ -163,7 +160,7 @@ def _is_picture(value: Any) -> bool:
 
 
 def _read_only(value: Any) -> Any:
-    """The same with arrays that cannot be written to: an array, or a dataclass that holds some."""
+    """The value with read-only arrays: an array, or a dataclass with arrays."""
     if isinstance(value, np.ndarray):
         view = value.view()
         view.flags.writeable = False
@@ -178,19 +175,19 @@ def _read_only(value: Any) -> Any:
 
 
 def encode_message(result: Result, *, detail: bool = False, field: bool = False) -> bytes:
-    """The result message of one frame, as JSON in UTF-8 on a single line without a line end.
+    """Encode the result message of a frame as JSON in UTF-8, on a single line without a line end.
 
     Parameters
     ----------
     result : in pixels of the processed frame; None becomes null.
-    detail : with `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`, `flow.residual`,
-        `flow.shear`, `markers.stderr`, and the standard errors of all these and of all that is in mm.
-    field : with `field`.
+    detail : include `contact.confidence`, `flow.stderr`, `flow.rotation`, `flow.divergence`, `flow.residual`,
+        `flow.shear`, `markers.stderr`, and the standard errors of these and of all values in mm.
+    field : include `field`.
 
     Raises
     ------
     ValueError
-        If a number is infinite, or NaN (except in standard errors, where NaN stands for unknown).
+        If a number is infinite, or NaN (except in standard errors, where NaN means unknown).
     """
     message = encode(result, detail, field) if result._message is None else result._message
     return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)

@@ -1,4 +1,4 @@
-"""The JSON Schema of the result message `tactflow.frame/1`: what `encoding.py` may write."""
+"""The JSON Schema of the result message `tactflow.frame/1`, which `encoding.py` writes."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ class _Message(_Strict):
 
 
 class _NoDefaults(GenerateJsonSchema):
-    """Leaves defaults out: a field that a message lacks was not asked for; it has no value."""
+    """Without defaults, because a field missing in a message has no value."""
 
     def default_schema(self, schema: Any) -> dict[str, Any]:
         return self.generate_inner(schema["schema"])
@@ -267,16 +267,16 @@ class _NoDefaults(GenerateJsonSchema):
 
 @functools.cache
 def message_schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of the result message; made once, not to be changed.
+    """JSON Schema (draft 2020-12) of the result message; cached, do not modify it.
 
-    `field`, and what is marked (detail) or (calibrated), is optional.
+    `field` and the fields marked (detail) or (calibrated) are optional.
     """
     schema = _Message.model_json_schema(by_alias=True, schema_generator=_NoDefaults)
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema}
 
 
 def resolved(part: Mapping[str, Any], definitions: Mapping[str, Any]) -> dict[str, Any]:
-    """A part of a JSON Schema without `$ref` and `anyOf`: what it is where it is not null."""
+    """A part of a JSON Schema with `$ref` and `anyOf` resolved, assuming that it is not null."""
     inner = next((choice for choice in part.get("anyOf", ()) if choice.get("type") != "null"), part)
     if "$ref" in inner:
         inner = definitions[inner["$ref"].rpartition("/")[2]]

@@ -1,19 +1,19 @@
-"""Recordings: MCAP files that hold every frame without loss, the results, and how they were made.
+"""Recordings: MCAP files with lossless frames, results and provenance.
 
-One file holds the frames of one sensor. Its channels, with `/main` for the sensor's name:
+A file has the frames of one sensor. Its channels, with `/main` for the sensor's name:
 
     /main/frames       every accepted frame, lossless       protobuf tactflow.RawFrame
-    /main/references   those that show the untouched gel     the same
+    /main/references   frames of the untouched gel           the same
     /main/results      the result messages                   JSON tactflow.frame
-    /main/image        pictures for people, at a low rate    protobuf foxglove.CompressedImage
-    /main/annotations  contact, dots, arrows on those        protobuf foxglove.ImageAnnotations
+    /main/image        previews at a low rate                protobuf foxglove.CompressedImage
+    /main/annotations  contacts, markers, arrows on those    protobuf foxglove.ImageAnnotations
 
-Attachments: `pipeline.yaml` (with every override, so that it can be run as it is), `pipeline.original.yaml`
-(the file as it was written), `message.schema.json`. Metadata `tactflow`: versions and the source.
+Attachments: `pipeline.yaml` (with all overrides, so that it can be run), `pipeline.original.yaml` (the
+original file), `message.schema.json`. Metadata `tactflow`: versions and the source.
 
-Every frame ends a chunk of the file, so that a process that is killed loses the frame it was writing and
-nothing else. What it lacks then is the index at the end: the frames can be played, and `tactflow repair`
-adds it for programs that insist on one.
+A chunk of the file ends with every frame, so that a killed process loses only the frame that it was writing.
+The file then has no index at the end: its frames can be played, and `tactflow repair` adds the index for
+programs that require it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ NEEDED = ("mcap", "zstandard", "mcap_protobuf", "foxglove_schemas_protobuf")
 
 
 CALIBRATION = frozenset({"calibration.yaml", "calibration.npz"})
-"""Attachments of a recording that was made with a calibration."""
+"""Attachments of a recording with a calibration."""
 
 
 def missing_packages() -> str | None:
-    """Why recordings can be neither written nor read here and what to do about it, or None."""
+    """A message about missing packages for recordings, with the remedy, or None."""
     return missing("recordings", "record", NEEDED)

@@ -1,7 +1,7 @@
-"""Frames as bytes and back, without loss.
+"""Lossless encoding of frames.
 
-Each row is replaced by its difference to the row above, modulo 256, and compressed with zstd. On a noisy
-800 x 600 frame that takes 2 ms and halves it; PNG, which does the same with a slower coder, takes 39 ms.
+Each row is replaced by its difference to the row above, modulo 256, and compressed with zstd. This halves a
+noisy 800 x 600 frame in 2 ms; PNG, with a slower coder, takes 39 ms.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TYPE_NAME = "tactflow.RawFrame"
 CODEC = "up+zstd"
 ENCODING = "bgr8"
 LATEST = 2.0**62 / 1e9
-"""Largest frame time, s either side of 1970: in ns, it still fits into 64 bits."""
+"""Largest absolute time of a frame, s: in ns, it fits into 64 bits."""
 LEVEL = 1
 """zstd's fastest level that still does entropy coding."""
 _FIELDS = {
@@ -43,8 +43,8 @@ _FIELDS = {
 }
 """Fields of `tactflow.RawFrame`, numbered from 1.
 
-data, decoded with zstd, is height x width x 3 bytes; row i is what is stored for it plus row i - 1, modulo
-256. t is the exact capture time, s; timestamp is the same, rounded to ns.
+data, decoded with zstd, is height x width x 3 bytes; row i of the image is row i of the data plus row i - 1
+of the image, modulo 256. t is the exact capture time, s; timestamp is the same, rounded to ns.
 """
 
 
@@ -70,7 +70,7 @@ RawFrame: Any = _raw_frame()
 
 
 def nanoseconds(t: float) -> int:
-    """A capture time in ns, as on the time line of a recording."""
+    """A capture time in ns, as in the log times of a recording."""
     return round(t * 1e9)
 
 
@@ -108,18 +108,18 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 def parse_frame(message: bytes) -> RawFrame:
-    """Read one `tactflow.RawFrame`.
+    """Parse a `tactflow.RawFrame`.
 
-    Raises ValueError if it is not one, its time is out of range, or its pixels are packed in an unknown way.
+    Raises ValueError if it is invalid, its time is out of range, or the encoding of its pixels is unknown.
     """
     try:
         raw = RawFrame.FromString(message)
     except DecodeError as error:
         raise ValueError(f"not a {TYPE_NAME}: {error}") from None
-    for required, found in ((ENCODING, raw.encoding), (CODEC, raw.codec)):
-        if found != required:
+    for required, stored in ((ENCODING, raw.encoding), (CODEC, raw.codec)):
+        if stored != required:
             raise ValueError(
-                f"required pixels stored as {required}, got {found or None}; "
+                f"required pixels stored as {required}, got {stored or None}; "
                 "was it recorded by a newer tactflow?"
             )
     if not abs(raw.t) < LATEST:
@@ -128,12 +128,12 @@ def parse_frame(message: bytes) -> RawFrame:
 
 
 def decode_pixels(raw: RawFrame) -> NDArray[np.uint8]:
-    """The pixels of a frame, (H, W, 3) uint8 BGR, bit for bit as captured; ValueError if they are damaged."""
+    """The pixels of a frame, (H, W, 3) uint8 BGR, exactly as captured. Raises ValueError if damaged."""
     if not 0 < raw.width * raw.height <= MOST_PIXELS:
         raise ValueError(f"required 1 to {MOST_PIXELS} pixels, got {raw.width} x {raw.height}")
     size = raw.height * raw.width * 3
     try:
-        # Checked first: zstd allocates what the data announces, whatever limit it is given.
+        # Check first, because zstd allocates the announced size whatever limit it is given.
         unpacked = zstandard.frame_content_size(raw.data)
         if unpacked <= size:
             data = zstandard.ZstdDecompressor().decompress(raw.data, max_output_size=size)

@@ -1,4 +1,4 @@
-"""Where results come from, for files that outlive the run: versions, source, pipeline, calibration."""
+"""Provenance of results, for output files: versions, source, pipeline, calibration."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ log = logging.getLogger("tactflow")
 
 
 def facts(sensor: str, control: Control | None) -> dict[str, str]:
-    """Versions, machine, sensor and, of a run, the source: name -> text.
+    """Versions, machine, sensor and, for a run, the source: name -> text.
 
     >>> facts("main", None)["sensor"]
     'main'
     """
-    found = {
+    texts = {
         "tactflow": __version__,
         "numpy": np.__version__,
         "numba": version("numba"),
@@ -36,15 +36,15 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
         "sensor": sensor,
     }
     if control is not None:
-        found["source"] = str((control.source and control.source.description) or "")
-    return found
+        texts["source"] = str((control.source and control.source.description) or "")
+    return texts
 
 
 def kept_files(control: Control | None) -> dict[str, bytes]:
-    """The files of a run, without passwords: name -> content.
+    """The files of a run without passwords: name -> content.
 
-    `pipeline.yaml` has every override, `pipeline.original.yaml` is the file as it was written,
-    `calibration.yaml` and `calibration.npz` are the sensor's calibration, where it has one.
+    `pipeline.yaml` includes all overrides, `pipeline.original.yaml` is the original file, `calibration.yaml`
+    and `calibration.npz` are the sensor's calibration, if any.
     """
     if control is None:
         return {}
@@ -57,12 +57,12 @@ def kept_files(control: Control | None) -> dict[str, bytes]:
     if calibration is not None:
         readers["calibration.yaml"] = lambda: stored_text(calibration)
         readers["calibration.npz"] = lambda: stored_arrays(calibration)
-    found = {}
+    files = {}
     for name, read in readers.items():
         try:
             data = read()
             is_text = name.endswith(".yaml")
-            found[name] = without_secrets(data.decode("utf-8")).encode() if is_text else data
+            files[name] = without_secrets(data.decode("utf-8")).encode() if is_text else data
         except (OSError, ValueError) as error:
             log.debug("%s is not kept: %s", name, error)
-    return found
+    return files

@@ -1,4 +1,4 @@
-"""Reads recordings, whole ones and ones that were cut off."""
+"""Reads recordings, also truncated ones."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from tactflow.recording.records import (
 )
 
 MOST_NAMED = 20
-"""Topics that a message lists at most. Chosen by hand."""
+"""Maximum number of topics in a message. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What a recording holds.
+    """Contents of a recording.
 
-    finished : it has an index. frame_topic, reference_topic : channels. frames : how many, references
-    included; None if not known. start, end : ns; None if not known.
+    finished : whether it has an index. frame_topic, reference_topic : channels. frames : number, including
+    references; None if unknown. start, end : ns; None if unknown.
     """
 
     finished: bool
@@ -39,36 +39,37 @@ class Contents:
 
 
 def look_into(path: Path) -> Contents:
-    """Find the frames in a recording.
+    """Determine the contents of a recording.
 
-    Raises NotARecordingError if it holds none that tactflow recorded, OSError if it cannot be read.
+    Raises NotARecordingError if it has no frames recorded by tactflow, OSError if it cannot be read.
     """
-    found = Summary()
+    described = Summary()
     start = None
     with path.open("rb") as file:
         summary = read_summary(file)
-        # Its channels are described before its first message.
+        # Channels are described before the first message.
         for record in intact_records(file):
             if isinstance(record, Schema):
-                found.schemas[record.id] = record
+                described.schemas[record.id] = record
             elif isinstance(record, Channel):
-                found.channels[record.id] = record
+                described.channels[record.id] = record
             elif isinstance(record, Message):
                 start = record.log_time
                 break
-    topics = _frame_topics(found)
+    topics = _frame_topics(described)
     if summary is None or summary.statistics is None:
         return Contents(summary is not None, *topics, None, start, None)
     counts = summary.statistics.channel_message_counts
-    count = sum(counts.get(channel.id, 0) for channel in found.channels.values() if channel.topic in topics)
+    channels = [channel for channel in described.channels.values() if channel.topic in topics]
+    count = sum(counts.get(channel.id, 0) for channel in channels)
     return Contents(True, *topics, count, start, summary.statistics.message_end_time)
 
 
-def _frame_topics(found: Summary) -> tuple[str, str]:
+def _frame_topics(described: Summary) -> tuple[str, str]:
     """The topics of the frames and of the references."""
-    channels = sorted(found.channels.values(), key=lambda channel: channel.topic)
+    channels = sorted(described.channels.values(), key=lambda channel: channel.topic)
     for channel in channels:
-        schema = found.schemas.get(channel.schema_id)
+        schema = described.schemas.get(channel.schema_id)
         if schema is not None and schema.name == TYPE_NAME and channel.topic.endswith("/frames"):
             return channel.topic, channel.topic.removesuffix("frames") + "references"
     topics = list(dict.fromkeys(channel.topic for channel in channels))
@@ -81,28 +82,28 @@ def _frame_topics(found: Summary) -> tuple[str, str]:
 
 
 def attachments(path: Path) -> dict[str, bytes]:
-    """Name -> bytes of the files that stand before the frames of a recording, as ours do.
+    """The attachments before the frames of a recording, where ours are: name -> bytes.
 
     Raises OSError if it cannot be read, NotARecordingError if it is not an MCAP file.
     """
-    found: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     with path.open("rb") as file:
         for record in intact_records(file):
             if isinstance(record, Attachment):
-                found[record.name] = record.data
+                files[record.name] = record.data
             elif isinstance(record, Message):
                 break
-    return found
+    return files
 
 
 def messages(
     path: Path, topics: Collection[str], start: int | None = None, end: int | None = None
 ) -> Iterator[Message]:
-    """The messages of some channels of an MCAP file, in the order they were written.
+    """The messages of some topics of an MCAP file, in the order in which they were written.
 
-    start, end : those with start <= time < end, ns. A file without an index ends at its last whole chunk.
+    start, end : select start <= time < end, ns. A file without an index ends with its last complete chunk.
 
-    Raises ValueError where the file is damaged and not only cut off, OSError if it cannot be read.
+    Raises ValueError if the file is damaged and not just truncated, OSError if it cannot be read.
     """
     with path.open("rb") as file:
         has_index = read_summary(file) is not None

@@ -1,4 +1,4 @@
-"""The records of an MCAP file one after the other, also of a damaged one and one that was cut off."""
+"""The records of an MCAP file in sequence, also of a damaged or truncated one."""
 
 from __future__ import annotations
 
@@ -32,45 +32,45 @@ DAMAGE = (
     *(McapError, struct.error, zstandard.ZstdError),
     *(ValueError, KeyError, OverflowError, RuntimeError, MemoryError),
 )
-"""What reading a damaged file raises: mcap's own errors and those of the packages that unpack chunks."""
+"""Exceptions on reading a damaged file: those of mcap and of the packages that unpack chunks."""
 
 MAGIC = b"\x89MCAP0\r\n"
-"""How every MCAP file begins."""
+"""First bytes of every MCAP file."""
 
 LARGEST_CHUNK = 256 << 20
-"""Bytes of an unpacked chunk, above which it counts as damaged: twice a raw picture of 8K."""
+"""Maximum size of an unpacked chunk, bytes: twice a raw 8K picture. Larger ones count as damaged."""
 RECORD_HEAD = 9
-"""Bytes of a record before its content: its kind and its length."""
+"""Size of the type and length of a record, bytes."""
 MOST_RECORDS = 1_000_000
-"""Records of a chunk, above which it counts as damaged: hours of a sensor's messages."""
+"""Maximum number of records of a chunk: hours of a sensor's messages. More count as damage."""
 
 _FOOTER = struct.Struct("<QQI")
-"""Where the index begins, where its offsets do, and its checksum: the last bytes of a file before `MAGIC`."""
+"""Offsets of the index and of its offset section, and checksum: the last bytes of a file before `MAGIC`."""
 _PIECE = 1 << 20
-"""Bytes that are read at once for a checksum."""
+"""Size of the blocks for a checksum, bytes."""
 
 _DATA = (Attachment, Channel, Header, Message, Metadata, Schema)
-"""All records outside of chunks but the index, which follows from the rest."""
+"""All records outside chunks except the index, which can be derived from the rest."""
 
 
 class NotARecordingError(Exception):
-    """The file is not an MCAP file, or holds no frames of ours."""
+    """The file is not an MCAP file, or has no frames of tactflow."""
 
 
 class ForeignRecordingError(NotARecordingError):
-    """An MCAP file that another program has written."""
+    """An MCAP file of another program."""
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Bytes of the file, from `start` up to `end`, that belong to no intact record."""
+    """Bytes [start, end) of the file that belong to no intact record."""
 
     start: int
     end: int
 
 
 def read_summary(file: BinaryIO) -> Summary | None:
-    """The index at the end of the file, or None where it is damaged, cut off, or of another kind of file."""
+    """The index at the end of the file; None if it is damaged or missing, or the file is not an MCAP file."""
     size = file.seek(0, io.SEEK_END)
     try:
         if not _index_is_intact(file, size):
@@ -83,33 +83,33 @@ def read_summary(file: BinaryIO) -> Summary | None:
 
 
 def _index_is_intact(file: BinaryIO, size: int) -> bool:
-    """Whether the index has the checksum that the footer states, where it states one.
+    """Verify the checksum of the index, if the footer has one.
 
-    size : of the file, bytes. Raises OSError, ValueError or struct.error if the file is shorter.
+    size : of the file, bytes. Raises OSError, ValueError or struct.error if the file is too short.
     """
     file.seek(size - _FOOTER.size - len(MAGIC))
     start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
     if not checksum:
         return True
     file.seek(start)
-    # All from the index on but the checksum itself and the magic bytes behind it.
-    left, found = size - start - len(MAGIC) - 4, 0
-    while left > 0:
-        piece = file.read(min(left, _PIECE))
-        left, found = left - len(piece), zlib.crc32(piece, found)
+    # From the index to the end, without the checksum itself and the magic bytes.
+    remaining, computed = size - start - len(MAGIC) - 4, 0
+    while remaining > 0:
+        piece = file.read(min(remaining, _PIECE))
+        remaining, computed = remaining - len(piece), zlib.crc32(piece, computed)
         if not piece:
             return False
-    return bool(found == checksum)
+    return bool(computed == checksum)
 
 
 def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
-    """Every intact record of a file but its index, those of a chunk one by one, and the damage between them.
+    """All intact records of a file except its index, including those in chunks, and the damage between them.
 
-    Schemas and channels that the index describes come after the header too: their chunk may be damaged. The
-    footer comes only where there is an index.
+    Schemas and channels of the index are yielded after the header, because their chunk may be damaged. The
+    footer is yielded only if there is an index.
 
-    A damaged chunk is passed over. Where the length of a record is damaged, reading goes on at the next
-    chunk that the index names; without an index it ends there. Memory is bounded by the largest chunk.
+    Damaged chunks are skipped. If the length of a record is damaged, reading continues at the next chunk of
+    the index; without an index, it ends there. Memory is bounded by the largest chunk.
 
     Raises
     ------
@@ -151,13 +151,13 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
 
 
 def _first_behind(place: int, chunks: Sequence[int], size: int) -> int:
-    """Where the first of the sorted chunks behind a place begins; the size of the file if there is none."""
+    """Offset of the first of the sorted chunks after an offset; the size of the file if there is none."""
     index = bisect_right(chunks, place)
     return chunks[index] if index < len(chunks) else size
 
 
 def _unpacked(chunk: Chunk, place: Damage) -> Iterator[McapRecord | Damage]:
-    """The records of a chunk, or its place if it is damaged."""
+    """The records of a chunk, or its location if it is damaged."""
     try:
         data = _content(chunk)
         _check_lengths(data)
@@ -169,11 +169,11 @@ def _unpacked(chunk: Chunk, place: Damage) -> Iterator[McapRecord | Damage]:
 
 
 def _content(chunk: Chunk) -> bytes:
-    """The unpacked bytes of a chunk. Raises ValueError, before memory is taken, if they are too many."""
+    """Unpack a chunk. Raises ValueError, before memory is allocated, if it is too large."""
     size = chunk.uncompressed_size
     if size > LARGEST_CHUNK:
         raise ValueError(f"required a chunk of {LARGEST_CHUNK} bytes at most, got {size}")
-    # One byte more than stated, to notice a chunk that is larger than it says.
+    # One byte more, to detect a chunk that is larger than stated.
     if chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
     elif chunk.compression == "lz4":
@@ -188,7 +188,7 @@ def _content(chunk: Chunk) -> bytes:
 
 
 def _check_lengths(data: bytes) -> None:
-    """Raise ValueError if a chunk has a record of kind 0, which no file may have, or too many records."""
+    """Raise ValueError if a chunk has a record of type 0, which is invalid, or too many records."""
     at = count = 0
     while at < len(data):
         count += 1

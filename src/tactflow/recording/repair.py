@@ -1,4 +1,4 @@
-"""Copies all that is intact in a recording to a new one, with an index."""
+"""Copies the intact part of a recording to a new one, with an index."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ CHUNK_BYTES = 1 << 22
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """What `repair` found.
+    """The outcome of `repair`.
 
-    finished : the file was whole. messages : how many were kept. lost : bytes that belong to no intact
-    record.
+    finished : whether the file was intact. messages : number of copied messages. lost : bytes that belong to
+    no intact record.
     """
 
     finished: bool
@@ -30,11 +30,11 @@ class Repaired:
 
 
 def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -> Repaired:
-    """Copy all that is intact in an MCAP file to another, with an index; works for any MCAP file.
+    """Copy the intact part of any MCAP file to another file, with an index.
 
-    path : stays as it is. out : is replaced. report : called now and then with the bytes read so far.
+    path : of the file, which is not changed. out : is replaced. report : called with the bytes read so far.
 
-    Raises NotARecordingError if it is not an MCAP file, OSError if one cannot be read or the other written.
+    Raises NotARecordingError if it is not an MCAP file, OSError if a file cannot be read or written.
     """
     messages = lost = 0
     has_index = False
@@ -60,7 +60,7 @@ def repair(path: Path, out: Path, report: Callable[[int], None] | None = None) -
 
 
 class _Copy:
-    """Copies records, with ids as the new file numbers them."""
+    """Copies records, with the ids of the new file."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -68,7 +68,7 @@ class _Copy:
         self._channels: dict[int, int] = {}
 
     def add(self, record: McapRecord) -> bool:
-        """Copy one record; whether it is a message that could be copied."""
+        """Copy a record; returns whether it was a message."""
         writer = self._writer
         if isinstance(record, Schema) and record.id not in self._schemas:
             self._schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)

@@ -1,6 +1,6 @@
-"""The other message types of a recording: pictures for people, what is drawn on them, and results.
+"""Further message types of a recording: previews, annotations and results.
 
-The types of Foxglove are those of its package `foxglove-schemas-protobuf`.
+The types of Foxglove are defined by its package `foxglove-schemas-protobuf`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from tactflow.vision.types import Markers, MarkerStatus
 
 RESULT_TYPE = "tactflow.frame"
 CORNER = 0.5
-"""Foxglove counts pixels from the corner of the first one, tactflow from its centre, px."""
+"""Foxglove's origin is the corner of the first pixel, tactflow's is its centre, px."""
 ARROW_SCALE = 3.0
-"""Length of an arrow over the displacement that it shows, as in `visualize`."""
+"""Length of an arrow relative to the displacement, as in `visualize`."""
 HEAD = 0.2
-"""Length of the two strokes of an arrow's head over its own. Chosen by hand."""
+"""Length of an arrow's head relative to the arrow. Chosen by hand."""
 LINE, DOT = 2.0, 4.0
 """Width of lines, diameter of dots, px. Chosen by hand."""
 CONTACT = Color(r=0.2, g=0.9, b=1.0, a=1.0)
@@ -45,7 +45,7 @@ DOTS = {
 
 
 class ChannelType(NamedTuple):
-    """Of the messages of a channel. schema : how the type is written, and its bytes. packing : of each."""
+    """Type of the messages of a channel. schema : encoding and bytes. packing : encoding of the messages."""
 
     name: str
     schema: tuple[str, bytes]
@@ -60,7 +60,7 @@ def channel_type(message: type[Message]) -> ChannelType:
 
 @functools.cache
 def channel_types() -> dict[str, ChannelType]:
-    """The channels for people: `image`, `annotations` and `results`."""
+    """The channels `image`, `annotations` and `results`."""
     results = json.dumps(plain_schema(message_schema())).encode()
     return {
         "image": channel_type(CompressedImage),
@@ -76,10 +76,7 @@ def encode_picture(jpeg: bytes, sensor: str, nanoseconds: int) -> bytes:
 
 
 def encode_annotations(result: Result, nanoseconds: int) -> bytes:
-    """One `foxglove.ImageAnnotations`: outlines of contacts, dots by their status, arrows of displacements.
-
-    result : in pixels of the processed frame, which is the picture.
-    """
+    """One `foxglove.ImageAnnotations`: outlines of contacts, markers by status, arrows of displacements."""
     stamp = timestamp(nanoseconds)
 
     def drawn(
@@ -102,7 +99,7 @@ def encode_annotations(result: Result, nanoseconds: int) -> bytes:
 
 
 def _arrows(markers: Markers) -> NDArray[np.float64]:
-    """Ends of three strokes for each marker that is not lost, one pair of rows after the other."""
+    """End points of three lines per marker that is not lost, in pairs of rows."""
     known = markers.status != MarkerStatus.LOST
     tail, moved = markers.origin[known], ARROW_SCALE * markers.displacement[known]
     tip, across = tail + moved, np.column_stack([-moved[:, 1], moved[:, 0]])
@@ -112,11 +109,10 @@ def _arrows(markers: Markers) -> NDArray[np.float64]:
 
 
 def plain_schema(schema: Mapping[str, Any], definitions: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """A JSON Schema for programs that plot: what each field is where it is known.
+    """A simplified JSON Schema for plotting programs, with one type per field and without references.
 
-    They want one type per field and no references. So references are filled in, `X or null` becomes a field
-    that may be missing, and a tuple becomes an array. Messages with null in them are not valid under it; the
-    exact schema is an attachment of the recording.
+    References are resolved, `X or null` becomes an optional field, and a tuple becomes an array. Messages
+    with null are not valid under it; the exact schema is an attachment of the recording.
     """
     definitions = schema.get("$defs", {}) if definitions is None else definitions
     part = resolved(schema, definitions)

@@ -1,4 +1,4 @@
-"""Writes one recording file."""
+"""Writes a recording file."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from tactflow.system.outputs import cannot_write, create, refuse_interference
 
 MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".npz": "application/octet-stream"}
 NEVER = 1 << 62
-"""Size at which a chunk would end by itself, bytes: each ends with a frame."""
+"""Size limit of chunks, bytes: never reached, because each chunk ends with a frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What is recorded about one frame, ready to be written.
+    """The encoded messages of a frame.
 
-    time : of the frame, ns. seq, reference, epoch : as in `Frame`. data : channel -> message; "frames" holds
-    the frame itself.
+    time : of the frame, ns. seq, reference, epoch : as in `Frame`. data : channel -> message; "frames" is the
+    frame itself.
     """
 
     time: int
@@ -40,16 +40,16 @@ class Entry:
 
 
 class RecordingWriter:
-    """One file that is being recorded. After each `write`, everything is with the operating system.
+    """Writes a recording. After each `write`, all data has been passed to the operating system.
 
     path : the file; its folder is created. sensor : names the channels. overwrite : replace an existing file.
     control : the run, whose versions, source, pipeline and calibration are attached; or None.
-    frames, bytes : written so far. begins : time of the first frame on the file's time line, ns.
+    frames, bytes : written so far. begins : log time of the first frame, ns.
 
     Raises
     ------
-    StageError : from every method, if the file is there already or cannot be written. The frames written
-        before can be played.
+    StageError : from every method, if the file exists or cannot be written. Frames written before can be
+    played.
     """
 
     def __init__(
@@ -78,10 +78,7 @@ class RecordingWriter:
             writer.add_attachment(0, 0, name, MEDIA_TYPES[Path(name).suffix], data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:
-        """Add one frame and what belongs to it.
-
-        time : on the file's time line, ns, if it is not the frame's own.
-        """
+        """Write the messages of a frame. time : log time, ns, if not that of the frame."""
         at = max(entry.time if time is None else time, 0)
         with self._errors():
             for name, data in entry.data.items():
@@ -106,13 +103,13 @@ class RecordingWriter:
             self._file.close()
 
     def close(self) -> None:
-        """Close the file as it is; without an index if it was not finished."""
-        # Not the buffer: what it could not write it would try again.
+        """Close the file; without an index if it was not finished."""
+        # Bypass the buffer, which would retry a failed write.
         self._file.raw.close()
 
     def _flush(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]
-        # Afterwards: what is cut between a check and the write would go unnoticed.
+        # After the write, so that no truncation between check and write goes unnoticed.
         self._refuse_interference()
         self.bytes = self._file.tell()
 
@@ -122,7 +119,7 @@ class RecordingWriter:
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
-        """Close the file when an error occurs, and say what became of its frames."""
+        """Close the file on errors, and report which frames are complete."""
         try:
             yield
         except OSError as error:

@@ -1,4 +1,4 @@
-"""What capture opens: simulated sensors, files, folders, cameras, streams.
+"""Sources of frames: simulated sensors, files, folders, cameras, streams.
 
 `open_source("recordings/wedge")` gives a `FrameReader`: call `read()` until it returns None, then `close()`.
 """
@@ -43,19 +43,19 @@ KINDS = (
     "a ROS or Foxglove recording (.mcap, .bag or folder, with ?topic=), .h5 or .zarr with ?dataset=, "
     "lerobot:PATH?camera=KEY&episode=N, or an http://, rtsp:// or udp:// stream"
 )
-"""What a source can be, for people: in messages, in `--help`, and for the parameter `source` of `capture`."""
+"""Description of valid sources, for messages, `--help` and the parameter `source` of `capture`."""
 
 GROUP = "tactflow.sources"
-"""Group of entry points that open other kinds of files.
+"""Group of entry points for other kinds of files.
 
-The name of an entry point is what it recognises: the suffix of a file or folder (`.h5`), a word and a colon
-in front of a path (`lerobot`), or a file that such a folder contains (`metadata.yaml`). Its value is a
-function or class that is called with `(spec, directory, fps)` of `open_source` and returns a `FrameReader`.
+The name of an entry point is the suffix of a file or folder (`.h5`), the prefix of a path without its colon
+(`lerobot`), or a file in a folder (`metadata.yaml`). Its value is a function or class that is called with
+`(spec, directory, fps)` of `open_source` and returns a `FrameReader`.
 """
 
 _STREAMS = frozenset(["http", "https", "rtsp", "udp"])
 _BUILT_IN = frozenset(["", ".npy", ".npz", *IMAGE_SUFFIXES, *VIDEO_SUFFIXES])
-"""Suffixes for which no plug-in is looked for: that takes some milliseconds."""
+"""Suffixes without a search for plug-ins, which takes some milliseconds."""
 
 
 def open_source(
@@ -71,15 +71,15 @@ def open_source(
     Parameters
     ----------
     spec : one of `KINDS`, such as `sim:press?frames=300&seed=7` or `recording.avi`.
-    directory : where a relative path is looked for if it is not in the current directory.
-    fps : rate of recordings that do not state one (images, arrays), frames per second; 30 by default.
-    camera : size, rate and format to ask a camera for.
-    watch : watch a camera or a stream, and open it again after faults; without it, the first fault ends it.
+    directory : searched for relative paths after the current directory.
+    fps : rate of recordings without one (images, arrays), frames per second; 30 by default.
+    camera : size, rate and format to request from a camera.
+    watch : monitor a camera or a stream, and reopen it after faults; without it, the first fault ends it.
 
     Raises
     ------
     SourceError
-        If it cannot be opened; the message says what to try.
+        If it cannot be opened; the message states a remedy.
 
     Examples
     --------
@@ -91,7 +91,7 @@ def open_source(
     ((600, 800, 3), dtype('uint8'), 0.0)
     >>> reader.close()
 
-    The error for a wrong name lists what there is:
+    The error for an invalid name lists the valid kinds:
 
     >>> open_source("ftp://camera")
     Traceback (most recent call last):
@@ -161,7 +161,7 @@ def _open_recording(spec: str, directory: Path | None, fps: float | None) -> Fra
 
 
 def _keys(name: str, directory: Path | None, is_pattern: bool) -> Iterator[str]:
-    """The names that a plug-in may have to open this."""
+    """The names of plug-ins that can open a source."""
     prefix, _ = split_prefix(name, directory)
     if prefix:
         yield prefix.removesuffix(":")
@@ -178,7 +178,7 @@ def _keys(name: str, directory: Path | None, is_pattern: bool) -> Iterator[str]:
 
 
 def recording_suffixes() -> frozenset[str]:
-    """Suffixes of files and folders that are a single recording: built-in kinds and those of plug-ins.
+    """Suffixes of files and folders that are a recording, including those of plug-ins.
 
     >>> {".avi", ".npy", ".mcap"} <= recording_suffixes()
     True

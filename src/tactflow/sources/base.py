@@ -1,4 +1,4 @@
-"""What all sources have in common: frames one after the other, of one size, as BGR pixels."""
+"""Base of all sources: frames in sequence, of one size, as BGR pixels."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from tactflow.system.extras import missing
 
 log = logging.getLogger("tactflow")
 
-# OpenCV's and FFmpeg's own messages do not belong on standard error: ours say the same more clearly. FFmpeg
-# reads its level once, when OpenCV opens the first file with it; OpenCV 5 keeps its own elsewhere than 4.
+# Silence OpenCV and FFmpeg, because our messages are clearer. FFmpeg reads its level when OpenCV opens
+# the first file with it; OpenCV 5 has the function in another module than OpenCV 4.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 if "OPENCV_LOG_LEVEL" not in os.environ:
     (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)
 
 SPARSE_PEAK = 4096
-"""A 16-bit frame without a value from here on comes from a sensor with 12 bits or fewer, grey levels."""
+"""A 16-bit frame with only smaller values is from a sensor with 12 bits or fewer, grey levels."""
 FEWEST_BITS = 10
-"""Sensors whose pixels are stored in 16 bits have at least so many."""
+"""Minimum number of bits of sensors whose pixels are stored in 16 bits."""
 
 SHORTEST_SIDE = 2
-"""Fewer rows or columns are no picture, px: stages halve them."""
+"""Minimum number of rows and columns, px, because stages halve the picture."""
 
 BgrImage = NDArray[np.uint8]
 
 
 class Arrival(NamedTuple):
-    """A frame as it came from its source.
+    """A frame of a source.
 
-    image, t : as from `FrameReader.read`. seq, reference, epoch : as in `Frame`; seq counts all frames of a
-    live source, those that nobody took included. paced : False for a frame that is shown ahead of its time,
-    because those after it are compared with it. connection : grows by one with each reconnection that
-    delivered. captured : monotonic time (`time.perf_counter`) when it arrived, s; 0 for a recording.
+    image, t : as from `FrameReader.read`. seq, reference, epoch : as in `Frame`; for a live source, seq also
+    counts frames that were never read. paced : False for a reference that is delivered ahead of its time.
+    connection : number of reconnections so far. captured : monotonic time (`time.perf_counter`) of its
+    arrival, s; 0 for a recording.
     """
 
     image: BgrImage
@@ -55,20 +55,20 @@ class Arrival(NamedTuple):
 
 
 class FrameReader:
-    """Frames, one after the other.
+    """A sequence of frames.
 
-    Each kind of source is a subclass that yields its pictures from `_frames`, in whatever pixels they are
-    stored; `read` converts them and checks their size.
+    A subclass yields its pictures from `_frames`, with any type of pixels; `read` converts them and checks
+    their size.
 
-    live : frames arrive at the camera's pace; a recording waits until it is read.
+    live : whether frames arrive at the camera's pace; a recording waits until it is read.
     fps : frames per second, or None if unknown.
     size : (width, height) of the frames, px, or None before the first one.
     total : number of frames, or None if unknown or endless.
-    description : one line for people.
+    description : one line for messages.
     state : of a live source: `running`, `waiting since ...` or `reconnecting since ...`.
     missed : frames of a live source that a newer one replaced before they were read.
 
-    name : what messages call the source.
+    name : for messages.
     """
 
     live = False
@@ -79,17 +79,17 @@ class FrameReader:
     state = "running"
     missed = 0
     parser_errors: tuple[type[Exception], ...] = (OSError,)
-    """What `_frames` may raise on damaged data; it reaches the caller as a SourceError."""
+    """Exceptions of `_frames` on damaged data, which are converted to SourceError."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._picture = ""
-        """What messages call the picture that `_frames` yields next; its index if empty."""
+        """Name of the next picture of `_frames` in messages; if empty, its index."""
         self._items: Iterator[tuple[Any, ...]] = self._converted()
         self._count = itertools.count()
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
-        """Yield every picture, as `to_bgr` takes them, and its time, s; ends at the last one."""
+        """Yield all pictures, as accepted by `to_bgr`, and their times, s."""
         raise NotImplementedError
 
     def read(self) -> tuple[BgrImage, float] | None:
@@ -97,7 +97,7 @@ class FrameReader:
 
         Returns
         -------
-        image : (H, W, 3) uint8 BGR; the caller must not write to it.
+        image : (H, W, 3) uint8 BGR; must not be modified.
         t : s; from the start for a recording, Unix time for a live source.
 
         Raises
@@ -109,7 +109,7 @@ class FrameReader:
         return None if item is None else (item[0], item[1])
 
     def read_arrival(self) -> Arrival | None:
-        """Like `read`, with what `capture` needs to know of the frame."""
+        """Like `read`, with the metadata for `capture`."""
         item = next(self._items, None)
         if item is None:
             return None
@@ -117,7 +117,7 @@ class FrameReader:
         return Arrival(image, t, *(stamp or [next(self._count)]))
 
     def peek(self) -> tuple[BgrImage, float] | None:
-        """The next frame, which `read` still returns in its turn; None at the end. Raises as `read`."""
+        """The next frame, without consuming it; None at the end. Raises as `read`."""
         item = next(self._items, None)
         if item is None:
             return None
@@ -125,14 +125,14 @@ class FrameReader:
         return item[0], item[1]
 
     def stop(self) -> None:
-        """End a read that waits for a live source, at once. From any thread."""
+        """End a read that waits for a live source. Thread-safe."""
 
     def close(self) -> None:
-        """Release the file or device; `read` then returns None. May be called twice."""
+        """Release the file or device; `read` then returns None. Idempotent."""
         self._items = iter(())
 
     def _read_first(self, empty: str = "there is no picture in it") -> None:
-        """Read the first frame ahead, so that `size` is known. Raises SourceError if there is none."""
+        """Read the first frame ahead to determine `size`. Raises SourceError if there is none."""
         try:
             if self.peek() is None:
                 raise SourceError(f"{self.name}: {empty}")
@@ -141,7 +141,7 @@ class FrameReader:
             raise
 
     def _converted(self) -> Iterator[tuple[Any, ...]]:
-        """What `_frames` yields, with pictures in BGR and of one size."""
+        """The items of `_frames`, with pictures in BGR and of one size."""
         first = None
         try:
             for index, (image, *rest) in enumerate(self._frames()):
@@ -170,18 +170,16 @@ class FrameReader:
 
 
 class StampedReader(FrameReader):
-    """A source whose frames went through `capture` once before.
+    """A source whose frames already passed through `capture`.
 
-    `_frames` also yields their seq, reference, epoch and paced, as in `Arrival`; capture then decides nothing
-    by itself.
+    `_frames` also yields seq, reference, epoch and paced, as in `Arrival`, which capture uses unchanged.
     """
 
 
 class CaptureReader(FrameReader):
-    """A source that OpenCV opens: a video, a camera, a stream.
+    """A source opened by OpenCV: a video, a camera, a stream.
 
-    name : what messages call it. failure : the error message if it cannot be opened. arguments : of
-    `cv2.VideoCapture`.
+    name : for messages. failure : error message if it cannot be opened. arguments : of `cv2.VideoCapture`.
     """
 
     def __init__(self, name: str, failure: str, *arguments: Any) -> None:
@@ -198,7 +196,7 @@ class CaptureReader(FrameReader):
         self._size_text = f"{width} x {height}"
 
     def _property(self, number: int) -> float:
-        """What OpenCV knows of the source (`cv2.CAP_PROP_...`); 0 if it does not."""
+        """A property of the source (`cv2.CAP_PROP_...`); 0 if unknown."""
         return 0.0 if self._capture is None else self._capture.get(number)
 
     def _grab(self) -> NDArray[Any] | None:
@@ -224,7 +222,7 @@ def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> BgrImage:
     ((2, 2, 3), dtype('uint8'), 255)
 
     image : (H, W) or (H, W, C) with C in 1, 3, 4; uint8 or uint16; others raise SourceError.
-    name : what messages call the picture. note : whether the log tells what is converted.
+    name : of the picture, for messages. note : whether to log conversions.
     """
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4):
@@ -284,9 +282,9 @@ def check_pixel_count(name: str, width: int, height: int) -> None:
         )
 
 
-def require(name: object, what: str, extra: str, *modules: str) -> None:
+def require(name: object, feature: str, extra: str, *modules: str) -> None:
     """Raise SourceError unless these packages are installed; arguments as for `missing`."""
-    problem = missing(what, extra, modules)
+    problem = missing(feature, extra, modules)
     if problem is not None:
         raise SourceError(f"{name}: {problem}")
 

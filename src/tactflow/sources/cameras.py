@@ -1,7 +1,7 @@
-"""The cameras of this machine, under names that stay the same.
+"""The cameras of this machine, with persistent names.
 
-`/dev/videoN` is numbered in the order of plugging in. udev's links `/dev/v4l/by-id/...` name the device (two
-of the same model without serial numbers share one), `/dev/v4l/by-path/...` the socket it is plugged into.
+`/dev/videoN` is numbered in the order of connection. udev's links `/dev/v4l/by-id/...` name the device
+(cameras of one model without serial numbers share a link), `/dev/v4l/by-path/...` the port.
 """
 
 from __future__ import annotations
@@ -26,26 +26,25 @@ else:
 VIDIOC_QUERYCAP = 0x80685600
 VIDIOC_ENUM_FMT = 0xC0405602
 VIDIOC_ENUM_FRAMESIZES = 0xC02C564A
-"""Requests to a driver, as `linux/videodev2.h` defines them; bits 16 to 29 are the length of the answer."""
+"""Requests to a driver (`linux/videodev2.h`); bits 16 to 29 are the length of the reply."""
 CAN_CAPTURE = 0x1
 CAN_CAPTURE_PLANES = 0x1000
 HAS_DEVICE_CAPS = 0x80000000
-"""Bits of the answer to the first one, from the same file."""
+"""Bits of the reply to the first one, from the same file."""
 BUFFER_CAPTURE = 1
 BUFFER_CAPTURE_PLANES = 9
-"""Kinds of buffers that pictures come in, from the same file."""
+"""Types of buffers for pictures, from the same file."""
 DISCRETE_SIZES = 1
-"""The driver lists sizes one by one, not as a range."""
+"""The driver lists single sizes, not a range."""
 MAX_ENTRIES = 64
-"""Entries of a list that are read at most, in case a driver never ends it. Chosen by hand."""
+"""Maximum length of a list, in case a driver never ends it. Chosen by hand."""
 
 
 class Abilities(NamedTuple):
-    """What a driver says.
+    """Information of a driver.
 
-    name : the device's own name. pictures : whether it delivers any (many cameras show a second device that
-    only carries metadata). formats : pixel format -> sizes (width, height), px; no sizes where the driver
-    names a range.
+    name : of the device. pictures : whether it delivers any (many cameras have a second device with metadata
+    only). formats : pixel format -> sizes (width, height), px; empty if the driver states a range.
     """
 
     name: str
@@ -57,9 +56,9 @@ class Abilities(NamedTuple):
 class CameraInfo:
     """A camera of this machine.
 
-    source : its most stable name, to be used as a source. device : `/dev/videoN`. index : N.
-    names : all links to it. abilities : what its driver says, or None where it cannot be asked; `problem`
-    then says why.
+    source : its most persistent name, for use as a source. device : `/dev/videoN`. index : N.
+    names : all links to it. abilities : from its driver, or None if it cannot be queried, because of
+    `problem`.
     """
 
     source: str
@@ -73,12 +72,9 @@ class CameraInfo:
 def list_cameras(
     dev: Path = Path("/dev"), ask: Callable[[Path], Abilities] | None = None
 ) -> list[CameraInfo]:
-    """The cameras that are plugged in, by index; none of them is started.
+    """The connected cameras by index, without starting them.
 
-    Parameters
-    ----------
-    dev : the folder of devices.
-    ask : asks a driver; Linux's V4L2 if not given.
+    dev : folder of devices. ask : queries a driver; V4L2 by default.
     """
     links: dict[str, list[str]] = {}
     for link in sorted(dev.glob("v4l/by-*/*")):
@@ -102,7 +98,7 @@ def list_cameras(
 
 
 def ask_driver(device: Path) -> Abilities:
-    """Ask a V4L2 driver what it can do. Does not start the camera, and works while another program uses it.
+    """Query a V4L2 driver, without starting the camera; also works while another program uses it.
 
     Raises
     ------
@@ -128,17 +124,17 @@ def _sizes(handle: int, code: bytes) -> list[tuple[int, int]]:
     return list(dict.fromkeys((width, height) for kind, width, height in entries if kind == DISCRETE_SIZES))
 
 
-def _list(handle: int, request: int, what: bytes) -> Iterator[bytes]:
-    """The entries of a list. what : of what, behind the index of the entry."""
+def _list(handle: int, request: int, argument: bytes) -> Iterator[bytes]:
+    """The entries of a list. argument : of the request, after the index of the entry."""
     for index in range(MAX_ENTRIES):
         try:
-            yield _request(handle, request, struct.pack("=I", index) + what)
+            yield _request(handle, request, struct.pack("=I", index) + argument)
         except OSError:
             return
 
 
 def _request(handle: int, request: int, question: bytes = b"") -> bytes:
-    """The driver's answer. Raises OSError."""
+    """The driver's reply. Raises OSError."""
     data = bytearray(question.ljust(request >> 16 & 0x3FFF, b"\0"))
     ioctl(handle, request, data)
     return bytes(data)

@@ -22,19 +22,18 @@ from tactflow.system.redaction import public_address
 HIGHEST_INDEX = 2**31 - 1
 """OpenCV takes the index of a camera as an `int` of C."""
 READ_TIMEOUT = 2.0
-"""Seconds without a frame after which Linux's video driver and FFmpeg give up; OpenCV's defaults are 10 and
-30."""
+"""Timeout for a frame, s; OpenCV's defaults are 10 for Linux's video driver and 30 for FFmpeg."""
 OPEN_TIMEOUT = 10.0
-"""Seconds to wait for the first answer of a stream."""
+"""Timeout for opening a stream, s."""
 EPOCH = SYSTEM.unix() - SYSTEM.now()
-"""Unix time when the monotonic clock was 0, s: looked up once, so that times of frames never step back."""
+"""Unix time when the monotonic clock was 0, s; determined once, so that times of frames never decrease."""
 TOLERANCE = 0.01
-"""A size or rate this close to the requested one, as a fraction, is what was asked for: 29.97 is 30."""
+"""Relative tolerance of a requested size or rate: 29.97 is 30."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraRequest:
-    """What a camera is asked for; None leaves the camera's own choice.
+    """Requested settings of a camera; None for its default.
 
     width, height : px. fps : frames per second. format : four characters, such as MJPG or YUYV.
     """
@@ -48,9 +47,9 @@ class CameraRequest:
 class Camera(CaptureReader):
     """A camera of this machine. Frames are stamped on arrival.
 
-    device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/..."). request : size, rate and format
-    to ask for; a camera may ignore it, which is reported. Raises SourceError if it cannot be opened, and from
-    `read` if it stops delivering.
+    device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/..."). request : settings, which a
+    camera may ignore; this is reported. Raises SourceError if it cannot be opened, and from `read` if it
+    stops delivering.
     """
 
     live = True
@@ -68,10 +67,10 @@ class Camera(CaptureReader):
         self._configure(request or CameraRequest())
 
     def _configure(self, request: CameraRequest) -> None:
-        """Ask for size, rate and format, and report what the camera chose instead."""
+        """Request size, rate and format, and report differing settings."""
         capture = self._capture
         assert capture is not None
-        # The format comes first: it decides which sizes and rates the driver offers.
+        # The format first, because the available sizes and rates depend on it.
         if request.format is not None:
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*request.format))
         properties = {
@@ -91,8 +90,8 @@ class Camera(CaptureReader):
         self.description += f" at {rate:g} fps" if rate > 0 else ""
         self.description += f", {form}" if form.isprintable() and form else ""
         ignored = [
-            f"{what} {value:g} -> {chosen:g}"
-            for what, (number, value) in properties.items()
+            f"{name} {value:g} -> {chosen:g}"
+            for name, (number, value) in properties.items()
             if value is not None and abs(value - (chosen := capture.get(number))) > TOLERANCE * value
         ]
         if request.format is not None and form and form.upper() != request.format.upper():
@@ -106,9 +105,9 @@ class Camera(CaptureReader):
         raise SourceError(f"{self.name}: delivers no more frames; unplugged, or in use by another program?")
 
     def delay(self) -> float | None:
-        """Time since the driver stamped the frame that was read last, s; None where it does not say.
+        """Time since the driver's time stamp of the last frame, s; None if unknown.
 
-        Linux's driver for USB cameras stamps a frame when its first bytes come, by the monotonic clock.
+        Linux's driver for USB cameras stamps a frame when its first bytes arrive, with the monotonic clock.
         """
         if sys.platform != "linux":
             return None
@@ -122,9 +121,9 @@ def _camera_hint(device: str) -> str:
     wanted = f"/dev/video{device}" if device.isdecimal() else device
     if not present:
         return "no camera is plugged in (there is no /dev/video*)"
-    others = "this machine has " + ", ".join(present)
+    cameras = "this machine has " + ", ".join(present)
     if not os.path.exists(wanted):
-        return f"{wanted} does not exist; {others}"
+        return f"{wanted} does not exist; {cameras}"
     if not os.access(wanted, os.R_OK | os.W_OK):
         return (
             f"no permission for {wanted}; add yourself to its group (sudo usermod -aG video $USER) "
@@ -132,15 +131,15 @@ def _camera_hint(device: str) -> str:
         )
     return (
         "another program may be using it, or it only carries metadata "
-        f"(many cameras show two devices, of which one has pictures); {others}"
+        f"(many cameras show two devices, of which one has pictures); {cameras}"
     )
 
 
 class Stream(CaptureReader):
     """A network stream: http, https, rtsp or udp. Frames are stamped on arrival.
 
-    The stream's own times and rate are not used: for HTTP they are invented. Raises SourceError if nothing
-    can be opened there.
+    The times and the rate of the stream are not used, because they are meaningless for HTTP. Raises
+    SourceError if it cannot be opened.
     """
 
     live = True
@@ -168,7 +167,7 @@ def _stream_hint(url: str) -> str:
         parts = urlsplit(url)
         port = parts.port
     except ValueError:
-        # Python's own message repeats what may be a password with a slash.
+        # Python's message may contain a part of a password.
         return "the address is not valid; in a password, write / as %2F and @ as %40"
     if parts.scheme == "udp":
         return f"does anything send MPEG-TS to port {port or '(no port given)'} of this machine?"

@@ -31,26 +31,26 @@ from tactflow.system.files import expanded
 IMAGE_SUFFIXES = frozenset(
     [".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"]
 )
-"""Files that are read as images."""
+"""Suffixes of images."""
 VIDEO_SUFFIXES = frozenset([".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ogv", ".webm", ".wmv"])
-"""Files that are read as videos, as are all others that nothing else reads."""
+"""Suffixes of videos; files with unknown suffixes are also read as videos."""
 DEFAULT_FPS = 30.0
-"""Rate of images, arrays and videos that do not state one, frames per second. Chosen by hand."""
+"""Rate of images, arrays and videos without one, frames per second. Chosen by hand."""
 HIGHEST_FPS = 1e4
-"""A rate above this in a video file is taken as unknown, frames per second. Chosen by hand."""
+"""Maximum rate of a video file, frames per second; larger ones are ignored. Chosen by hand."""
 
 ZIP_MAGIC = r"got b'PK\x03\x04"
-"""What numpy says about a .npz file, which begins as every ZIP file does."""
+"""Part of NumPy's message for a .npz file, which is a ZIP file."""
 PLAYLISTS = (b"#EXTM3U", b"ffconcat")
-"""First bytes of lists of other files, which FFmpeg would open in place of a video."""
+"""First bytes of playlists, whose files FFmpeg would open."""
 PNG = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file."""
 CHUNK_FRAME = 12
-"""Bytes of a PNG chunk around its data: length, type, checksum."""
+"""Bytes of a PNG chunk besides its data: length, type, checksum."""
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sorting key that puts cal-2 before cal-10 and ignores case.
+    """Sorting key for natural order (cal-2 before cal-10), ignoring case.
 
     >>> sorted(["cal-10.png", "cal-2.png", "CAL-1.png"], key=natural_key)
     ['CAL-1.png', 'cal-2.png', 'cal-10.png']
@@ -63,9 +63,9 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def read_image(path: Path) -> NDArray[Any]:
-    """Decode an image file as it is stored: (H, W) or (H, W, C), any depth.
+    """Decode an image file without conversion: (H, W) or (H, W, C), any depth.
 
-    Raises SourceError if the file cannot be read, is not an image, or is cut off.
+    Raises SourceError if the file cannot be read, is not an image, or is truncated.
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
@@ -76,7 +76,7 @@ def read_image(path: Path) -> NDArray[Any]:
 
 
 def decode_image(data: bytes, name: str) -> NDArray[Any]:
-    """Decode the bytes of an image file; `name` is what messages call it. As `read_image`."""
+    """Decode the bytes of an image file, as `read_image`. name : for messages."""
     if not data:
         raise SourceError(f"{name}: the image is empty")
     if _is_cut_off(data):
@@ -102,20 +102,20 @@ def load_image(spec: str, directory: Path | None = None) -> BgrImage:
 
 
 def _is_cut_off(data: bytes) -> bool:
-    """Whether the end of a JPEG or PNG is missing: OpenCV fills a JPEG with gray then and says nothing."""
+    """Whether a JPEG or PNG is truncated; OpenCV would silently fill a JPEG with gray."""
     if data.startswith(b"\xff\xd8\xff"):
-        # Behind the last start-of-scan marker there must be an end-of-image marker. Neither can occur
-        # inside compressed data, and an embedded thumbnail brings both.
+        # An end-of-image marker must follow the last start-of-scan marker. Neither can occur inside
+        # compressed data, and an embedded thumbnail has both.
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     return data.startswith(PNG) and not _has_whole_chunks(data)
 
 
 def _has_whole_chunks(png: bytes) -> bool:
-    """Whether all chunks of a PNG have the length they state: OpenCV allocates it before it reads them."""
+    """Whether all chunks of a PNG are complete; OpenCV would allocate their stated length."""
     at = len(PNG)
     while at + CHUNK_FRAME <= len(png):
         at += CHUNK_FRAME + int.from_bytes(png[at : at + 4], "big")
-        # The last one is empty: its type stands eight bytes before its end.
+        # The last chunk is empty, so that its type starts eight bytes before its end.
         if at <= len(png) and png[at - 8 : at - 4] == b"IEND":
             return True
     return False
@@ -124,8 +124,8 @@ def _has_whole_chunks(png: bytes) -> bool:
 class ImageFiles(FrameReader):
     """A recording of one image file per frame; frame i is taken at i / fps.
 
-    files : in the order they are played. name : of the folder or pattern, for people. first : name of the
-    first file, without its folder.
+    files : in order. name : folder or pattern, for messages. first : name of the first file without its
+    folder.
     """
 
     def __init__(self, files: Sequence[Path], name: str, fps: float | None = None) -> None:
@@ -150,7 +150,7 @@ class ImageFiles(FrameReader):
 
 
 def open_folder(folder: Path, fps: float | None = None) -> ImageFiles:
-    """All images of a folder, in natural order; hidden files and other kinds of files are left out."""
+    """All images of a folder in natural order, without hidden files."""
     try:
         entries = sorted(folder.iterdir(), key=lambda entry: natural_key(entry.name))
     except OSError as error:
@@ -167,14 +167,14 @@ def open_folder(folder: Path, fps: float | None = None) -> ImageFiles:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is an image by its name, and not hidden."""
+    """Whether a file has the name of an image and is not hidden."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def open_glob(pattern: str, directory: Path | None = None, fps: float | None = None) -> ImageFiles:
     """All files that match a pattern (`*`, `?`, `[...]`, `**`), in natural order.
 
-    The pattern is relative to the current directory, or to `directory` if nothing matches there.
+    The pattern is relative to the current directory, or, without matches there, to `directory`.
     """
     for base in (Path(), directory or Path()):
         files = [path for path in matching(base / expanded(pattern)) if path.is_file()]
@@ -184,23 +184,23 @@ def open_glob(pattern: str, directory: Path | None = None, fps: float | None = N
 
 
 def matching(pattern: Path) -> list[Path]:
-    """What matches a pattern, in natural order, without hidden files and folders.
+    """The files and folders that match a pattern, in natural order, without hidden ones.
 
-    `**` follows no links, as they may lead in circles.
+    `**` does not follow links, which may be circular.
     """
     parts = pattern.parts
     fixed = next((index for index, part in enumerate(parts) if glob.has_magic(part)), len(parts))
     folder = Path(*parts[:fixed])
-    found = [
+    visible = [
         path
         for path in folder.glob(str(Path(*parts[fixed:])))
         if not any(part.startswith(".") for part in path.relative_to(folder).parts)
     ]
-    return sorted(found, key=lambda path: natural_key(str(path)))
+    return sorted(visible, key=lambda path: natural_key(str(path)))
 
 
 class ArrayFile(FrameReader):
-    """A .npy file: uint8, N x H x W x 3 BGR or N x H x W gray; memory-mapped, never loaded whole.
+    """A memory-mapped .npy file: uint8, N x H x W x 3 BGR or N x H x W gray.
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
@@ -228,7 +228,7 @@ class ArrayFile(FrameReader):
         end = self._array.offset + self._array.nbytes
         with self._path.open("rb") as file:
             for index, frame in enumerate(np.asarray(self._array)):
-                # Reading the map beyond the end of the file would end the process.
+                # Reading the map beyond the end of the file would crash the process.
                 if os.fstat(file.fileno()).st_size < end:
                     raise SourceError(f"{self._path}: was cut off during the run, within frame {index}")
                 yield np.array(frame, order="C"), index / (self.fps or DEFAULT_FPS)
@@ -236,12 +236,12 @@ class ArrayFile(FrameReader):
 
 def _map_array(path: Path) -> np.memmap[Any, Any]:
     try:
-        # Not np.load, which would also take archives and pickles.
+        # np.load would also accept archives and pickles.
         array = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
         raise damaged(str(path), error) from error
     except Exception as error:
-        # The header is read as Python source is: what is wrong with it raises whatever a parser can.
+        # The header is parsed as Python source, so that any exception is possible.
         if ZIP_MAGIC in str(error):
             raise SourceError(f"{path}: a .npz archive; save its array with np.save") from error
         if "mmap length" in str(error) or "file size" in str(error):
@@ -254,7 +254,7 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
 
 
 def refuse_playlist(path: Path) -> None:
-    """Refuse an empty file, and a list of other files: what is passed on as a video must not open others."""
+    """Raise SourceError for an empty file and for a playlist: a video must not open other files."""
     try:
         with path.open("rb") as file:
             head = file.read(64)
@@ -269,8 +269,8 @@ def refuse_playlist(path: Path) -> None:
 class VideoFile(CaptureReader):
     """A video file, read by OpenCV's FFmpeg.
 
-    A frame's time is the file's own time stamp, from 0 at the first frame; where stamps are missing or do not
-    grow, one frame's duration is added instead. fps : frames per second if the file does not say.
+    The time of a frame is its time stamp in the file, from 0 at the first frame; if stamps are missing or do
+    not increase, the duration of a frame is added. fps : frames per second if the file does not state it.
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:

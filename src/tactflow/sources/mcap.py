@@ -1,4 +1,4 @@
-"""Recordings of tactflow, played again: the frames bit for bit, with their original seq, t and flags."""
+"""Replay of tactflow's recordings: identical frames, with their original seq, t and flags."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from tactflow.sources.paths import describe_settings, find_path, split_query
 SETTINGS = {"start": "SECONDS (from the beginning)"}
 
 LATEST_START = 1e9
-"""A start beyond this, s, lies behind the end of every recording: 30 years. Chosen by hand."""
+"""Maximum start, s: 30 years, longer than any recording. Chosen by hand."""
 
 
 class Recording(StampedReader):
-    """An .mcap file that tactflow recorded.
+    """An .mcap file recorded by tactflow.
 
-    A recording brings its own references: capture's parameters `reference` and `skip` do not apply. With
-    `start`, the references that were in force at that time come first.
+    A recording includes its references, so that capture's parameters `reference` and `skip` do not apply.
+    With `start`, the references of that time come first.
 
     spec : `file.mcap`, or `file.mcap?start=2.5`. directory : as for `open_source`. Raises SourceError if it
-    is not there, is not a recording of tactflow, or an option is wrong.
+    does not exist, is not a recording of tactflow, or an option is invalid.
     """
 
     def __init__(self, spec: str, directory: Path | None = None) -> None:
@@ -57,7 +57,7 @@ class Recording(StampedReader):
             )
 
     def _frames(self) -> Iterator[tuple[BgrImage, float, int, bool, int, bool]]:
-        """Each frame, and what is known of it."""
+        """All frames with their metadata."""
         self._picture = str(self._path)
         try:
             for frame, paced in self._stored_frames():
@@ -71,7 +71,7 @@ class Recording(StampedReader):
             ) from error
 
     def _stored_frames(self) -> Iterator[tuple[RawFrame, bool]]:
-        """The frames, and whether each comes at its time (True) or ahead of it."""
+        """The frames, and whether each is delivered at its time (True) or ahead of it."""
         played = messages(self._path, {self._frame_topic, self._reference_topic}, start=self._start)
         if self._start is not None:
             first = next(played, None)
@@ -84,7 +84,7 @@ class Recording(StampedReader):
             played = chain([first], played)
         for message in played:
             frame = parse_frame(message.data)
-            # A recording begun late brings the references of before, at the time it began.
+            # A recording that was started later has earlier references, logged at its start.
             late = frame.reference and message.log_time != max(nanoseconds(frame.t), 0)
             yield frame, not late and frame.seq >= 0
 

@@ -1,4 +1,4 @@
-"""Frames that a program already has: an array, a list, or any iterator of pictures."""
+"""Frames in memory: an array, a list, or any iterator of pictures."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tactflow.sources.files import DEFAULT_FPS
 
 
 class MemoryFrames(FrameReader):
-    """Pictures in memory, as a recording; frame i is taken at i / fps.
+    """Pictures in memory as a recording; the time of frame i is i / fps.
 
-    `tactflow.stream(source=frames)` opens its pictures with this reader. Pictures of an iterator are asked
-    for one at a time, when the pipeline is ready for the next one.
+    `tactflow.stream(source=frames)` uses this reader. It requests pictures of an iterator one at a time, when
+    the pipeline is ready for the next one.
 
     Parameters
     ----------
     frames : (N, H, W, 3) BGR or (N, H, W) gray array of uint8 or uint16, or an iterable of pictures
-        (H, W, 3) or (H, W), all of one size. They are not copied: do not change a picture afterwards.
+        (H, W, 3) or (H, W), all of one size. They are not copied: do not modify them afterwards.
     fps : frames per second; 30 by default.
 
     Raises

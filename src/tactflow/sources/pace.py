@@ -1,4 +1,4 @@
-"""Playing a recording at its own pace."""
+"""Playing a recording in real time."""
 
 from __future__ import annotations
 
@@ -11,23 +11,20 @@ from tactflow.sources.base import Arrival
 from tactflow.system.clock import SYSTEM, Clock
 
 REST = 0.5
-"""The next frame is read after this fraction of the time between frames: what reads, unpacks or renders it
-earlier takes the processor from the work on the last one, which no camera does. Chosen by hand."""
+"""Fraction of the time between frames after which the next one is read: reading, unpacking or rendering it
+earlier would compete with the processing of the last one. Chosen by hand."""
 MAX_BACKLOG = 0.5
-"""A recording that falls further behind, s, continues from there: a laptop was asleep. Chosen by hand."""
+"""Delay after which the recording does not catch up but continues from there, s. Chosen by hand."""
 LONGEST_GAP = 60.0
-"""A recording that pauses for longer, s, is continued at once: a clock was wrong. Chosen by hand."""
+"""Longest gap that is waited for, s; longer ones are skipped. Chosen by hand."""
 
 logger = logging.getLogger("tactflow")
 
 
 class Pace:
-    """Waits until a recording's frames are due, counted from the first one, so that delays do not add up.
+    """Waits until frames are due, relative to the first one, so that delays do not accumulate.
 
-    Parameters
-    ----------
-    stop : ends every wait at once.
-    clock : tells the time, and lets it pass.
+    stop : ends waiting immediately. clock : for time and waiting.
 
     Examples
     --------
@@ -45,14 +42,14 @@ class Pace:
         self._interval = math.inf
 
     def wait_to_read(self) -> bool:
-        """Wait until it is time to read the next frame; False if stopped meanwhile."""
+        """Wait until the next frame should be read; False if stopped."""
         if self._start is None or self._interval == math.inf:
             return not self._stop.is_set()
         due = self._start + self._last + REST * self._interval
         return not self._clock.sleep(max(due - self._clock.now(), 0.0), self._stop)
 
     def wait_for(self, t: float) -> bool:
-        """Wait until time t of the recording, s; False if stopped meanwhile. Skips gaps of a minute."""
+        """Wait until time t of the recording, s; False if stopped. Skips gaps of a minute."""
         now = self._clock.now()
         if self._start is not None and t - self._last > LONGEST_GAP:
             logger.warning("the recording pauses for %.3g s, which is skipped", t - self._last)
@@ -60,17 +57,17 @@ class Pace:
         elif self._start is None or self._start + t - now < -MAX_BACKLOG:
             self._start = now - t
         elif t > self._last:
-            # The shortest so far: after a gap, where frames were dropped, the next one is not late.
+            # The shortest so far, because dropped frames leave gaps.
             self._interval = min(self._interval, t - self._last)
         self._last = t
         return not self._clock.sleep(max(self._start + t - now, 0.0), self._stop)
 
 
 def paced(arrivals: Iterator[Arrival], name: str, realtime: bool, stop: threading.Event) -> Iterator[Arrival]:
-    """Frames of a source until its end or `stop`, with times that never run back.
+    """Frames of a source until its end or `stop`, with non-decreasing times.
 
-    Times that do are counted on from the last one, with a warning in which the source is `name`.
-    realtime : each is returned when it is due; else as fast as it is taken.
+    If times decrease, they continue from the last one, with a warning. name : of the source, for messages.
+    realtime : yield each frame when it is due; else immediately.
     """
     pace = Pace(stop) if realtime else None
     latest, ahead = -math.inf, 0.0

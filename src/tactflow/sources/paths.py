@@ -1,4 +1,4 @@
-"""Paths of sources, and settings behind them: `bag.mcap?topic=/camera/image`."""
+"""Paths of sources, and their settings: `bag.mcap?topic=/camera/image`."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from tactflow.engine.errors import SourceError
 from tactflow.system.files import expanded, is_device
 
 MOST_LISTED = 20
-"""Names that a message lists at most. Chosen by hand."""
+"""Maximum number of names in a message. Chosen by hand."""
 
 
 def locate(spec: str, directory: Path | None) -> Path | None:
-    """The file or folder of this name, here or else in `directory`; None if there is none."""
+    """The file or folder in the current directory, or else in `directory`; None if there is none."""
     paths = (base / expanded(spec) for base in (Path(), directory or Path()))
     return next((path for path in paths if path.exists()), None)
 
 
 def split_prefix(spec: str, directory: Path | None) -> tuple[str, str]:
-    """The word and colon in front of a path, or "", and the path.
+    """The prefix of a path with its colon, or "", and the path.
 
     >>> split_prefix("lerobot:datasets/press", None), split_prefix("press.avi", None)
     (('lerobot:', 'datasets/press'), ('', 'press.avi'))
     """
     prefix, colon, path = spec.partition(":")
-    # A single letter is a drive of Windows.
+    # A single letter is a Windows drive.
     if len(prefix) < 2 or not colon or not prefix.isidentifier() or locate(spec.partition("?")[0], directory):
         return "", spec
     return prefix + colon, path
 
 
 def find_path(spec: str, directory: Path | None) -> Path:
-    """Where a path of a command line or a pipeline file points to; `~` is expanded.
+    """Resolve a path of the command line or a pipeline file; `~` is expanded.
 
-    Raises SourceError if nothing is there (it suggests similar names), and for a pipe or a device: opening
-    one may block for ever, and no signal ends that.
+    Raises SourceError if it does not exist, with similar names, and for a pipe or a device, because opening
+    it may block forever, regardless of signals.
     """
     path = locate(spec, directory)
     if path is None:
@@ -53,7 +53,7 @@ def find_path(spec: str, directory: Path | None) -> Path:
 def _suggestion(candidates: list[Path]) -> str:
     for path in candidates:
         folder, wanted = path.parent, path.name
-        # Climb to the first folder that exists, so that a typo in the middle of a path is found too.
+        # Go up to the first existing folder, to find a typo in the middle of a path.
         while not folder.is_dir() and folder.parent != folder:
             folder, wanted = folder.parent, folder.name
         with suppress(OSError):
@@ -64,7 +64,8 @@ def _suggestion(candidates: list[Path]) -> str:
 
 
 def refuse_devices(path: Path) -> None:
-    """Raise SourceError for a pipe or a device, also through a link or inside a folder: it may never end."""
+    """Raise SourceError for a pipe or a device, also by a link or inside a folder, because it may be
+    endless."""
     inside = [Path(place, name) for place, _, names in os.walk(path) for name in names]
     for file in inside or [path]:
         if is_device(str(file)):
@@ -74,8 +75,8 @@ def refuse_devices(path: Path) -> None:
 def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> tuple[str, dict[str, str]]:
     """The path and the settings of a source, `path?name=value&name=value`; `%26` stands for &.
 
-    A file that has a ? in its name takes precedence. known : name -> what it is, for messages. Raises
-    SourceError if a setting is unknown, empty or given twice.
+    A file with a ? in its name takes precedence. known : name -> description. Raises SourceError if a setting
+    is unknown, empty or repeated.
 
     >>> split_query("bag.mcap?topic=/gel/image", None, {"topic": "name of a topic"})
     ('bag.mcap', {'topic': '/gel/image'})
@@ -98,5 +99,5 @@ def listed(names: Sequence[str]) -> str:
 
 
 def describe_settings(known: Mapping[str, str]) -> str:
-    """The settings that there are, as `name=what it is`."""
+    """The valid settings as `name=description`."""
     return ", ".join(f"{setting}={meaning}" for setting, meaning in known.items())

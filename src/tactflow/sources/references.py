@@ -1,4 +1,4 @@
-"""Which frames of a source show the untouched gel, and come first as the reference."""
+"""Choosing the reference: frames that show the untouched gel."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tactflow.sources.files import ImageFiles
 from tactflow.vision.change import Settling
 
 MEMORY: Final = 128_000_000
-"""Bytes of frames that are held at most while they are examined. Chosen by hand."""
+"""Maximum size of the frames held back while they are examined, bytes. Chosen by hand."""
 
 
 class References:
-    """Chooses the reference frames, and tells the user if they are not the very first ones.
+    """Chooses the reference frames, and reports if they are not the first ones.
 
-    name : of the source, in messages. count : of frames. settle : time after which the light must be steady,
-    s; 0 takes the very first frames. retakes : whether a reconnection begins a new epoch.
+    name : of the source, for messages. count : number of reference frames. settle : longest time until the
+    light is steady, s; 0 takes the first frames. retakes : whether a reconnection starts a new epoch.
 
-    left_out : frames of a live source that were examined and not handed over.
+    left_out : number of frames of a live source that were examined but not delivered.
     """
 
     def __init__(self, name: str, count: int, settle: float, *, retakes: bool = False) -> None:
@@ -35,18 +35,18 @@ class References:
         self.left_out = 0
 
     def retake(self) -> None:
-        """Make the next frames the new reference, in a new epoch: `count` of them. From any thread."""
+        """Make the next `count` frames the reference of a new epoch. Thread-safe."""
         self._requested.set()
 
     def arranged(
         self, arrivals: Iterator[Arrival], source: FrameReader, image: BgrImage | None
     ) -> Iterator[Arrival]:
-        """The frames of a source with their references marked.
+        """Mark the references among the frames of a source.
 
-        The first ones are held back until it is known which of them is the reference. If it is not the very
-        first one, it comes before all others, with number -1; of a live source, the others are left out.
+        The first frames are held back until the reference is chosen. If it is not the first frame, it is also
+        delivered before all others, with number -1; for a live source, the others are omitted.
 
-        image : (H, W, 3) uint8 BGR, the reference in place of the first frames; or None.
+        image : (H, W, 3) uint8 BGR, a reference that replaces the first frames; or None.
         """
         first = None
         if image is None:
@@ -76,7 +76,7 @@ class References:
             raise failure
 
     def marked(self, arrival: Arrival) -> Arrival:
-        """The next frame, as a reference if it is one."""
+        """The next frame, marked if it is a reference."""
         if arrival.seq >= 0 and self._requested.is_set():
             self._begin(self._count)
         reference = self._left > 0
@@ -84,18 +84,18 @@ class References:
         return arrival._replace(reference=reference or arrival.reference, epoch=arrival.epoch + self._epoch)
 
     def _begin(self, count: int) -> None:
-        """Make the next frames references; in a new epoch if that was requested."""
+        """Make the next frames references, in a new epoch if requested."""
         if self._requested.is_set():
             self._requested.clear()
             self._epoch += 1
         self._left = count
 
     def _begin_settling(self) -> Settling | None:
-        """What examines the first frames; None if they are handed out at once."""
+        """The test for the first frames; None if they are delivered immediately."""
         return Settling() if self._settle > 0 else None
 
     def _goes_on(self, first: Settling, held: list[Arrival]) -> bool:
-        """Examine the newest frame; whether more frames are needed."""
+        """Examine the newest frame; returns whether more frames are needed."""
         image, t = held[-1].image, held[-1].t
         first.add(image, t)
         decided = first.touched or first.unrelated or (first.steady and len(first) >= self._count)
@@ -105,7 +105,7 @@ class References:
     def _released(
         self, first: Settling | None, held: list[Arrival], source: FrameReader
     ) -> Iterator[Arrival]:
-        """The frames that were held back; of a live source, the references alone."""
+        """The frames that were held back; for a live source, only the references."""
         if first is not None and held:
             chosen = self._choose(first, source)
             if source.live:
@@ -118,7 +118,7 @@ class References:
         yield from map(self.marked, held)
 
     def _choose(self, first: Settling, source: FrameReader) -> list[int]:
-        """Indices of the frames that show the untouched gel, in order: `count` of them, or as many as do."""
+        """Indices of frames that show the untouched gel, in order: `count` of them, or fewer."""
         best, alike = first.best(), first.alike()
         begin = max(0, min(alike.index(best) - self._count // 2, len(alike) - self._count))
         chosen = alike[begin : begin + self._count]
@@ -126,7 +126,7 @@ class References:
         return chosen
 
     def _report(self, first: Settling, best: int, source: FrameReader) -> None:
-        """Say in one line which frame is the reference and why, unless it is clearly the very first."""
+        """Log which frame is the reference and why, unless it is clearly the first one."""
         if first.changing:
             log.warning(
                 "%s: the light is not steady, it changed by %.0f %% within the last frames; the reference is "
@@ -155,7 +155,7 @@ class References:
         log.info("%s: the reference is frame %d%s", self._name, best, why)
 
     def _shown_before(self, image: BgrImage, first: Arrival) -> Arrival:
-        """A reference that comes before the first frame, and as large as that."""
+        """A reference delivered before the first frame, whose size it must have."""
         (height, width), (high, wide) = image.shape[:2], first.image.shape[:2]
         if (height, width) != (high, wide):
             raise SourceError(

@@ -1,7 +1,7 @@
-"""Live sources that fail and come back: faults are reported, and the source is opened again.
+"""Monitoring of live sources: faults are reported, and the source is reopened.
 
-A thread reads all the time and keeps only the newest frame, so that a driver's buffer never goes stale and
-waiting for a frame can be ended at once.
+A thread reads continuously and keeps only the newest frame, so that the driver's buffer holds no old frames,
+and waiting for a frame can be interrupted.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from tactflow.sources.base import Arrival, BgrImage, FrameReader, log
 from tactflow.system.clock import SYSTEM, Clock
 
 BLACK_LEVEL = 4.0
-"""Mean gray level at and below which a picture counts as black; a lit gel has 30 and more."""
+"""Maximum mean gray level of a black picture; a lit gel has 30 and more."""
 BLACK_STEP = 8
-"""The mean is taken over every so many rows and columns, px: a mean needs no more pixels. Chosen by hand."""
+"""Sampling step for that mean, px. Chosen by hand."""
 FIRST_FRAME_SECONDS = 3.0
-"""A device may take so long to its first frame before that is reported, s. Chosen by hand."""
+"""Stall timeout for the first frame, s. Chosen by hand."""
 SILENT_INTERVALS = 3.0
-"""A gap shorter than so many usual times between frames is no stall. Chosen by hand."""
+"""Minimum length of a stall, in usual times between frames. Chosen by hand."""
 INTERVAL_DECAY = 0.9
-"""By this factor a long gap counts less with each frame after it. Chosen by hand."""
+"""Decay of the usual time between frames per frame after a long gap. Chosen by hand."""
 CLOSE_SECONDS = 3.0
-"""How long `close` waits for a read that is under way, s. Chosen by hand."""
+"""Longest time that `close` waits for a pending read, s. Chosen by hand."""
 POLL_SECONDS = 0.1
-"""How often a waiting reader looks for faults, s. Chosen by hand."""
+"""Interval at which a waiting reader checks for faults, s. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """What counts as a fault of a live source, and what is done then. All times in s.
+    """Faults of a live source, and their handling. All times in s.
 
-    reconnect : open the source again after a fault, until it is back. If False, a camera that stops is an
-        error and a stream that ends is the end.
-    no_frame_timeout : an error after so long without a good frame; None or 0 never gives up.
-    frozen_after : pictures that are identical for so long are a fault; None never.
-    black_after : black pictures for so long are a fault; None never.
-    silent_after : stall timeout: no picture for so long, and for three times the usual interval, is a fault.
-    first_retry, last_retry : back-off between attempts: doubles from the first to the last.
+    reconnect : reopen the source after a fault. If False, a camera that stops is an error, and the end of a
+        stream is the end of the source.
+    no_frame_timeout : time without a good frame after which reading fails; None or 0: never.
+    frozen_after : time with identical pictures that is a fault; None: never.
+    black_after : time with black pictures that is a fault; None: never.
+    silent_after : stall timeout: time without a picture that is a fault, if it exceeds three usual intervals.
+    first_retry, last_retry : back-off between attempts, which doubles from the first to the last.
     """
 
     reconnect: bool = True
@@ -59,12 +59,11 @@ class Watch:
 
 @dataclass(slots=True)
 class _Fault:
-    """since : on the clock, s. hour : the same for people. retry_at : when to open the source again, s.
-
-    attempts : to open it, so far. detail : the last error.
+    """kind : in words. since : time of the clock, s. hour : the same as text. retry_at : time of the next
+    attempt to open the source, s. detail : the last error. attempts : number so far.
     """
 
-    what: str
+    kind: str
     since: float
     hour: str
     retry_at: float
@@ -73,15 +72,15 @@ class _Fault:
 
 
 class Watched(FrameReader):
-    """A live source that is watched, and opened again when it fails.
+    """A monitored live source, which is reopened when it fails.
 
-    The first opening happens here and must succeed: a wrong address is an error at once, not after a wait.
+    The constructor opens it and must succeed, so that a wrong address is an error immediately.
 
-    opener : opens the source; called again for each reconnection, in another thread. name : what messages
-    call it. clock : tells the time, and lets it pass between two attempts.
+    opener : opens the source; also called for each reconnection, in another thread. name : for messages.
+    clock : for time, and for waiting between attempts.
 
     Raises SourceError if the source cannot be opened, and from `read` if there was no good frame for
-    `no_frame_timeout`, or the source failed and `reconnect` is False. Any reader can stand for a camera:
+    `no_frame_timeout`, or the source failed and `reconnect` is False. Any reader can replace a camera:
 
     >>> from tactflow.sources import open_source
     >>> source = Watched(lambda: open_source("sim:idle?frames=100"), Watch(), "example")
@@ -120,16 +119,16 @@ class Watched(FrameReader):
 
     @property
     def state(self) -> str:  # type: ignore[override]
-        """What is wrong, and since when."""
+        """The current fault and its start."""
         fault = self._fault
         if fault is None:
             return "running"
         attempts = f", attempt {fault.attempts}" if fault.attempts else ""
-        word = "reconnecting" if fault.attempts or fault.what == "gone" else "waiting"
-        return f"{word} since {fault.hour} ({fault.what}{attempts})"
+        word = "reconnecting" if fault.attempts or fault.kind == "gone" else "waiting"
+        return f"{word} since {fault.hour} ({fault.kind}{attempts})"
 
     def read_arrival(self) -> Arrival | None:
-        """Wait for the newest frame that was not read yet; None at the end and after `stop`."""
+        """Wait for a new frame, and return the newest; None at the end and after `stop`."""
         with self._changed:
             while not self._stopped.is_set():
                 arrival, self._newest = self._newest, None
@@ -145,13 +144,13 @@ class Watched(FrameReader):
         return None
 
     def stop(self) -> None:
-        """End a read that waits, at once. From any thread."""
+        """End a waiting read immediately. Thread-safe."""
         self._stopped.set()
         with self._changed:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Release the source. A read that hangs is given a moment; it releases it when it ends."""
+        """Release the source; a hanging read releases it when it ends."""
         super().close()
         self.stop()
         self._reader.join(CLOSE_SECONDS)
@@ -160,10 +159,10 @@ class Watched(FrameReader):
         while (arrival := self.read_arrival()) is not None:
             yield arrival.image, arrival.t
 
-    # -- faults; whoever calls these holds the lock -------------------------------------------------------
+    # -- faults; callers hold the lock --------------------------------------------------------------------
 
     def _check_time(self, now: float) -> None:
-        """Notice what no frame can show: a stall, and the end of all patience."""
+        """Detect stalls and timeouts."""
         watch = self._watch
         usual = FIRST_FRAME_SECONDS if self._seq < 0 else watch.silent_after
         if self._fault is None and now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval):
@@ -176,29 +175,29 @@ class Watched(FrameReader):
         last = f"; the last attempt of {fault.attempts}" if fault and fault.attempts else ""
         detail = f"{last}: {fault.detail}" if fault and fault.detail else last
         return SourceError(
-            f"{self.name}: {fault.what if fault else 'no frames'}, no good frame for "
+            f"{self.name}: {fault.kind if fault else 'no frames'}, no good frame for "
             f"{now - self._good_at:.1f} s{detail}; check its cable, power and light and what else may be "
             "using it; no_frame_timeout sets how long to wait (0: forever)"
         )
 
-    def _report(self, what: str, since: float, now: float, detail: str = "") -> None:
+    def _report(self, kind: str, since: float, now: float, detail: str = "") -> None:
         hour = time.strftime("%H:%M:%S", time.localtime(self._clock.unix() - (now - since)))
-        retry_at = now + self._watch.first_retry if what == "gone" else now
-        self._fault = _Fault(what, since, hour, retry_at, detail)
-        then = "" if not self._watch.reconnect else "; waiting" if what == "no frames" else "; reconnecting"
-        words = f"is {what}" if what == "gone" else what
+        retry_at = now + self._watch.first_retry if kind == "gone" else now
+        self._fault = _Fault(kind, since, hour, retry_at, detail)
+        then = "" if not self._watch.reconnect else "; waiting" if kind == "no frames" else "; reconnecting"
+        words = f"is {kind}" if kind == "gone" else kind
         reason = f": {detail}" if detail else ""
         log.warning("%s: %s since %s (%.1f s)%s%s", self.name, words, hour, now - since, reason, then)
 
     def _recover(self, fault: _Fault, now: float) -> None:
         self._fault = None
         tries = f", at attempt {fault.attempts}" if fault.attempts else ""
-        log.warning("%s: is back after %.1f s%s (%s)", self.name, now - fault.since, tries, fault.what)
+        log.warning("%s: is back after %.1f s%s (%s)", self.name, now - fault.since, tries, fault.kind)
 
     def _picture_problem(self, image: BgrImage, now: float) -> tuple[str, float, bool] | None:
-        """What is wrong with a picture, since when (s), and whether that has lasted long enough to report it.
+        """The fault of a picture, its start (s), and whether it has lasted long enough to be reported.
 
-        Before anything else was there, black is no picture of the gel: it must not become the reference.
+        Black pictures at the start are a fault immediately, because they must not become the reference.
         """
         watch = self._watch
         if watch.black_after is not None:
@@ -214,10 +213,10 @@ class Watched(FrameReader):
                 return "a frozen picture", self._changed_at, True
         return None
 
-    # -- the thread that reads ----------------------------------------------------------------------------
+    # -- the reading thread -------------------------------------------------------------------------------
 
     def _work(self, source: FrameReader | None) -> None:
-        """Read the source until it fails, and open it again, until the end."""
+        """Read the source, and reopen it after faults, until the end."""
         while source is not None or self._wait_to_retry():
             try:
                 with closing(source or self._reopen()) as opened:
@@ -236,7 +235,7 @@ class Watched(FrameReader):
         return not self._ended and self._failure is None and not self._stopped.is_set()
 
     def _wait_to_retry(self) -> bool:
-        """Wait until the source may be opened again, with exponential back-off; False if there is no need."""
+        """Wait for the next attempt to open the source (exponential back-off); False at the end."""
         fault, watch = self._fault, self._watch
         if fault is None or not self._is_running():
             return False
@@ -255,13 +254,13 @@ class Watched(FrameReader):
         return source
 
     def _take(self, image: BgrImage, t: float) -> bool:
-        """A frame has arrived; True if the source is to be opened again."""
+        """Handle a new frame; returns whether to reopen the source."""
         now = self._clock.now()
         with self._changed:
             gap, self._arrived_at = now - self._arrived_at, now
             size, first = (image.shape[1], image.shape[0]), self.size
             if first is None or self._seq < 0:
-                # A driver may state another size.
+                # The driver may have stated another size.
                 self.size = size
             elif size != first:
                 raise SourceError(
@@ -272,9 +271,9 @@ class Watched(FrameReader):
                 self._interval = max(gap, INTERVAL_DECAY * self._interval)
             problem = self._picture_problem(image, now)
             if problem is not None:
-                what, since, reportable = problem
+                kind, since, reportable = problem
                 if self._fault is None and reportable:
-                    self._report(what, since, now)
+                    self._report(kind, since, now)
                 return self._fault is not None and self._watch.reconnect and now >= self._fault.retry_at
             if self._fault is not None:
                 self._recover(self._fault, now)
@@ -286,7 +285,7 @@ class Watched(FrameReader):
             return False
 
     def _fail(self, error: Exception | None) -> None:
-        """Reading failed, or, if there is no error, the source says that it is the end."""
+        """Handle an error on reading, or (None) the end of the source."""
         detail = "it ended" if error is None else str(error).removeprefix(f"{self.name}: ")
         if error is not None and not isinstance(error, SourceError):
             detail = f"{type(error).__name__}: {detail}"

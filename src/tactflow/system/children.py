@@ -1,4 +1,4 @@
-"""Python processes that tactflow starts. None of them imports modules from the current folder."""
+"""Child processes of Python, which do not import modules from the current folder."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from contextlib import contextmanager
 def python_command(*arguments: str) -> list[str]:
     """The command line of a Python child, for `subprocess`.
 
-    Without `-P`, Python would look for every module in the current folder first: a `random.py` that lies
-    there would run.
+    Without `-P`, Python would search the current folder first for every module, and run a `random.py` there.
 
     >>> python_command("-m", "tactflow", "check")[1:]
     ['-P', '-m', 'tactflow', 'check']
@@ -23,13 +22,13 @@ def python_command(*arguments: str) -> list[str]:
 
 @contextmanager
 def starting_children(blocked: Collection[int] = ()) -> Iterator[None]:
-    """Let multiprocessing, or Dask, start its processes in this block.
+    """Context in which multiprocessing, or Dask, may start processes.
 
-    blocked : signals that never reach them. Ctrl-C on a terminal reaches every process there; the process of
-        the command line decides what ends. In this thread they arrive after the block.
+    blocked : signals that the children never receive: Ctrl-C on a terminal reaches every process, but the
+        process of the command line decides what ends. This thread receives them after the block.
     """
     before = os.environ.get("PYTHONSAFEPATH")
-    # The environment variable for -P: multiprocessing composes the command line itself.
+    # Equivalent to -P, because multiprocessing composes the command line itself.
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
         with _signals_blocked(blocked):
@@ -50,7 +49,7 @@ def _signals_blocked(numbers: Collection[int]) -> Iterator[None]:
 
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
-        # Python starts this process with the first child, and then unblocks SIGINT and SIGTERM.
+        # Otherwise Python starts it with the first child, and then unblocks SIGINT and SIGTERM.
         resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
         yield

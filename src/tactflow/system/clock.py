@@ -1,4 +1,4 @@
-"""The clock of everything that waits or measures time; a test passes one that it moves by hand.
+"""The clock for waiting and measuring time; tests pass one that they advance.
 
 >>> from tactflow.system.clock import SYSTEM
 >>> began = SYSTEM.now()
@@ -15,24 +15,24 @@ import time
 
 
 class Clock:
-    """The clock of the machine. Its methods may be called from any thread."""
+    """The clock of the machine; thread-safe."""
 
     def now(self) -> float:
-        """Monotonic time, s, as in `Frame.captured`; only differences mean something."""
+        """Monotonic time, s, as in `Frame.captured`; only differences are meaningful."""
         return time.perf_counter()
 
     def unix(self) -> float:
-        """Time since 1970, s, for people and for frames of live sources."""
+        """Unix time, s, for messages and for frames of live sources."""
         return time.time()
 
     def sleep(self, seconds: float, end: threading.Event) -> bool:
-        """Sleep, at most until `end` is set; returns whether it is."""
+        """Sleep until `end` is set, for at most `seconds`; returns whether it is set."""
         return end.wait(seconds) if seconds > 0 else end.is_set()
 
     def wait(self, seconds: float, changed: threading.Condition) -> None:
-        """Wait until another thread notifies `changed`, which the caller holds, at most `seconds`."""
+        """Wait for a notification of `changed`, which the caller holds, for at most `seconds`."""
         changed.wait(seconds)
 
 
 SYSTEM = Clock()
-"""The clock that everything uses unless it is given another one."""
+"""The default clock."""

@@ -1,4 +1,4 @@
-"""Installed packages: those of an extra that are missing, and OpenCV packages that overwrite each other."""
+"""Missing packages of extras, and conflicting OpenCV packages."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ OPENCV = "opencv-python-headless"
 """The OpenCV package that tactflow depends on."""
 
 
-def missing(what: str, extra: str, modules: Sequence[str]) -> str | None:
-    """Why something cannot be done here and what to install, or None.
+def missing(feature: str, extra: str, modules: Sequence[str]) -> str | None:
+    """A message about packages that are not installed, with the remedy; None if all are.
 
-    what : in the plural, at the beginning of the sentence. extra : of tactflow, as in
-    `pip install 'tactflow[record]'`. modules : that must be there, top level.
+    feature : in the plural. extra : of tactflow, as in `pip install 'tactflow[record]'`. modules : required
+    top-level modules.
 
     >>> missing("recordings", "record", ["json", "no_such_module"])
     "recordings need no_such_module: pip install 'tactflow[record]'"
@@ -25,19 +25,19 @@ def missing(what: str, extra: str, modules: Sequence[str]) -> str | None:
     absent = [name for name in modules if importlib.util.find_spec(name) is None]
     if not absent:
         return None
-    return f"{what} need {joined(absent)}: pip install 'tactflow[{extra}]'"
+    return f"{feature} need {joined(absent)}: pip install 'tactflow[{extra}]'"
 
 
 def opencv_conflict() -> str | None:
-    """What is wrong where several OpenCV packages are installed, and what to do, or None. Takes 20 ms."""
-    found: dict[str, str] = {}
+    """A message if several OpenCV packages are installed, with the remedy, or None. Takes 20 ms."""
+    versions: dict[str, str] = {}
     for name in ("opencv-python", "opencv-contrib-python", "opencv-contrib-python-headless", OPENCV):
         with suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    if len(found) < 2:
+            versions[name] = metadata.version(name)
+    if len(versions) < 2:
         return None
-    names = " and ".join(f"{name} {number}" for name, number in found.items())
+    names = " and ".join(f"{name} {number}" for name, number in versions.items())
     return (
         f"{names} are installed together and overwrite each other's files, so that it is left to chance "
-        f"which one runs; to repair it: pip uninstall --yes {' '.join(found)}, then pip install {OPENCV}"
+        f"which one runs; to repair it: pip uninstall --yes {' '.join(versions)}, then pip install {OPENCV}"
     )

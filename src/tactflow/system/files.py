@@ -1,4 +1,4 @@
-"""Files as pipelines and command lines name them."""
+"""Paths and files."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if sys.platform != "win32":
 
 
 def expanded(text: str) -> Path:
-    """A path with `~` and `~name` replaced. An unknown name stays, and is reported as a missing file."""
+    """A path with `~` and `~name` expanded; an unknown name is left unchanged."""
     return Path(os.path.expanduser(text))
 
 
 def is_utf8(text: str) -> bool:
-    """Whether a text, such as the name of a file, can be written to messages and tables.
+    """Whether a text, such as a file name, can be encoded in UTF-8.
 
     >>> is_utf8("left-ü"), is_utf8("left-\\udcff")
     (True, False)
@@ -35,7 +35,7 @@ def is_utf8(text: str) -> bool:
 
 
 def status(text: str) -> os.stat_result | None:
-    """The status of a path; None if nothing is there."""
+    """The status of a path; None if it does not exist."""
     try:
         return expanded(text).stat()
     except (OSError, ValueError):
@@ -44,16 +44,16 @@ def status(text: str) -> os.stat_result | None:
 
 def is_device(text: str) -> bool:
     """Whether it exists and is neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
-    found = status(text)
-    return found is not None and not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode)
+    file = status(text)
+    return file is not None and not stat.S_ISREG(file.st_mode) and not stat.S_ISDIR(file.st_mode)
 
 
 MAX_BYTES = 1 << 20
-"""Size limit of a file of code or YAML: far above any that people write."""
+"""Size limit of files of code or YAML, far above usual sizes."""
 
 
 def read_limited(path: Path) -> bytes:
-    """The bytes of a file of code or YAML. Raises OSError for one that is larger than `MAX_BYTES`."""
+    """Read a file of code or YAML. Raises OSError if it is larger than `MAX_BYTES`."""
     with path.open("rb") as stream:
         # A device such as /dev/zero has no end.
         data = stream.read(MAX_BYTES + 1)
@@ -63,7 +63,7 @@ def read_limited(path: Path) -> bytes:
 
 
 def next_name(path: Path) -> Path:
-    """The numbered name after those that are taken: press.mcap, press-001.mcap, press-002.mcap ...
+    """The next numbered name after existing ones: press.mcap, press-001.mcap, press-002.mcap ...
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -75,20 +75,20 @@ def next_name(path: Path) -> Path:
     pattern = re.compile(re.escape(path.stem) + r"-(\d+)" + re.escape(path.suffix))
     if path.parent.is_dir():
         for name in os.listdir(path.parent):
-            found = pattern.fullmatch(name)
-            taken = max(taken, int(found[1]) if found else 0)
+            match = pattern.fullmatch(name)
+            taken = max(taken, int(match[1]) if match else 0)
     return path.with_name(f"{path.stem}-{taken + 1:03d}{path.suffix}")
 
 
 @contextmanager
 def completed(path: Path, *, make_parent: bool = True) -> Iterator[Path]:
-    """A path to write a file or a folder to, renamed to `path` if all went well and removed if not.
+    """A temporary path for a file or folder, renamed to `path` on success and removed on error.
 
-    It replaces what is there, but no file replaces a folder; if nothing was written, nothing is replaced. Its
-    name begins with a dot and ends as that of `path` does. What a killed process of this machine has left for
-    the same path is removed first.
+    It replaces an existing file or folder, but a file never replaces a folder; if nothing was written,
+    nothing is replaced. Its name begins with a dot and has the suffix of `path`. Leftovers of killed
+    processes of this machine for the same path are removed first.
 
-    make_parent : whether folders above are made; if not, they have to be there.
+    make_parent : whether to create missing parent folders.
     Raises OSError.
     """
     if make_parent:
@@ -111,7 +111,7 @@ def completed(path: Path, *, make_parent: bool = True) -> Iterator[Path]:
 
 def _has_ended(process: int) -> bool:
     if sys.platform == "win32":
-        # Signal 0 would end it there.
+        # Signal 0 would terminate the process.
         return False
     else:  # noqa: RET505 (mypy knows branches)
         try:
@@ -132,11 +132,11 @@ def _remove(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and all above it, unless it exists.
+    """Create a folder and its parents, unless it exists.
 
     Raises
     ------
-    OSError : it cannot be made; where a file is in its place, `strerror` says which.
+    OSError : it cannot be created; if a file is in its place, `strerror` names it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -146,14 +146,14 @@ def make_folder(folder: Path) -> None:
 
 
 def claim_path(path: Path) -> int | None:
-    """Claim a file or a folder that exists until the descriptor returned is closed.
+    """Lock an existing file or folder until the returned descriptor is closed.
 
-    The claim binds only those who ask. It ends with the process, however that ends; where the file system
-    knows no locks, everybody gets one. Windows itself refuses to replace a file that is open.
+    The lock is advisory and ends with the process. It always succeeds on file systems without locks, and does
+    nothing on Windows, which does not allow replacing an open file.
 
     Raises
     ------
-    OSError : another run has claimed it (BlockingIOError), or it cannot be opened.
+    OSError : another run holds the lock (BlockingIOError), or it cannot be opened.
     """
     if sys.platform == "win32":
         return None
@@ -170,25 +170,25 @@ def claim_path(path: Path) -> int | None:
 
 
 class LossyStream(io.TextIOWrapper):
-    """Standard error that loses its output, instead of raising, once its reader has left.
+    """Standard error that discards its output after its reader has closed it, instead of raising.
 
-    stream : the present standard error, which it replaces.
+    stream : the standard error that it replaces.
     """
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream.buffer, stream.encoding, stream.errors, line_buffering=True)
-        # Without a reference, it would close what both write to.
+        # Without a reference, the replaced stream would be collected and close the shared file.
         self._replaced = stream
 
     def write(self, text: str) -> int:
-        """Write, or lose it."""
+        """Write, or discard."""
         with suppress(OSError):
             return super().write(text)
         discard_output(self)
         return len(text)
 
     def flush(self) -> None:
-        """Flush, or lose it."""
+        """Flush, or discard."""
         try:
             super().flush()
         except OSError:
@@ -196,9 +196,9 @@ class LossyStream(io.TextIOWrapper):
 
 
 def discard_output(stream: IO[str]) -> None:
-    """Lead a stream to the null device: what it has buffered and what follows is lost without an error.
+    """Redirect a stream to the null device, so that buffered and further output is discarded.
 
-    Python flushes standard output once more at exit.
+    This also covers the flush of standard output at exit.
     """
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())

@@ -1,4 +1,4 @@
-"""Whole lines: to a file that others may cut or remove, or to a reader who may be slow or never come."""
+"""Writing complete lines to a file or to the reader of a pipe."""
 
 from __future__ import annotations
 
@@ -21,23 +21,25 @@ from tactflow.system.outputs import cannot_write, refuse_interference
 log = logging.getLogger("tactflow")
 
 LOOK_EVERY = 0.1
-"""Time between two looks whether to go on waiting for a reader, s."""
+"""Poll interval while waiting for a reader, s."""
 LINGER = 1.0
-"""Time to deliver the last lines to a reader who is not waited for any more, s; as the ZeroMQ sink's."""
+"""Time to deliver the last lines when the run no longer waits for the reader, s; as for the ZeroMQ sink."""
 MOST_WAITING = 1000
-"""Lines kept for a reader that takes none: 17 s at 60 Hz, 6 MB with 60 markers each."""
+"""Length of the queue for a slow reader, lines: 17 s at 60 Hz, 6 MB with 60 markers each."""
 LONGEST_LINE = 1 << 24
 """Upper bound of a line, bytes: one with a displacement field has some 100 kB."""
 
 
 class LineStream:
-    """Writes whole lines to a pipe or standard output from a thread of its own, at the pace of the reader.
+    """Writes complete lines to a pipe or standard output, in its own thread, at the pace of the reader.
 
-    In a live run, the oldest beyond `MOST_WAITING` lines are dropped; otherwise the reader is waited for.
+    In a live run, the oldest of more than `MOST_WAITING` lines are dropped; otherwise it waits for the
+    reader.
 
-    path : the named pipe or device, for whose reader the constructor waits; "-" is standard output.
-    control : the run, which knows whether it is live, and whether it is to end; or None.
-    delivered, dropped : lines. ended : there is no reader (any more), which is no error.
+    path : a named pipe or device, whose reader the constructor waits for; "-" is standard output.
+    control : the run, which is live or not, and may be stopped; or None.
+    delivered, dropped : number of lines. ended : whether there is no reader (any more), which is not an
+    error.
 
     Raises
     ------
@@ -53,7 +55,7 @@ class LineStream:
         self._lines: queue.Queue[bytes | None] = queue.Queue(MOST_WAITING)
         self._error: OSError | None = None
         self._opened = threading.Event()
-        # A daemon: to open or write a pipe may take for ever.
+        # A daemon, because opening or writing a pipe may block forever.
         self._thread = threading.Thread(target=self._deliver, args=(path,), daemon=True)
         self._thread.start()
         if not self._opened.wait(LOOK_EVERY):
@@ -65,7 +67,7 @@ class LineStream:
     def _deliver(self, path: str) -> None:
         """Body of the thread."""
         try:
-            # Not the buffer of standard output, which Python could not flush at exit while a write hangs.
+            # Unbuffered: Python could not flush the buffer of standard output at exit while a write hangs.
             number = sys.stdout.fileno() if path == "-" else os.open(expanded(path), os.O_WRONLY)
             self._opened.set()
             with os.fdopen(number, "wb", buffering=0, closefd=path != "-") as file:
@@ -95,7 +97,7 @@ class LineStream:
         return self._control is not None and self._control.hurried
 
     def send(self, line: bytes) -> None:
-        """Add a line, without its end; wait while the reader of a recording takes none."""
+        """Add a line without its line end; for a recording, wait while the queue is full."""
         while not self.ended:
             waits = not (self._is_live() or self._is_hurried())
             try:
@@ -116,9 +118,9 @@ class LineStream:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write the rest, for `LINGER` if nobody waits for the reader, and close the file.
+        """Write the rest, for at most `LINGER` if the run does not wait for the reader, and close the file.
 
-        Also raises StageError if the reader did not take all lines of a recording.
+        Raises StageError also if the reader did not take all lines of a recording.
         """
         until = time.monotonic() + LINGER
         while self._thread.is_alive() and not self.ended:
@@ -138,15 +140,16 @@ class LineStream:
 
 
 class LineFile:
-    """Writes whole lines to a regular file, and notices what other programs do to it.
+    """Writes complete lines to a regular file, and detects interference by other programs.
 
-    path : the file; created with its folder. replaces : empty it first. Otherwise lines are added after its
-    last complete line. every : longest time that lines wait before they are written, s. delivered : lines.
+    path : the file; created with its folder. replaces : whether to truncate it; otherwise lines are appended
+    after its last complete line. every : longest time that lines are buffered, s. delivered : number of
+    lines.
 
     Raises
     ------
-    StageError : from every method, if it cannot be written; it then ends with the last line that fitted. Or
-        another program has removed or replaced it, or it does not end with a result message.
+    StageError : from every method, if it cannot be written (it then ends with the last complete line), if
+        another program has removed or replaced it, or if it does not end with a result message.
     """
 
     ended = False
@@ -159,7 +162,7 @@ class LineFile:
         self._written = time.monotonic()
         try:
             make_folder(path.parent)
-            # Appending: where another program cuts the file, no gap of NULs follows.
+            # In append mode, no gap of NULs follows if another program truncates the file.
             self._file = path.open("ab+", buffering=0)
         except OSError as error:
             raise cannot_write(path, error) from error
@@ -172,7 +175,7 @@ class LineFile:
             raise
 
     def send(self, line: bytes) -> None:
-        """Add a line, without its end."""
+        """Add a line without its line end."""
         self._waiting.append(line + b"\n")
         now = time.monotonic()
         if now - self._written >= self._every:
@@ -180,7 +183,7 @@ class LineFile:
             self._write()
 
     def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write buffered lines, and close the file."""
         try:
             self._write()
         finally:
@@ -191,7 +194,7 @@ class LineFile:
         data, self._waiting = b"".join(self._waiting), []
         written = 0
         try:
-            # An unbuffered file may take only a part, and says why at the next attempt.
+            # A raw file may write only a part; the next attempt raises the error.
             while written < len(data):
                 written += self._file.write(data[written:])
         except OSError as error:
@@ -203,16 +206,17 @@ class LineFile:
         self.delivered += data.count(b"\n")
         ours = os.fstat(self._file.fileno())
         refuse_interference(self._path, ours, f"{self.delivered} lines are not in it")
-        gone = self._size + len(data) - ours.st_size
-        if gone > 0:
-            log.warning("%s: was cut by another program: %d written bytes are gone", self._path, gone)
+        lost = self._size + len(data) - ours.st_size
+        if lost > 0:
+            log.warning("%s: was cut by another program: %d written bytes are gone", self._path, lost)
         self._size = ours.st_size
 
 
 def _complete_last_line(file: BinaryIO, path: Path) -> int:
-    """End the last line of a file, or cut off half a message; returns the size of the file, bytes.
+    """Terminate the last line of a file, or remove an incomplete message; returns the size of the file,
+    bytes.
 
-    Raises StageError if the file ends with something else: that is not ours to cut off.
+    Raises StageError if the file ends with other content, which must not be removed.
     """
     end = file.seek(0, os.SEEK_END)
     file.seek(max(0, end - LONGEST_LINE))
@@ -223,7 +227,7 @@ def _complete_last_line(file: BinaryIO, path: Path) -> int:
         json.loads(rest)
         file.write(b"\n")
     except (ValueError, RecursionError):
-        # A power cut may leave NULs. Anything else belongs to another program, or to the user.
+        # A power cut may leave NULs. Other content belongs to another program, or to the user.
         if not rest.startswith(b"{") and rest.strip(b"\0"):
             raise StageError(
                 f"{path}: cannot be continued: it does not end with a result message; give another path"

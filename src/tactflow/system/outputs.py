@@ -1,4 +1,4 @@
-"""Files that a run writes: created, and checked to be still there."""
+"""Output files of a run: creating them, and detecting interference."""
 
 from __future__ import annotations
 
@@ -10,29 +10,25 @@ from tactflow.system.files import is_device, make_folder
 
 
 def cannot_write(path: Path | str, error: OSError, kept: str = "") -> StageError:
-    """The error to raise where a file cannot be written. kept : what is safe, and what to do."""
+    """The error for a file that cannot be written. kept : what is complete, and the remedy."""
     return StageError(f"{path}: cannot be written: {error.strerror or error}{kept and f'; {kept}'}")
 
 
-def refuse_existing(path: Path, *, overwrite: bool, others: str = "") -> None:
-    """Refuse a file that is there, unless it may be replaced, and a pipe or device, which can hang.
+def refuse_existing(path: Path, *, overwrite: bool, advice: str = "") -> None:
+    """Raise StageError for an existing file, unless it may be replaced, and for a pipe or device.
 
-    others : what else to try, such as `append: true to continue it, `.
-
-    Raises
-    ------
-    StageError : there is one.
+    advice : another remedy, such as `append: true to continue it, `.
     """
     if path.exists() and not path.is_dir() and not overwrite:
         raise StageError(
-            f"{path}: this file exists; set overwrite: true to replace it, {others}or give another path"
+            f"{path}: this file exists; set overwrite: true to replace it, {advice}or give another path"
         )
     if is_device(str(path)):
         raise StageError(f"{path}: required a file, not a pipe or device; give another path")
 
 
 def create(path: Path, *, overwrite: bool) -> None:
-    """Create an empty file and its folder, or empty an existing file with `overwrite`.
+    """Create an empty file and its folder, or truncate an existing file with `overwrite`.
 
     Raises
     ------
@@ -47,20 +43,15 @@ def create(path: Path, *, overwrite: bool) -> None:
 
 
 def refuse_interference(path: Path, ours: os.stat_result, lost: str, length: int = 0) -> None:
-    """Notice that another program has removed, replaced or cut a file that we write.
+    """Raise StageError if another program has removed, replaced or truncated a file that we write.
 
-    ours : of the file that is open. lost : what becomes of our data, in words. length : that it must have,
-    bytes.
-
-    Raises
-    ------
-    StageError : one has.
+    ours : status of the open file. lost : the consequence for our data. length : expected, bytes.
     """
     try:
-        there = path.stat()
+        current = path.stat()
     except OSError:
-        what = "removed"
+        change = "removed"
     else:
-        what = "cut" if ours.st_size < length else "" if os.path.samestat(there, ours) else "replaced"
-    if what:
-        raise StageError(f"{path}: was {what} by another program while the run wrote to it; {lost}")
+        change = "cut" if ours.st_size < length else "" if os.path.samestat(current, ours) else "replaced"
+    if change:
+        raise StageError(f"{path}: was {change} by another program while the run wrote to it; {lost}")

@@ -1,4 +1,4 @@
-"""Plug-ins: what installed packages declare as entry points."""
+"""Plug-ins: entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def plugins(group: str) -> Sequence[EntryPoint]:
 
 @functools.cache
 def _installed(group: str, path: tuple[str, ...]) -> Sequence[EntryPoint]:
-    # Not at the start of every run: it takes 40 ms.
+    # Imported here, because it takes 40 ms.
     from importlib import metadata
 
     points = metadata.entry_points(group=group) if path else ()

@@ -7,17 +7,17 @@ import re
 from collections.abc import Iterator
 from typing import Any, Final
 
-# With a single slash: what `pathlib` makes of an address that is given in place of a file.
+# A single slash is the result of passing an address through `pathlib`.
 _ADDRESS = re.compile(r"\b((?!ipc:|file:)[A-Za-z][A-Za-z0-9+.-]*://|(?:https?|rtsps?|udp|tcp):/)(\S*)")
 SHOW: Final = "TACTFLOW_SHOW_ADDRESSES"
-"""The environment variable that lets messages on the terminal show addresses as they were given."""
+"""Environment variable with which messages on the terminal show complete addresses."""
 _KEYS = ("token", "password")
 """Parameters of stages and sinks whose values are secret."""
 _SETTING = re.compile(rf"\b({'|'.join(_KEYS)})(\s*[=:]\s*)[^\s,}}]+")
 
 
 def public_address(text: str) -> str:
-    """Addresses with their scheme and host only: user, path and query may be, or hold, a password.
+    """Reduce addresses to scheme and host, because user, path and query may contain a password.
 
     >>> public_address("rtsp://me:p@ss@camera:554/1?channel=2&pwd=1234: no stream")
     'rtsp://camera:554/...: no stream'
@@ -26,22 +26,22 @@ def public_address(text: str) -> str:
 
 
 def shown_address(text: str) -> str:
-    """`public_address`, unless the environment variable TACTFLOW_SHOW_ADDRESSES asks for all of it."""
+    """`public_address`, unless the environment variable TACTFLOW_SHOW_ADDRESSES is set."""
     return text if os.environ.get(SHOW) else public_address(text)
 
 
 def _scheme_and_host(address: re.Match[str]) -> str:
     scheme, rest = address[1], address[2].rstrip("]:;,.'\")}>")
-    behind = address[2][len(rest) :]  # belongs to the sentence or the YAML around the address
-    front = re.split(r"[/?#;]", rest, maxsplit=1)[0]
-    host = front.rpartition("@")[2]
+    punctuation = address[2][len(rest) :]  # of the sentence or the YAML around the address
+    authority = re.split(r"[/?#;]", rest, maxsplit=1)[0]
+    host = authority.rpartition("@")[2]
     if rest in (host, f"{host}/"):
         # Nothing to hide, or hidden already.
         return address[0]
-    if "@" in rest[len(front) :]:
-        # A password may hold a slash, so what stands in front of it is not known to be the host.
-        return f"{scheme}...{behind}"
-    return f"{scheme}{host}/...{behind}"
+    if "@" in rest[len(authority) :]:
+        # A password may contain a slash, so that the text before it need not be the host.
+        return f"{scheme}...{punctuation}"
+    return f"{scheme}{host}/...{punctuation}"
 
 
 def public_setting(text: str) -> str:
@@ -54,19 +54,19 @@ def public_setting(text: str) -> str:
 
 
 def without_secrets(text: str) -> str:
-    """The text of a pipeline without passwords in addresses and without tokens, for files that are shared.
+    """The text of a pipeline without passwords in addresses and without tokens, for sharing.
 
     >>> print(without_secrets("{source: rtsp://me:pass@camera/1, token: abc, host: null}"))
     {source: rtsp://camera/..., token: removed, host: null}
     """
-    # Imported here: it takes a while, and most messages hold no pipeline.
+    # Imported here, because it is slow and rarely needed.
     import yaml
 
     try:
         document = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError):
         return ""
-    # However it is written: in quotes, on a line of its own, by an alias.
+    # In any notation: quoted, on its own line, by an alias.
     for secret in sorted(set(_secrets(document)), key=len, reverse=True):
         text = text.replace(secret, "removed")
     return public_address(text)

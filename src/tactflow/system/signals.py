@@ -1,4 +1,4 @@
-"""The signals that ask a program to end."""
+"""Signals that end a program."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if h
 """Ctrl-C, a service manager, a terminal that is closed."""
 
 INTERRUPTED = 130
-"""Exit code of a program that was not allowed to finish what was under way."""
+"""Exit code of a program that was interrupted before it had finished pending work."""
 
 Handler = Callable[[int, FrameType | None], object]
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised by a handler in the main thread to end what is under way.
+    """Raised by a handler in the main thread to end pending work.
 
-    Not KeyboardInterrupt itself: where that is raised within `exec` of a text, as numba uses it, `python -m`
-    ends by SIGINT whatever the exit code is, even if the exception was caught.
+    After a KeyboardInterrupt within `exec` of a text, as used by numba, `python -m` would end by SIGINT,
+    whatever the exit code, even if the exception was caught.
     """
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:
-    """Handler that ends what is under way; a second signal does not prevent the clean-up, a third kills."""
+    """Handler that ends pending work; a second signal does not prevent the clean-up, a third kills."""
     on_ending(lambda _number, _frame: on_ending(signal.SIG_DFL))
     raise Interrupted
 
@@ -34,8 +34,8 @@ def interrupt(_number: int, _frame: FrameType | None) -> None:
 def on_ending(handler: Handler | signal.Handlers) -> dict[int, object]:
     """Install a handler for each signal; returns the earlier ones.
 
-    A signal that is ignored stays so: nohup asks a program to go on. So does one handled by a host written in
-    C, whose handler Python could not restore.
+    Ignored signals remain ignored, as nohup requires. So do signals handled by a host program in C, whose
+    handler Python could not restore.
     """
     handled = [number for number in ENDING if signal.getsignal(number) not in (signal.SIG_IGN, None)]
     return {number: signal.signal(number, handler) for number in handled}
@@ -43,7 +43,7 @@ def on_ending(handler: Handler | signal.Handlers) -> dict[int, object]:
 
 @contextmanager
 def ending_handled(handler: Handler) -> Iterator[None]:
-    """Have a handler called for each signal while a block lasts."""
+    """Install a handler for each signal within a block."""
     before = on_ending(handler)
     try:
         yield
@@ -54,9 +54,9 @@ def ending_handled(handler: Handler) -> Iterator[None]:
 
 @contextmanager
 def ending_held_back() -> Iterator[None]:
-    """Let signals that come during a block be handled after it: what the block does is complete then."""
+    """Delay the handling of signals until after a block, so that the block completes."""
     if threading.current_thread() is not threading.main_thread():
-        # Signals are handled in the main thread.
+        # Only the main thread handles signals.
         yield
         return
     pending: list[int] = []

@@ -1,4 +1,4 @@
-"""Words in messages: suggestions for misspelled ones, and lists."""
+"""Suggestions for misspelled words, and lists of words, in messages."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 MISSPELLED: Final = 0.75
-"""Similarity (`difflib`, 0 to 1) above which a word counts as misspelled: one wrong letter of four, or two in
-the wrong order. Different words are less similar: threads and radius 0.62, depth and path 0.67."""
+"""Minimum similarity (`difflib`, 0 to 1) of a misspelled word: one wrong letter of four, or two in the wrong
+order. Different words are less similar: threads and radius 0.62, depth and path 0.67."""
 
 
 def closest(word: str, candidates: Iterable[str]) -> str | None:
-    """The candidate a misspelled word most likely means, or None; upper case does not matter.
+    """The candidate that a word is most likely a misspelling of, or None; case-insensitive.
 
     >>> closest("min_aera", ["min_area", "method"]), closest("HULL", ["hull"]), closest("threads", ["radius"])
     ('min_area', 'hull', None)
     """
     lowered = {candidate.lower(): candidate for candidate in candidates}
-    found = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=MISSPELLED)
-    return lowered[found[0]] if found else None
+    matches = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=MISSPELLED)
+    return lowered[matches[0]] if matches else None
 
 
 def did_you_mean(word: str, candidates: Iterable[str], otherwise: str = "known: ") -> str:
-    """`; did you mean X?` for a misspelled word, else the list of candidates, if there are any.
+    """`; did you mean X?` for a misspelled word, else the list of candidates, if any.
 
-    otherwise : how the list begins.
+    otherwise : beginning of the list.
 
     >>> did_you_mean("hul", ["hull", "capture"]), did_you_mean("zzz", ["hull", "capture"])
     ('; did you mean hull?', '; known: hull, capture')
