@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final, NamedTuple
 
 import cv2
@@ -56,8 +56,9 @@ class Grid(NamedTuple):
     spacing: float
 
     @property
+    @lru_cache(maxsize=8)  # noqa: B019
     def points(self) -> Floats:
-        """(rows, columns, 2) float64: x and y of every cell's centre, px."""
+        """(rows, columns, 2) float64: x and y of every cell's centre, px. Not to be changed."""
         rows, columns = self.shape
         x = self.first[0] + self.spacing * np.arange(columns)
         y = self.first[1] + self.spacing * np.arange(rows)

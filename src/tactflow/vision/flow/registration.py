@@ -6,8 +6,7 @@ markers are left out, since they move with the gel.
 References
 ----------
 S. Baker, I. Matthews, "Lucas-Kanade 20 years on: a unifying framework", IJCV 2004, for the gradients of the
-template; H. White, "A heteroskedasticity-consistent covariance matrix estimator", Econometrica 1980, with
-sums over patches, whose errors are common, for the covariance.
+template.
 """
 
 from __future__ import annotations
@@ -18,24 +17,31 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import ColorImage, Floats, Floats32, Indices, Mask
+from tactflow.vision.arrays import ColorImage, Flags, Floats, Floats32, Mask
 
 CELL: Final = 4
 """Processed px per side of a cell, over which the light is averaged."""
 MARGIN: Final = 2
 """Cells around a contact that belong to its picture: the outline shows against the gel at rest."""
-MOST: Final = 700
+MOST: Final = 500
 """Cells of a template at most: neighbours share their errors, and more of them cost time alone."""
 FEWEST: Final = 30
 """Cells of a template at least."""
-PATCHES: Final = 5
-"""Patches along each side of a template within which errors are taken for common."""
+PATCHES: Final = 25
+"""Independent errors of a template: those of neighbouring cells are common."""
 NOISE: Final = 1.0
 """Standard deviation of what is common to a patch and no motion, grey levels, at least."""
+UNEVEN: Final = 0.1
+"""How unevenly the lamps light the gel around a contact, relative: what moves becomes brighter or darker."""
+ELSE: Final = 0.5
+"""Part of a growth or a change of contrast that the picture shows in other ways: a cable that is pressed
+harder grows across, but not along."""
 STEPS: Final = 12
 """Steps of Gauss-Newton at most."""
 CONVERGED: Final = 0.01
 """Step after which it ends, cells."""
+KNOWN: Final = 0.999
+"""Weight of a picture from which on no marker has part in it."""
 SEEN: Final = 0.4
 """Share of a template's cells that the picture must show."""
 UNLIKE: Final = 0.6
@@ -65,17 +71,18 @@ def cells(picture: ColorImage | Mask) -> Floats32:
 class Template(NamedTuple):
     """The picture of a contact, with which later ones are compared; lengths in cells.
 
-    center : (2,), mean of its cells. radius : RMS distance from it. away : (N, 2), cells, from the centre.
-    light : (N, 3), grey levels. by : (N, 3, 5), what a small motion, and a gain, change the difference by.
-    patches : (N,), the patch of each cell.
+    center : (2,), mean of its cells. radius : RMS distance from it. away : (N, 2) float32, from the centre.
+    light : (N, 3) float32, grey levels. by : (3 N, 5) float32, what a small motion, and a gain, change the
+    difference by. power : (5, 5), by.T @ by. contrast : standard deviation of the light.
     """
 
     center: Floats
     radius: float
-    away: Floats
-    light: Floats
-    by: Floats
-    patches: Indices
+    away: Floats32
+    light: Floats32
+    by: Floats32
+    power: Floats
+    contrast: float
 
     @property
     def place(self) -> Floats:
@@ -89,12 +96,14 @@ class Registration(NamedTuple):
     motion : (5,), shift (x, y) of the centre, turn from +x to +y and growth, as far as they move the cells at
     the RMS radius, cells; relative change of the contrast. covariance : (5, 5). residual : RMS difference,
     over the standard deviation of the change of light. seen : share of the template's cells.
+    fresh : part of the variance that the next frame does not share.
     """
 
     motion: Floats
     covariance: Floats
     residual: float
     seen: float
+    fresh: float
 
 
 def template_of(change: Floats32, mask: Mask) -> Template | None:
@@ -110,25 +119,20 @@ def template_of(change: Floats32, mask: Mask) -> Template | None:
         return None
     every = -(-len(rows) // MOST)
     rows, columns = rows[::every], columns[::every]
-    away = np.column_stack([columns, rows]).astype(np.float64)
-    center = away.mean(axis=0)
-    away -= center
+    places = np.column_stack([columns, rows])
+    center = places.mean(axis=0)
+    away = (places - center).astype(np.float32)
     radius = math.sqrt((away * away).sum(axis=1).mean())
     light = change[..., :3]
     dx, dy = (
         cv2.Sobel(light, cv2.CV_32F, *axis, ksize=3, scale=1 / 8)[rows, columns] for axis in ((1, 0), (0, 1))
     )
-    x, y = (away / radius).T[:, :, None]
-    values = light[rows, columns].astype(np.float64)
-    by = np.stack([dx, dy, x * dy - y * dx, x * dx + y * dy, -values], axis=-1)
-    patches = _part(rows) * PATCHES + _part(columns)
-    return Template(center, radius, away, values, by, patches)
-
-
-def _part(places: Indices) -> Indices:
-    """In which of `PATCHES` equal parts of their range each place lies."""
-    low = places.min()
-    return np.asarray(PATCHES * (places - low) // (places.max() - low + 1))
+    x, y = (away / np.float32(radius)).T[:, :, None]
+    values = light[rows, columns]
+    by = np.stack([dx, dy, x * dy - y * dx, x * dx + y * dy, -values], axis=-1).reshape(-1, 5)
+    power = np.asarray(by.T @ by, np.float64)
+    contrast = float(np.sqrt(values.var(axis=0).mean()))
+    return Template(center, radius, away, values, by, power, contrast)
 
 
 def register(
@@ -141,45 +145,43 @@ def register(
     """
     motion, prior = start, np.diag(spread**-2.0)
     for _ in range(STEPS):
-        light, shown = _light_at(template, change, motion)
-        count = float(shown.sum())
+        error, shown = _difference(template, change, motion)
+        count = int(np.count_nonzero(shown))
         if count < max(SEEN * len(shown), FEWEST):
             return None
-        error = light - (1 + motion[4]) * template.light
-        by = template.by * shown[:, None, None]
-        power = float(np.vdot(error, error * shown[:, None])) / (3 * count)
+        power = float(np.vdot(error, error)) / (3 * count)
+        shaded = UNEVEN + ELSE * (abs(float(motion[3])) / template.radius + abs(float(motion[4])))
+        shaded = (shaded * template.contrast) ** 2
         # As many independent errors as there are patches.
-        weight = min(PATCHES**2 / count, 1.0) / max(power, NOISE**2)
-        information = weight * np.tensordot(by, template.by, ([0, 1], [0, 1])) + prior
-        gradient = weight * np.tensordot(by, error, ([0, 1], [0, 1])) + prior @ (motion - expected)
-        step = -np.linalg.solve(information, gradient)
+        weight = min(PATCHES / count, 1.0) / (power + NOISE**2 + shaded)
+        gradient = weight * (template.by.T @ error.ravel()) + prior @ (motion - expected)
+        step = -np.linalg.solve(weight * count / len(shown) * template.power + prior, gradient)
         turn = motion[2] / template.radius
         cos, sin = math.cos(turn), math.sin(turn)
         step[:2] = cos * step[0] - sin * step[1], sin * step[0] + cos * step[1]
         motion = motion + step
         if np.abs(step[:4]).max() < CONVERGED:
             break
-    signal = float(np.sqrt(template.light[shown > 0].var(axis=0).mean()))
-    residual = math.sqrt(power) / max(signal * (1 + motion[4]), 1e-3)
+    residual = math.sqrt(power) / max(template.contrast * (1 + float(motion[4])), 1e-3)
     if residual > UNLIKE:
         return None
-    sums = _sums(weight * np.einsum("nci,nc->ni", by, error), template.patches)
-    inverse = np.linalg.inv(information)
-    covariance = inverse @ (sums.T @ sums + prior) @ inverse
-    return Registration(motion, np.asarray(covariance, np.float64), residual, count / len(shown))
+    seen = template.by.reshape(-1, 3, 5)[shown].reshape(-1, 5)
+    covariance = np.linalg.inv(weight * (seen.T @ seen) + prior)
+    fresh = 1 - shaded / (power + NOISE**2 + shaded)
+    return Registration(motion, np.asarray(covariance, np.float64), residual, count / len(shown), fresh)
 
 
-def _light_at(template: Template, change: Floats32, motion: Floats) -> tuple[Floats, Floats]:
-    """(N, 3) and (N,): the light where the template's cells are after a motion, and 1 where it is known."""
-    turn, growth = motion[2:4] / template.radius
+def _difference(template: Template, change: Floats32, motion: Floats) -> tuple[Floats32, Flags]:
+    """(N, 3) float32 and (N,): how the light where the template's cells are after a motion differs from its
+    own, 0 where it is not known; where it is."""
+    turn, growth = (motion[2:4] / template.radius).tolist()
     scale = math.exp(growth)
     cos, sin = scale * math.cos(turn), scale * math.sin(turn)
-    places = template.away @ np.array([[cos, sin], [-sin, cos]]) + template.center + motion[:2]
-    x, y = np.ascontiguousarray(places.T[:, :, None], np.float32)
-    seen = cv2.remap(change, x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
-    return seen[:, :3], (seen[:, 3] > 0.999).astype(np.float64)
-
-
-def _sums(values: Floats, patches: Indices) -> Floats:
-    """(PATCHES^2, K): sums of values (N, K) over patches."""
-    return np.stack([np.bincount(patches, column, PATCHES**2) for column in values.T], axis=1)
+    x, y = template.away.T
+    left, top = (template.center + motion[:2]).tolist()
+    columns, rows = (cos * x - sin * y + left)[:, None], (sin * x + cos * y + top)[:, None]
+    light = cv2.remap(change, columns, rows, cv2.INTER_LINEAR)[:, 0]
+    shown = np.asarray(light[:, 3] > KNOWN)
+    error = light[:, :3] - np.float32(1 + motion[4]) * template.light
+    error[~shown] = 0
+    return error, shown

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections import deque
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Mask
-from tactflow.vision.flow.displacement_field import CELL, DisplacementField, GelMotion
+from tactflow.vision.flow.displacement_field import CELL, DisplacementField
 from tactflow.vision.flow.in_mask import OUTLINE, UNKNOWN
 from tactflow.vision.flow.registration import CELL as PX
 from tactflow.vision.flow.registration import Registration, Template, register, template_of
@@ -49,23 +52,32 @@ ASIDE: Final = 2.0
 gel does both alike, slip only the first. Chosen on the simulator."""
 _ROUNDS: Final = 4
 """Fits to the part that sticks, each to what the last one found to stick. Chosen by hand."""
+Complexes = NDArray[np.complex128]
+"""(M,), x + iy, px."""
 
 
 class _Key(NamedTuple):
-    """The frame that others are compared with: its picture and field. core : (rows, columns), share of each
-    cell in the middle of the contact, which sticks longest. slid, covariance : (3,), (3, 3), slip from the
-    start to it, px and radians."""
+    """The frame that others are compared with: its picture and the gel in the middle of its contact.
+
+    cells : (rows, columns), which cells. rest, before : (M,) complex, where they are at rest, px, and how far
+    they had moved; share : (M,), how they count, with the sum 1; count : their number, by their shares.
+    slid, covariance : (3,), (3, 3), slip from the start to this frame, px and radians.
+    """
 
     template: Template
-    field: DisplacementField
-    core: Floats
+    cells: Flags
+    rest: Complexes
+    before: Complexes
+    share: Floats
+    count: float
     slid: Floats
     covariance: Floats
 
 
 class _Moment(NamedTuple):
-    """What is known at a time, s: mean motion and turn of the gel in contact, (3,), slip until then, (3,),
-    its covariance, (3, 3), and what of that stems from before the keyframe; px and radians."""
+    """What is known at a time, s: the rigid motion (3,) of the gel under the object since it was at rest, the
+    slip (3,) until then, its covariance (3, 3), and what of that stems from before the keyframe; px and
+    radians."""
 
     time: float
     gel: Floats
@@ -113,10 +125,9 @@ class SlipTracker:
         """Nothing touches the gel: what comes is another contact."""
         self._key: _Key | None = None
         self._since = 0
-        self._grip: tuple[Floats, Floats] | None = None
         self._last = self._before = np.zeros(5)
+        self._grip: tuple[Floats, Floats] | None = None
         self._recent: deque[_Moment] = deque()
-        self._slipping = False
 
     def __call__(
         self, seq: int, time: float, change: Floats32, field: DisplacementField, mask: Mask
@@ -126,87 +137,90 @@ class SlipTracker:
         seq : of the frame. time : s. change : of `light_change`. field : of this frame. mask : (H, W) uint8,
         255 in contact.
         """
-        gel, template = field.motion(mask), template_of(change, mask)
-        if gel is None or template is None or gel.unknown > UNKNOWN:
+        gel = field.motion(mask)
+        if gel is None or gel.unknown > UNKNOWN:
             self.reset()
             return None
         share, key, found = field.share(mask), self._key, None
-        if key is not None and key.core.shape == share.shape:  # else markers have joined
+        if key is not None and key.cells.shape == share.shape:  # else markers have joined
             found = self._registered(key, change, field)
-        motion = np.array([*gel.mean, gel.gradient.growth[1] if gel.gradient else 0.0])
         if key is None or found is None:
             self.reset()
-            self._since, nothing = seq, np.zeros((3, 3))
-            now = _Moment(time, motion, np.zeros(3), nothing, nothing)
-        else:
-            slid, covariance = _slid(key, found, field, gel)
-            now = _Moment(time, motion, key.slid + slid, key.covariance + covariance, key.covariance)
+            template = template_of(change, mask)
+            if template is None:
+                return None
+            key = _keyframe(template, field, share, np.zeros(3), np.zeros((3, 3)))
+            self._since, at_rest = seq, np.zeros(5)
+            found = Registration(at_rest, np.zeros((5, 5)), 0.0, 1.0, 1.0)
+        now = _slid(key, found, field, time)
         self._recent.append(now)
         while len(self._recent) > 2 and time - self._recent[1].time > WINDOW - 1e-6:
             self._recent.popleft()
-        radius = (template if key is None else key.template).radius * PX
-        slip = self._slip(radius, self._sticking(field, share), gel, field, share)
-        stopped, self._slipping = self._slipping and not slip.slipping, slip.slipping
-        if key is None or found is None or stopped or _aged(key, found):
-            core = share * _core(field.grid.points, share)
-            self._key = _Key(template, field, core, now.slid, now.covariance)
-            self._grip = share, field.displacement
-            self._last = self._before = np.zeros(5)
+        slip = self._slip(key, found.fresh, gel.stderr, math.hypot(*gel.outline_stderr))
+        if slip.slipping:
+            self._grip = None
+        else:
+            slip = replace(slip, stick_ratio=self._sticking(field, share))
+        if _aged(key, found) and (template := template_of(change, mask)) is not None:
+            key = _keyframe(template, field, share, now.slid, now.covariance)
+        if key is not self._key:
+            self._key, self._last, self._before = key, np.zeros(5), np.zeros(5)
         return slip
 
     def _registered(self, key: _Key, change: Floats32, field: DisplacementField) -> Registration | None:
-        """How the picture has moved since the keyframe: on as before, not since the last frame, or as the
-        gel, whichever fits best."""
-        x, y, turn = _gel_motion(key, field).tolist()
+        """How the picture has moved since the keyframe: on as before, or else not since the last frame, or
+        with the gel."""
+        moved = _complex(field.displacement[key.cells]) - key.before
+        x, y, turn = _rigid(key.rest + key.before - _place(key), moved, key.share)[0].tolist()
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
-        found = [
-            register(key.template, change, start, expected, SPREAD)
-            for start in (2 * self._last - self._before, self._last, expected)
-        ]
-        best = min((fit for fit in found if fit is not None), key=lambda fit: fit.residual, default=None)
+        best: Registration | None = None
+        for start in (2 * self._last - self._before, self._last, expected):
+            found = register(key.template, change, start, expected, SPREAD)
+            if found is not None and (best is None or found.residual < best.residual):
+                best = found
+            if best is not None and best.residual < AGED:
+                break
         if best is not None:
             self._before, self._last = self._last, best.motion
         return best
 
     def _sticking(self, field: DisplacementField, share: Floats) -> float:
-        """The stick ratio, on the gel that was touched first, or that a contact has rolled on to."""
-        if self._grip is None:
-            return 1.0
-        before, displacement = self._grip
+        """The stick ratio, on the gel that was touched first, or that the contact has gone on to."""
+        before, displacement = self._grip or (0 * share, field.displacement)
         came, left = (float(np.maximum(part, 0).sum()) for part in (share - before, before - share))
         if max(came, left) > EXCHANGED * float(share.sum()):
             self._grip = share, field.displacement
             return 1.0
-        moved = field.displacement - displacement
-        return stick_ratio(before, share, field.grid.points, moved, field.noise)
+        return stick_ratio(before, share, field.grid.points, field.displacement - displacement, field.noise)
 
-    def _slip(
-        self, radius: float, ratio: float, gel: GelMotion, field: DisplacementField, share: Floats
-    ) -> Slip:
-        """The slip up to now. radius : of the contact, px."""
+    def _slip(self, key: _Key, fresh: float, gel_stderr: float, outline_stderr: float) -> Slip:
+        """The slip up to now. fresh : part of the variance that is new in each frame. gel_stderr,
+        outline_stderr : of the mean displacement of the gel, and what the outline does to it, px."""
         then, now = self._recent[0], self._recent[-1]
-        slid, stderr = now.slid.tolist(), np.sqrt(np.diag(now.covariance)).tolist()
-        speed = speed_stderr = None
-        probability = 0.0
+        radius = key.template.radius * PX
+        gel_variance = gel_stderr**2 * np.array([1.0, 1.0, 2 / radius**2])
+        slid, stderr = now.slid.tolist(), np.sqrt(np.diag(now.covariance) + gel_variance).tolist()
+        probability, speed, speed_stderr = 0.0, None, None
         if now is not then:
-            # Displacements at the RMS radius, where a turn moves the object as much as a shift.
+            # At the RMS radius, where a turn moves the object as much as a shift.
             lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
-            moved = (now.slid - then.slid) * lever
+            covariance = now.covariance + then.covariance - 2 * then.inherited
+            covariance *= fresh * np.outer(lever, lever)
+            # What errors alone may make counts less: a smooth ball does not show how it turns.
+            shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLID * radius) ** 2)
+            moved = shrink @ ((now.slid - then.slid) * lever)
             length = float(np.linalg.norm(moved))
             way = moved / max(length, LEAST_MOVED)
-            covariance = now.covariance + then.covariance - 2 * then.inherited
-            error = math.sqrt(float((way * lever) @ covariance @ (way * lever))) + LEAST_MOVED
-            dragged = _dragged(way / lever, field, share)
-            dragged_error = math.hypot(gel.stderr, *gel.outline_stderr) + LEAST_MOVED
+            error = math.sqrt(float(way @ shrink @ covariance @ way)) + LEAST_MOVED
             # Gel around the contact that counts as gel in contact stays behind what sticks.
             strained = OUTLINE * float(np.linalg.norm((now.gel - then.gel) * lever))
             slides = _normal((length - strained - SLID * radius) / error)
-            probability = slides * _normal((dragged - SLID * radius) / dragged_error)
+            dragged = float(way @ (now.gel * lever)) - SLID * radius
+            probability = slides * _normal(dragged / (math.hypot(gel_stderr, outline_stderr) + LEAST_MOVED))
             speed, speed_stderr = length / time, error / time
-        slipping = probability > 0.5
         return Slip(
-            slipping,
-            0.0 if slipping else ratio,
+            probability > 0.5,
+            0.0,
             probability,
             (slid[0], slid[1]),
             -math.degrees(slid[2]) + 0.0,
@@ -218,6 +232,15 @@ class SlipTracker:
         )
 
 
+def _keyframe(
+    template: Template, field: DisplacementField, share: Floats, slid: Floats, covariance: Floats
+) -> _Key:
+    inside = _core(field.grid.points, share) & (share > 0)
+    rest, before = _complex(field.grid.points[inside]), _complex(field.displacement[inside])
+    count = float(share[inside].sum())
+    return _Key(template, inside, rest, before, share[inside] / count, count, slid, covariance)
+
+
 def _aged(key: _Key, found: Registration) -> bool:
     """Whether the keyframe is to be replaced."""
     growth, contrast = np.abs(found.motion[3:]).tolist()
@@ -225,31 +248,49 @@ def _aged(key: _Key, found: Registration) -> bool:
     return found.seen < OVERLAP or found.residual > AGED or pressed
 
 
-def _slid(key: _Key, found: Registration, field: DisplacementField, gel: GelMotion) -> tuple[Floats, Floats]:
-    """Slip (3,) since the keyframe, and its covariance (3, 3), px and radians."""
-    template, inside = key.template, key.core > 0
-    share, rest = key.core[inside], field.grid.points[inside]
-    turn = found.motion[2] / template.radius
-    cos, sin = math.cos(turn), math.sin(turn)
-    away = rest + key.field.displacement[inside] - template.place
-    now = away @ np.array([[cos, sin], [-sin, cos]]) + template.place + found.motion[:2] * PX
-    under = rest
+def _slid(key: _Key, found: Registration, field: DisplacementField, time: float) -> _Moment:
+    """The slip up to a time."""
+    place, radius = _place(key), key.template.radius
+    x, y, turn = found.motion[:3].tolist()
+    now = (key.rest + key.before - place) * cmath.exp(1j * turn / radius) + complex(x, y) * PX
+    under = key.rest - place
     for _ in range(ROUNDS):
-        under = now - field.at(under)
-    slid, left = _rigid(rest - template.place, under - rest, share)
-    to_px = np.array([PX, PX, 1 / template.radius])
-    covariance = found.covariance[:3, :3] * np.outer(to_px, to_px)
+        moved = _complex(field.at(_pairs(under + place)))
+        under = now - moved
+    slid, left = _rigid(key.rest - place, under + place - key.rest, key.share)
+    to_px = np.array([PX, PX, 1 / radius])
     # Displacements of the gel a pitch apart are independent.
-    variance = gel.stderr**2 + left / max(float(share.sum()) * CELL**2, 1.0)
-    return slid, covariance + variance * np.diag([1.0, 1.0, 2 / (template.radius * PX) ** 2])
+    variance = left / max(key.count * CELL**2, 1.0)
+    covariance = key.covariance + found.covariance[:3, :3] * np.outer(to_px, to_px)
+    covariance += variance * np.diag([1.0, 1.0, 2 / (radius * PX) ** 2])
+    gel = _rigid(now - key.share @ now, moved, key.share)[0]
+    return _Moment(time, gel, key.slid + slid, covariance, key.covariance)
 
 
-def _gel_motion(key: _Key, field: DisplacementField) -> Floats:
-    """(3,): shift (x, y) at the template's centre, px, and turn, radians, since the keyframe, of the gel that
-    was in contact then."""
-    inside = key.core > 0
-    away = (field.grid.points + key.field.displacement)[inside] - key.template.place
-    return _rigid(away, (field.displacement - key.field.displacement)[inside], key.core[inside])[0]
+def _place(key: _Key) -> complex:
+    """The centre of the keyframe's picture, px."""
+    return complex(*key.template.place.tolist())
+
+
+def _complex(pairs: Floats) -> Complexes:
+    """Points or displacements (M, 2) as x + iy."""
+    return np.ascontiguousarray(pairs).view(np.complex128)[:, 0]
+
+
+def _pairs(points: Complexes) -> Floats:
+    """(M, 2) of x + iy."""
+    return np.asarray(points.view(np.float64).reshape(-1, 2))
+
+
+def _rigid(places: Complexes, moved: Complexes, share: Floats) -> tuple[Floats, float]:
+    """(3,): the rigid motion nearest to displacements of places: shift of the origin, px, and turn from +x to
+    +y, radians; the variance that it leaves of each component, px^2. share : with the sum 1."""
+    middle, mean = share @ places, share @ moved
+    away = places - middle
+    turn = float((share @ (away.conj() * moved)).imag / max((share @ (away.conj() * away)).real, 1e-9))
+    left = moved - mean - 1j * turn * away
+    shift = mean - 1j * turn * middle
+    return np.array([shift.real, shift.imag, turn]), float((share @ (left.conj() * left)).real) / 2
 
 
 def _core(places: Floats, share: Floats) -> Flags:
@@ -259,29 +300,6 @@ def _core(places: Floats, share: Floats) -> Flags:
     order = np.argsort(distance, axis=None)
     filled = np.cumsum(share.flat[order])
     return np.asarray(distance <= distance.flat[order[np.searchsorted(filled, CORE * filled[-1])]])
-
-
-def _rigid(places: Floats, moved: Floats, share: Floats) -> tuple[Floats, float]:
-    """(3,): the rigid motion nearest to displacements (N, 2) of places (N, 2): shift of the origin, px, and
-    turn from +x to +y, radians; the variance that it leaves of each component, px^2."""
-    share = share / share.sum()
-    middle, mean = share @ places, share @ moved
-    away = places - middle
-    across = np.column_stack([-away[:, 1], away[:, 0]])
-    turn = float(share @ (across * moved).sum(axis=1)) / max(float(share @ (away * away).sum(axis=1)), 1e-9)
-    left = moved - mean - turn * across
-    shift = mean + turn * np.array([middle[1], -middle[0]])
-    return np.array([*shift, turn]), float(share @ (left * left).sum(axis=1)) / 2
-
-
-def _dragged(motion: Floats, field: DisplacementField, share: Floats) -> float:
-    """How far the gel is displaced in the direction of a motion (3,), as a mean over a contact, px."""
-    x, y, turn = motion.tolist()
-    moved = field.displacement
-    place = field.grid.points + moved
-    away = place - np.einsum("rc,rck->k", share, place) / share.sum()
-    along = (x - turn * away[..., 1]) * moved[..., 0] + (y + turn * away[..., 0]) * moved[..., 1]
-    return float((share * along).sum() / share.sum())
 
 
 def _normal(value: float) -> float:
