@@ -60,7 +60,7 @@ class _Key(NamedTuple):
     """The frame that others are compared with: its picture and the gel in the middle of its contact.
 
     cells : (rows, columns), which cells. rest, before : (M,) complex, where they are at rest, px, and how far
-    they had moved; share : (M,), how they count, with the sum 1; count : their number, by their shares.
+    they had moved; share : (M,), how they count, with the sum 1; number : of them, by their shares.
     slid, covariance : (3,), (3, 3), slip from the start to this frame, px and radians.
     """
 
@@ -69,7 +69,7 @@ class _Key(NamedTuple):
     rest: Complexes
     before: Complexes
     share: Floats
-    count: float
+    number: float
     slid: Floats
     covariance: Floats
 
@@ -260,7 +260,7 @@ def _slid(key: _Key, found: Registration, field: DisplacementField, time: float)
     slid, left = _rigid(key.rest - place, under + place - key.rest, key.share)
     to_px = np.array([PX, PX, 1 / radius])
     # Displacements of the gel a pitch apart are independent.
-    variance = left / max(key.count * CELL**2, 1.0)
+    variance = left / max(key.number * CELL**2, 1.0)
     covariance = key.covariance + found.covariance[:3, :3] * np.outer(to_px, to_px)
     covariance += variance * np.diag([1.0, 1.0, 2 / (radius * PX) ** 2])
     gel = _rigid(now - key.share @ now, moved, key.share)[0]
@@ -287,7 +287,8 @@ def _rigid(places: Complexes, moved: Complexes, share: Floats) -> tuple[Floats, 
     +y, radians; the variance that it leaves of each component, px^2. share : with the sum 1."""
     middle, mean = share @ places, share @ moved
     away = places - middle
-    turn = float((share @ (away.conj() * moved)).imag / max((share @ (away.conj() * away)).real, 1e-9))
+    spread = float((share @ (away.conj() * away)).real)
+    turn = float((share @ (away.conj() * moved)).imag) / max(spread, 1e-9)
     left = moved - mean - 1j * turn * away
     shift = mean - 1j * turn * middle
     return np.array([shift.real, shift.imag, turn]), float((share @ (left.conj() * left)).real) / 2
