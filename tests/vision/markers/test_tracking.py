@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.lattice import neighbour_graph
-from tactflow.vision.markers.matching import choose_spots
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers, MarkerStatus
 from tests.vision.dots import FloatArray, grid, match, rectified, render
@@ -481,42 +480,6 @@ def test_a_real_press_is_tracked_from_the_reference_alone(shared_data: Path) -> 
     for frame in frames:
         under_test.reset()
         _check_field(under_test.track(frame), edges, 19.6)
-
-
-def test_a_joint_choice_beats_the_nearest_spot() -> None:
-    # A row whose dots all moved by 0.7 pitch: for each of them the nearest spot is its neighbour's.
-    origin = np.column_stack([10.0 * np.arange(6), np.zeros(6)])
-    edges = np.column_stack([np.arange(5), np.arange(1, 6)])
-    inliers = np.zeros(6, bool)
-    chosen = choose_spots(
-        origin, edges, np.arange(6), inliers, np.zeros((6, 2)), origin[None], origin + np.array([7.0, 0.0]),
-        np.ones(6), pitch=10.0, farthest=13.0,
-    )  # fmt: skip
-    assert chosen.tolist() == [0, 1, 2, 3, 4, 5]
-
-
-def test_no_spot_is_given_twice_and_none_out_of_reach() -> None:
-    origin = np.column_stack([10.0 * np.arange(4), np.zeros(4)])
-    edges = np.column_stack([np.arange(3), np.arange(1, 4)])
-    spots = np.array([[0.5, 0.0], [15.0, 0.0], [80.0, 0.0]])
-    chosen = choose_spots(
-        origin, edges, np.arange(4), np.zeros(4, bool), np.zeros((4, 2)), origin[None], spots,
-        np.ones(3), pitch=10.0, farthest=6.0,
-    )  # fmt: skip
-    given = chosen[chosen >= 0].tolist()
-    assert len(given) == len(set(given))
-    assert 2 not in given
-    assert chosen[0] == 0
-
-
-@pytest.mark.parametrize("spots", [np.zeros((0, 2)), np.array([[500.0, 500.0]])])
-def test_without_spots_in_reach_nothing_is_chosen(spots: FloatArray) -> None:
-    origin = np.array([[0.0, 0.0], [10.0, 0.0]])
-    chosen = choose_spots(
-        origin, np.array([[0, 1]]), np.arange(2), np.zeros(2, bool), np.zeros((2, 2)), origin[None], spots,
-        np.ones(len(spots)), pitch=10.0, farthest=13.0,
-    )  # fmt: skip
-    assert chosen.tolist() == [-1, -1]
 
 
 def test_the_tracker_does_not_depend_on_opencv_threads() -> None:

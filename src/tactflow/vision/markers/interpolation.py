@@ -49,10 +49,11 @@ class Interpolator:
         self._origin, self._pitch = origin, pitch
         self._around, self._weight = surroundings(origin, pitch)
 
-    def place(self, position: Floats, found: Flags) -> Indices:
+    def place(self, position: Floats, found: Flags, share: float = 0.0) -> Indices:
         """Place the marks that are not found, where enough of those around them are.
 
         position : (N, 2) float64, px, finite, changed in place. found : (N,) bool.
+        share : of the weight of all marks around, that those found have at least, 0 to 1.
         Returns the numbers of the marks that are placed; the positions of others stay.
         """
         missing = np.flatnonzero(~found)
@@ -66,7 +67,8 @@ class Interpolator:
             basis[..., number] = term
         weighted = (basis * weight[:, :, None]).transpose(0, 2, 1)
         fitted = np.linalg.solve(weighted @ basis + RIDGE, weighted @ moved)[:, 0]
-        supported = weight.sum(axis=1) > LEAST_SUPPORT
+        total = weight.sum(axis=1)
+        supported = (total > LEAST_SUPPORT) & (total > share * self._weight[missing].sum(axis=1))
         placed = np.asarray(missing[supported], np.int64)
         position[placed] = self._origin[placed] + fitted[supported]
         return placed

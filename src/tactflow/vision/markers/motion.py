@@ -6,24 +6,23 @@ from typing import Final
 
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
-from tactflow.vision.compiled import kernel
-from tactflow.vision.markers.interpolation import surroundings
+from tactflow.vision.arrays import Flags, Floats, Floats32
+from tactflow.vision.markers.interpolation import LEAST_SUPPORT, surroundings
 
 BEST_AGREEMENT: Final = 0.25
 """Difference of a mark's displacement from the mean of those around it, over this mean, that is always
 expected. In seven recordings and eight scenes the evidence against a true mark is then 4.1 at most, 3 in all
 but one of them (measured)."""
 
-LEAST_WEIGHT: Final = 0.6
-"""Sum of the weights of the seen marks around, at least: a single neighbour has 0.66."""
-
 LEAST_SPREAD: Final = 0.01
 """Difference that is always expected, px: the error of a mark without noise."""
 
-
 NEAREST: Final = 4
 """Marks around, of which one has to move: those next to it on a square grid."""
+
+FARTHER: Final = 1.2
+"""Ratio of the largest displacements of two frames that are weighed: frames in between add little, for the
+evidence grows with the displacement."""
 
 
 class MotionEvidence:
@@ -31,7 +30,8 @@ class MotionEvidence:
 
     In one frame a mark that moves with those around is as far from their mean displacement as they are
     themselves: normally distributed. One that stays is so far from zero. Frames repeat each other, so only
-    the strongest evidence of all frames counts.
+    the strongest evidence of all frames counts, and only those are weighed in which the gel has moved
+    farther than before, since it last rested.
 
     origin : (N, 2) float64, marks in the reference, px. pitch : px. rest : distance from its origin within
     which a mark rests, px.
@@ -57,7 +57,7 @@ class MotionEvidence:
 
     def __init__(self, origin: Floats, pitch: float, rest: float) -> None:
         self._around, self._weight = surroundings(origin, pitch)
-        self._rest = rest
+        self._rest, self._farthest = rest**2, rest**2
         self.against = np.zeros(len(origin))
 
     def add(self, displacement: Floats, stderr: Floats32, seen: Flags) -> bool:
@@ -65,56 +65,28 @@ class MotionEvidence:
 
         displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool.
         """
-        return weigh_motion(
-            displacement, stderr, seen, self._around, self._weight, self._rest**2, self.against
-        )
+        squared = np.where(seen, np.einsum("ni,ni->n", displacement, displacement), 0.0)
+        farthest = float(squared.max(initial=0))
+        if farthest <= self._rest:
+            self._farthest = self._rest
+            return False
+        if farthest > self._farthest:
+            self._farthest = FARTHER**2 * farthest
+            self._weigh(displacement, stderr, seen, squared > self._rest)
+        return True
 
-
-@kernel(
-    "boolean(float64[:, ::1], float32[::1], boolean[::1], int64[:, ::1], float64[:, ::1], float64,"
-    "float64[::1])",
-)
-def weigh_motion(
-    displacement: Floats,
-    stderr: Floats32,
-    seen: Flags,
-    around: Indices,
-    weight: Floats,
-    rest: float,
-    against: Floats,
-) -> bool:
-    """Raise `against`, (N,), to the evidence of a frame; returns whether a mark that is seen moves.
-
-    displacement : (N, 2). stderr, seen : (N,). around, weight : (N, K), the marks around, nearest first, and
-    their weights. rest : squared distance within which a mark rests.
-    """
-    count = len(displacement)
-    moves, moving = np.empty(count, np.bool_), False
-    for n in range(count):
-        x, y = displacement[n, 0], displacement[n, 1]
-        moves[n] = seen[n] and x * x + y * y > rest
-        moving = moving or moves[n]
-    if not moving:
-        return False
-    for n in range(count):
-        near = False
-        for k in range(min(NEAREST, around.shape[1])):
-            near = near or moves[around[n, k]]
-        if not near or moves[n] or not seen[n]:
-            continue
-        total = mean_x = mean_y = squares = 0.0
-        for k in range(around.shape[1]):
-            other, share = around[n, k], weight[n, k]
-            if seen[other]:
-                x, y = displacement[other, 0], displacement[other, 1]
-                total, mean_x, mean_y = total + share, mean_x + share * x, mean_y + share * y
-                squares += share * (x * x + y * y)
-        if total < LEAST_WEIGHT:
-            continue
-        mean_x, mean_y = mean_x / total, mean_y / total
-        length = mean_x * mean_x + mean_y * mean_y
-        spread = max(squares / total - length, 0.0) / 2
-        expected = spread + stderr[n] * stderr[n] + BEST_AGREEMENT**2 * length + LEAST_SPREAD**2
-        along = mean_x * displacement[n, 0] + mean_y * displacement[n, 1]
-        against[n] = max(against[n], (length / 2 - along) / expected)
-    return True
+    def _weigh(self, displacement: Floats, stderr: Floats32, seen: Flags, moves: Flags) -> None:
+        """Raise `against` to the evidence of a frame, where a mark rests beside one that `moves`, (N,)."""
+        resting = np.flatnonzero(seen & ~moves & moves[self._around[:, :NEAREST]].any(axis=1))
+        around = self._around[resting]
+        share = self._weight[resting] * seen[around]
+        told = share.sum(axis=1) > LEAST_SUPPORT
+        resting, around, share = resting[told], around[told], share[told]
+        share /= share.sum(axis=1, keepdims=True)
+        moved = displacement[around]
+        mean = np.einsum("nk,nki->ni", share, moved)
+        length = (mean**2).sum(axis=1)
+        spread = np.maximum(np.einsum("nk,nki,nki->n", share, moved, moved) - length, 0) / 2
+        expected = spread + stderr[resting] ** 2 + BEST_AGREEMENT**2 * length + LEAST_SPREAD**2
+        along = (mean * displacement[resting]).sum(axis=1)
+        self.against[resting] = np.maximum(self.against[resting], (length / 2 - along) / expected)

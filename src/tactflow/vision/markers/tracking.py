@@ -21,7 +21,7 @@ from tactflow.vision.markers.detection import (
     to_gray,
 )
 from tactflow.vision.markers.interpolation import Interpolator
-from tactflow.vision.markers.matching import MarkerGraph, choose_spots, common_displacement
+from tactflow.vision.markers.matching import REACH, MarkerGraph, common_displacement, grow
 from tactflow.vision.markers.motion import MotionEvidence
 from tactflow.vision.markers.selection import expected_marks
 from tactflow.vision.markers.spots import SpotFinder
@@ -81,9 +81,9 @@ class MarkerTracker:
     """Follows the marks of a reference frame: position, status, standard error and probability of each.
 
     Each mark is first aligned with its template, from where it was last. Where all are found and their
-    displacements form a smooth field, this is the answer. Otherwise spots are searched, and the marks outside
-    the largest smooth component of the field choose among them jointly, so that neighbours move alike. Every
-    choice is then aligned as before. Marks that are not seen are placed by those around them.
+    displacements form a smooth field, this is the answer. Otherwise spots are searched, and the largest
+    smooth component of the field grows: it predicts where the marks beside it are, and these take the spots
+    there. Every choice is then aligned as before. Marks that are not seen are placed by those around them.
 
     A position is always measured against the reference, so nothing drifts. What a mark did before only serves
     as a starting point. Identities rest on the smoothness of the whole field, so a wrong one does not
@@ -156,12 +156,18 @@ class MarkerTracker:
         self._origin = np.array(detection.centers, np.float64)
         if len(grays) > 1:
             self._origin = refine_centers(mean if dark else 255 - mean, self._origin, self._radius)
-        self._count = len(self._origin)
         self._templates = TemplateGroups(mean, self._origin, _radii(detection), dark)
         self._spots = SpotFinder(np.rint(mean).astype(np.uint8), detection)
-        self._graph = MarkerGraph(self._origin, detection.edges)
-        self._interpolator = Interpolator(self._origin, self._pitch)
+        self._know(self._origin, detection.edges)
         self.reset()
+
+    def _know(self, origin: Floats, edges: Indices) -> None:
+        """What follows from where the marks are in the reference, (N, 2) px, and from their links (E, 2)."""
+        self._origin, self._count = origin, len(origin)
+        self._graph = MarkerGraph(origin, edges)
+        self._interpolator = Interpolator(origin, self._pitch)
+        nearest = lattice.nearest(origin, 1)[0][:, :1]
+        self._apart = nearest[:, 0] if nearest.size else np.full(self._count, self._pitch)
 
     def reset(self) -> None:
         """Forget what was tracked; the reference stays."""
@@ -244,9 +250,7 @@ class MarkerTracker:
         placed = np.concatenate([self._position, centers])
         Interpolator(origin, self._pitch).place(placed, known)
         origin[~known] -= placed[~known] - centers
-        self._origin, self._count = origin, len(origin)
-        self._graph = MarkerGraph(origin, lattice.neighbour_graph(origin, lattice.LONGEST_LINK * self._pitch))
-        self._interpolator = Interpolator(origin, self._pitch)
+        self._know(origin, lattice.neighbour_graph(origin, lattice.LONGEST_LINK * self._pitch))
         against = self._evidence.against
         self._evidence = MotionEvidence(origin, self._pitch, REST * self._pitch)
         self._evidence.against[: len(against)] = against
@@ -264,7 +268,7 @@ class MarkerTracker:
         return seen, strain, check_marks(*fit, edges, length, self._seen, seen, strain)
 
     def _search(self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats) -> _Result:
-        """Joint choice among the spots, for marks outside the largest smooth component."""
+        """Spots for the marks outside the largest smooth component of the field."""
         jumped = self._jumps(image, seen)
         if jumped is not None:
             found = self._templates.align(image, jumped)
@@ -272,26 +276,20 @@ class MarkerTracker:
             seen = trusted(found.gain, found.r_squared)
             strain = self._graph.strain(found.position)
         inliers = self._graph.largest_component(seen, strain)
-        free = np.setdiff1d(np.flatnonzero(~inliers), self._left)
-        if len(free) == 0:
-            return _Result(found.position, seen, found.stderr)
-        moved = found.position - self._origin
-        # Where they were, and where the marks around them are now.
-        around = found.position.copy()
-        self._infer(around, inliers)
-        expected = np.stack([self._position[free], around[free]])
-        spots, strength = self._candidates(image, found, inliers, seen & ~inliers, expected)
-        chosen = choose_spots(
-            self._origin, self._graph.edges, free, inliers, moved, expected, spots, strength,
-            pitch=self._pitch, farthest=self._farthest,
-        )  # fmt: skip
         result = _Result(found.position.copy(), inliers.copy(), found.stderr.copy())
-        given = chosen >= 0
-        taken = free[given]
-        if len(taken):
-            aligned = self._templates.align(image, spots[chosen[given]], taken)
-            result.position[taken], result.stderr[taken] = aligned.position, aligned.stderr
-            result.found[taken] = trusted(aligned.gain, aligned.r_squared)
+        result.position[~inliers] = self._position[~inliers]
+        settled = inliers.copy()
+        settled[self._left] = True
+        if settled.all():
+            return result
+        spots = self._candidates(image, found, inliers, seen & ~inliers)
+        reach = np.minimum(REACH * self._apart, self._farthest)
+        marks, chosen = grow(result.position, inliers, spots, self._interpolator, reach)
+        marks, chosen = marks[~settled[marks]], chosen[~settled[marks]]
+        if len(marks):
+            aligned = self._templates.align(image, spots[chosen], marks)
+            result.position[marks], result.stderr[marks] = aligned.position, aligned.stderr
+            result.found[marks] = trusted(aligned.gain, aligned.r_squared)
         return result
 
     def _jumps(self, image: NDArray[np.uint8], seen: Flags) -> Floats | None:
@@ -327,20 +325,21 @@ class MarkerTracker:
         return there > int(np.count_nonzero(seen[grid])) and there > WHOLE * len(grid)
 
     def _candidates(
-        self, image: NDArray[np.uint8], found: Alignment, inliers: Flags, outliers: Flags, expected: Floats
-    ) -> tuple[Floats, Floats]:
-        """Spots (M, 2), px, that no inlier is at, and their strengths (M,), 1 for a typical mark.
+        self, image: NDArray[np.uint8], found: Alignment, inliers: Flags, outliers: Flags
+    ) -> Floats:
+        """Spots (M, 2), px, around the marks that no inlier is at.
 
-        expected : (k, n, 2), px, around which spots are searched. outliers : (N,), marks that are seen
-        without being inliers; where they are is a spot like any other.
+        outliers : (N,), marks that are seen without being inliers; where they are is a spot like any other.
         """
-        low, high = expected.min(axis=(0, 1)) - self._farthest, expected.max(axis=(0, 1)) + self._farthest
-        spots, strength = self._spots.find(image, SPOT_STRENGTH, low, high)
+        around = self._position.copy()
+        self._infer(around, inliers)
+        expected = np.concatenate([self._position[~inliers], around[~inliers]])
+        low, high = expected.min(axis=0) - self._farthest, expected.max(axis=0) + self._farthest
+        spots, _ = self._spots.find(image, SPOT_STRENGTH, low, high)
         own = np.flatnonzero(outliers)
         own = own[_are_apart(found.position[own], spots, SAME_SPOT * self._pitch)]
-        spots, strength = np.concatenate([spots, found.position[own]]), np.append(strength, found.gain[own])
-        free = _are_apart(spots, found.position[inliers], SAME_SPOT * self._pitch)
-        return spots[free], strength[free]
+        spots = np.concatenate([spots, found.position[own]])
+        return spots[_are_apart(spots, found.position[inliers], SAME_SPOT * self._pitch)]
 
     def _infer(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that were not found, in place, and return those; others stay where they were."""
