@@ -5,9 +5,8 @@
     python benchmarks/load.py --sensors 16 --touched 2 --rate 60 --subscribers
     python benchmarks/load.py --soak 1000000        # frames through all sinks as fast as possible; an hour
 
-Each sensor feeds 800 x 600 px pictures with intermittent contact, or of an untouched gel, to the default
-pipeline. Subscribers run on
-the same machine. Tables are printed in Markdown.
+Each sensor feeds pictures of 800 x 600 px, with intermittent contact or of an untouched gel, to the default
+pipeline. Subscribers run on the same machine. Tables are printed in Markdown.
 """
 
 from __future__ import annotations

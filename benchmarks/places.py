@@ -2,10 +2,10 @@
 
     python -m benchmarks.places [--data ../shared/data]
 
-`letac`: two objects, gripped and then dragged by a robot. A plane is fitted from what is seen to the robot's
-x and y (mm) on every other grasp, and tried on the rest: correlation and RMS residual for x, y. What is seen
-is the centre of the contact, the mean flow inside it, or both. The grip drags the gel along, and the object
-slides: the flow tells the first, the centre the second.
+`letac`: two objects, gripped and then dragged by a robot. A plane is fitted from the features to the robot's
+x and y (mm) on every other grasp, and tested on the rest: correlation and RMS residual for x, y. Features are
+the centre of the contact, the mean flow inside it, or both. The grip drags the gel along, which shows in the
+flow, and the object slides, which shows in the centre.
 
 `tactip_shear`: a flat surface, pushed in, tilted, sheared and turned in separate pictures. A linear model
 (ridge regression; its weight by leave-one-out errors of the training half) from every second picture to the
@@ -32,7 +32,7 @@ from tactflow.vision.arrays import Floats
 from tactflow.vision.types import MarkerStatus
 
 OBJECTS = ("3D_printing_1", "gel")
-SEEN = {"centre": slice(0, 2), "flow": slice(2, 4), "both": slice(0, 4)}
+FEATURES = {"centre": slice(0, 2), "flow": slice(2, 4), "both": slice(0, 4)}
 """Columns of `look`."""
 MOVED = {
     **{"pose_z": "mm", "pose_Rx": "deg", "pose_Ry": "deg"},
@@ -80,12 +80,12 @@ def densities(dots: list[Floats], size: tuple[int, int]) -> Floats:
     return np.array(fields, float)
 
 
-def ridge(features: Floats, values: Floats, tried: Floats) -> Floats:
-    """What a ridge regression says of `tried`; one value at a time, its weight by leave-one-out."""
+def ridge(features: Floats, values: Floats, tested: Floats) -> Floats:
+    """Prediction of a ridge regression for `tested`; one value at a time, its weight by leave-one-out."""
     middle = features.mean(axis=0)
     left, size, right = np.linalg.svd(features - middle, full_matrices=False)
     mean = values.mean(axis=0)
-    said = np.tile(mean, (len(tried), 1))
+    predicted = np.tile(mean, (len(tested), 1))
     for column, target in enumerate((values - mean).T):
         fits = []
         for weight in size[0] ** 2 * np.logspace(-9, 0, 19):
@@ -94,12 +94,12 @@ def ridge(features: Floats, values: Floats, tried: Floats) -> Floats:
             residual = (target - left @ (shrunk * (left.T @ target))) / (1 - leverage)
             fits.append((float(residual @ residual), weight))
         slopes = right.T @ (size / (size**2 + min(fits)[1]) * (left.T @ target))
-        said[:, column] += (tried - middle) @ slopes
-    return said
+        predicted[:, column] += (tested - middle) @ slopes
+    return predicted
 
 
 def judge_shear(folder: Path) -> list[list[str]]:
-    """Rows: what is seen, and the mean absolute error of each number of the robot."""
+    """Rows: the features, and the mean absolute error of each number of the robot."""
     lines = list(csv.DictReader((folder / "labels.csv").read_text().splitlines()))
     true = np.array([[float(line[name]) for name in MOVED] for line in lines])
     # The picture with the least motion comes first: the dots of all others are compared with it.
@@ -111,33 +111,33 @@ def judge_shear(folder: Path) -> list[list[str]]:
     height, width = cv2.imread(str(paths[0])).shape[:2]
     learned = slice(0, None, 2), slice(1, None, 2)
     rows = [["tactip_shear", *(f"{name}, {unit}" for name, unit in MOVED.items())]]
-    tried = true[learned[1]]
-    said = {
+    tested = true[learned[1]]
+    predicted = {
         what: ridge(features[learned[0]], true[learned[0]], features[learned[1]])
         for what, features in (
             ("displacements", displaced),
             ("density", densities(tracked, (width, height))),
         )
     }
-    said["chance"] = np.tile(true[learned[0]].mean(axis=0), (len(tried), 1))
-    for what, values in said.items():
-        rows.append([what, *(f"{error:.2f}" for error in np.abs(values - tried).mean(axis=0))])
+    predicted["chance"] = np.tile(true[learned[0]].mean(axis=0), (len(tested), 1))
+    for what, values in predicted.items():
+        rows.append([what, *(f"{error:.2f}" for error in np.abs(values - tested).mean(axis=0))])
     return rows
 
 
-def judge(seen: Floats, true: Floats, grasps: list[str]) -> list[str]:
-    """Columns of a row. seen : (n, k). true : (n, 2), mm. grasps : (n,), whose pictures stay together."""
-    known = np.isfinite(seen).all(axis=1)
-    tried = np.isin(grasps, sorted(set(grasps))[1::2])
-    plane = np.column_stack([seen, np.ones(len(seen))])
-    fit = np.linalg.lstsq(plane[known & ~tried], true[known & ~tried], rcond=None)[0]
-    said, true = plane[known & tried] @ fit, true[known & tried]
-    correlation = [np.corrcoef(said[:, axis], true[:, axis])[0, 1] for axis in (0, 1)]
-    residual = np.sqrt(((said - true) ** 2).mean(axis=0))
+def judge(features: Floats, true: Floats, grasps: list[str]) -> list[str]:
+    """Columns of a row. features : (n, k). true : (n, 2), mm. grasps : (n,), whose pictures stay together."""
+    known = np.isfinite(features).all(axis=1)
+    tested = np.isin(grasps, sorted(set(grasps))[1::2])
+    plane = np.column_stack([features, np.ones(len(features))])
+    fit = np.linalg.lstsq(plane[known & ~tested], true[known & ~tested], rcond=None)[0]
+    predicted, true = plane[known & tested] @ fit, true[known & tested]
+    correlation = [np.corrcoef(predicted[:, axis], true[:, axis])[0, 1] for axis in (0, 1)]
+    residual = np.sqrt(((predicted - true) ** 2).mean(axis=0))
     return [
         "{:.2f} {:.2f}".format(*correlation),
         "{:.2f} {:.2f}".format(*residual),
-        f"{np.count_nonzero(known & tried)} of {np.count_nonzero(tried)}",
+        f"{np.count_nonzero(known & tested)} of {np.count_nonzero(tested)}",
     ]
 
 
@@ -153,10 +153,12 @@ def main() -> None:
     for name in OBJECTS:
         chosen = [line for line in lines if line["image"].startswith(f"{name}/")]
         paths = [folder / line["image"] for line in chosen]
-        seen = np.array([look(result) for result in results(paths, untouched)])
+        features = np.array([look(result) for result in results(paths, untouched)])
         true = np.array([[float(line["x_mm"]), float(line["y_mm"])] for line in chosen])
         grasps = [path.stem.rpartition("_")[0] for path in paths]
-        rows += [[name, what, *judge(seen[:, columns], true, grasps)] for what, columns in SEEN.items()]
+        rows += [
+            [name, what, *judge(features[:, columns], true, grasps)] for what, columns in FEATURES.items()
+        ]
     show([*table(rows), "", *table(judge_shear(data / "tactip_shear"))])
 
 

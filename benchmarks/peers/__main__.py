@@ -104,8 +104,8 @@ def code() -> dict[str, dict[str, int]]:
     parts = {"trackpy": [dots.locate], "OpenCV Lucas-Kanade": [dots.corners]}
     network = (depth.PixelNetwork, depth.train, depth.integrate, depth.on_ball)
     return {
-        "dots": {name: sum(map(lines, [one, *parts.get(name, [])])) for name, one in dots.METHODS.items()},
-        "contact": {name: lines(one) for name, one in contact.ADAPTERS.items()},
+        "dots": {n: sum(map(lines, [method, *parts.get(n, [])])) for n, method in dots.METHODS.items()},
+        "contact": {name: lines(adapter) for name, adapter in contact.ADAPTERS.items()},
         "depth": {"tactflow": lines(depth.Tactflow), depth.NETWORK: sum(map(lines, network))},
     }
 

@@ -307,7 +307,7 @@ def _pair(label: FrameLabel, data: Path) -> tuple[Picture, Picture, PixelMapping
     preprocess = tactflow.Preprocessor(
         (width, height), downsample=2 if max(width, height) > judge.LARGE else 1
     )
-    reference, picture = (preprocess(one).copy() for one in pictures)
+    reference, picture = (preprocess(image).copy() for image in pictures)
     return reference, picture, preprocess.mapping
 
 
@@ -323,16 +323,19 @@ def _result(
 
 def _summary(judged: Sequence[judge.Judged]) -> Numbers:
     """Medians over outlined frames; shares of frames with contact that are missed, at rest that are not."""
-    touched, rest = [one for one in judged if one.touched], [one for one in judged if not one.touched]
-    outlined = [one for one in touched if not np.isnan(one.hull)]
-    areas = np.array([one.area for one in outlined])
+    touched, rest = (
+        [frame for frame in judged if frame.touched],
+        [frame for frame in judged if not frame.touched],
+    )
+    outlined = [frame for frame in touched if not np.isnan(frame.hull)]
+    areas = np.array([frame.area for frame in outlined])
     return {
-        "hull_iou": median(one.hull for one in outlined),
-        "contact_iou": median(one.region for one in outlined),
-        "worst_tenth": float(np.quantile([one.hull for one in outlined], 0.1)),
+        "hull_iou": median(frame.hull for frame in outlined),
+        "contact_iou": median(frame.region for frame in outlined),
+        "worst_tenth": float(np.quantile([frame.hull for frame in outlined], 0.1)),
         "area_ratio": float(np.nanmedian(areas)),
-        "missed_contacts": 100 * float(np.mean([not one.found for one in touched])),
-        "false_contacts": 100 * float(np.mean([one.found for one in rest])),
+        "missed_contacts": 100 * float(np.mean([not frame.found for frame in touched])),
+        "false_contacts": 100 * float(np.mean([frame.found for frame in rest])),
         "outlines": len(outlined),
         "at_rest": len(rest),
     }

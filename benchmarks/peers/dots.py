@@ -253,32 +253,38 @@ def on_gels(data: Path, methods: Sequence[str]) -> dict[str, Any]:
         for settings in combinations(FINDING.get(name, {})):
             finder = partial(FINDERS[name], **settings)
             judged[str(settings)] = list(judge_dots.judge(labels, data, finder, kinds=[""]))
-        labs = sorted({one.lab for one in next(iter(judged.values()))})
+        labs = sorted({frame.lab for frame in next(iter(judged.values()))})
         elsewhere = [
-            min(judged.values(), key=lambda ones, lab=lab: _missed(ones, lab, other=True)) for lab in labs
+            min(judged.values(), key=lambda frames, lab=lab: _missed(frames, lab, elsewhere=True))
+            for lab in labs
         ]
-        here = [min(judged.values(), key=lambda ones, lab=lab: _missed(ones, lab)) for lab in labs]
+        here = [min(judged.values(), key=lambda frames, lab=lab: _missed(frames, lab)) for lab in labs]
         answers[name] = {
             key: _shares(
-                [one for ones, lab in zip(chosen, labs, strict=True) for one in ones if one.lab == lab]
+                [
+                    frame
+                    for frames, lab in zip(chosen, labs, strict=True)
+                    for frame in frames
+                    if frame.lab == lab
+                ]
             )
             for key, chosen in (("other labs", elsewhere), ("same lab", here))
         }
     return answers
 
 
-def _missed(ones: Sequence[judge_dots.FoundDots], lab: str, other: bool = False) -> float:
+def _missed(frames: Sequence[judge_dots.FoundDots], lab: str, elsewhere: bool = False) -> float:
     """Mean over labs of the share of dots that are missed or false; of one lab, or of all others."""
     shares: dict[str, list[float]] = {}
-    for one in ones:
-        if (one.lab == lab) != other:
-            shares.setdefault(one.lab, []).append((one.dots - one.found + one.false) / one.dots)
+    for frame in frames:
+        if (frame.lab == lab) != elsewhere:
+            shares.setdefault(frame.lab, []).append((frame.dots - frame.found + frame.false) / frame.dots)
     return float(np.mean([min(np.mean(values), 1.0) for values in shares.values()]))
 
 
-def _shares(ones: Sequence[judge_dots.FoundDots]) -> Numbers:
-    dots = sum(one.dots for one in ones)
+def _shares(frames: Sequence[judge_dots.FoundDots]) -> Numbers:
+    dots = sum(frame.dots for frame in frames)
     return {
-        "found": 100 * sum(one.found for one in ones) / dots,
-        "false": 100 * sum(one.false for one in ones) / dots,
+        "found": 100 * sum(frame.found for frame in frames) / dots,
+        "false": 100 * sum(frame.false for frame in frames) / dots,
     }
