@@ -91,16 +91,16 @@ def test_pipelines_take_turns_and_each_sees_every_frame_once(pipeline: Pipeline,
         "long": recorded(pipeline, tmp_path, 1, 0, 3, 4, 5),
         "one": recorded(pipeline, tmp_path, 1),
     }
-    seen: list[tuple[str, int]] = []
+    order: list[tuple[str, int]] = []
 
     def see(name: str, result: TimedResult) -> str:
-        seen.append((name, result.seq))
+        order.append((name, result.seq))
         return "idle" if result.contact is None else "contact"
 
     times, failures = take_turns(three, see, block=2)
     assert not failures
     first = [("a", 0), ("a", 1), ("long", 0), ("long", 1), ("one", 0)]
-    assert seen == [*first, ("a", 2), ("long", 2), ("long", 3), ("long", 4)]
+    assert order == [*first, ("a", 2), ("long", 2), ("long", 3), ("long", 4)]
     counts = {name: {kind: len(samples) for kind, samples in kinds.items()} for name, kinds in times.items()}
     assert counts == {
         "a": {"reference": 1, "contact": 2},

@@ -17,7 +17,7 @@ from tactflow.report import markdown
 @pytest.fixture
 def result() -> BenchResult:
     """Methods for trackers, one of which has nothing to say about a scene; whole pipelines."""
-    made = BenchResult(quick=True, copy_ms=0.1)
+    result = BenchResult(quick=True, copy_ms=0.1)
     for method, scene, ms, rms, wrong in (
         ("slow & <exact>", "press", 5.0, 0.01, 0),
         ("slow & <exact>", "cable", 6.0, 0.02, 0),
@@ -28,11 +28,13 @@ def result() -> BenchResult:
         ("only easy scenes", "press", 0.1, 0.001, 0),
     ):
         errors = {"displacement_rms": rms, "wrong_percent": wrong}
-        made.add("tracker", method, scene, errors, times={"contact": [ms / 1e3]}, frames=1)
+        result.add("tracker", method, scene, errors, times={"contact": [ms / 1e3]}, frames=1)
     scored = {"displacement_rms": 0.01, "hull_iou": 0.97, "false_contacts": 0, "missed_contacts": 4}
-    made.add("pipeline", "default", "press", scored, times={"contact": [0.0015], "idle": [0.0001]}, frames=2)
-    made.failures["pipeline/classic/press"] = "no markers\nmore"
-    return made
+    result.add(
+        "pipeline", "default", "press", scored, times={"contact": [0.0015], "idle": [0.0001]}, frames=2
+    )
+    result.failures["pipeline/classic/press"] = "no markers\nmore"
+    return result
 
 
 def test_every_kind_of_measurement_has_its_row(result: BenchResult) -> None:

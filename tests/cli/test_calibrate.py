@@ -30,12 +30,12 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     pitch = f"{open_scene('ball').layout.pitch * RAW_MM:.5f}"
     words = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--ball-radius", "2.375"]
     assert calibrate(*words) == 0
-    told = capsys.readouterr().err
-    assert "press 8 of 30: good, radius" in told
-    assert "calibration/main.yaml is written" in told
-    said = yaml.safe_load(Path("calibration/main.yaml").read_text())
-    assert said["made_from"] == "sim:ball?frames=200"
-    assert said["photometric"]["presses"] >= 8
+    output = capsys.readouterr().err
+    assert "press 8 of 30: good, radius" in output
+    assert "calibration/main.yaml is written" in output
+    stored = yaml.safe_load(Path("calibration/main.yaml").read_text())
+    assert stored["made_from"] == "sim:ball?frames=200"
+    assert stored["photometric"]["presses"] >= 8
 
     settings = {"calibration": "calibration/main.yaml"}
     results = [r for r in tactflow.stream(source="sim:press?seed=11&frames=80", settings=settings) if r.depth]
@@ -51,9 +51,9 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert main(["sim", *gauge]) == 0
     force = ["force", "calibration/main.yaml", "--from", "gauge.avi"]
     assert calibrate(*force) == 0
-    told = capsys.readouterr().err
-    assert "heights are not known" not in told
-    assert "the gauge's x axis lies -90 degrees" in told
+    output = capsys.readouterr().err
+    assert "heights are not known" not in output
+    assert "the gauge's x axis lies -90 degrees" in output
     today = ["check", *force[1:], "--csv", "gauge.csv"]
     assert calibrate(*today) == 0
     assert "N RMS from the gauge today; when it was made" in capsys.readouterr().out
@@ -82,14 +82,14 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:ball?frames=60&seed=2") == 0
     assert "it still fits" in capsys.readouterr().out
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
-    told = capsys.readouterr().out
-    assert "another sensor or light, or an object on the gel at the start" in told
-    assert "calibrate again" in told
+    output = capsys.readouterr().out
+    assert "another sensor or light, or an object on the gel at the start" in output
+    assert "calibrate again" in output
     # One press of another ball is no drift.
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:finger?frames=12") == 3
-    told = capsys.readouterr().out
-    assert "presses today, 1: " in told
-    assert "a ball whose radius is not 2.375 mm" in told
+    output = capsys.readouterr().out
+    assert "presses today, 1: " in output
+    assert "a ball whose radius is not 2.375 mm" in output
     assert calibrate("check", "calibration/main.yaml", "--source", "sim:idle?frames=3") == 0
     assert "no presses today: to check the depth" in capsys.readouterr().out
 
@@ -106,16 +106,16 @@ def test_a_printed_target_gives_the_scale(
     assert calibrate(*words, "--grid", "9x6") == 2
     assert "board.png does not show 9 x 6 inner corners" in capsys.readouterr().err
     assert calibrate(*words, "--grid", "5x7") == 0
-    said = yaml.safe_load(Path("calibration/main.yaml").read_text())["scale"]
+    stored = yaml.safe_load(Path("calibration/main.yaml").read_text())["scale"]
     # 60 raw pixels are 30 processed ones.
-    assert said["mm_per_pixel"] == pytest.approx([0.1, 0.1], rel=2e-3)
-    assert said["found_by"] == "target of 5x7, pitch of 3 mm"
+    assert stored["mm_per_pixel"] == pytest.approx([0.1, 0.1], rel=2e-3)
+    assert stored["found_by"] == "target of 5x7, pitch of 3 mm"
 
 
-@pytest.mark.parametrize(("rows_apart", "told"), [(30, False), (28, True)])
+@pytest.mark.parametrize(("rows_apart", "warned"), [(30, False), (28, True)])
 def test_a_scale_from_dots_in_no_square_grid_is_told(
     rows_apart: int,
-    told: bool,
+    warned: bool,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -126,15 +126,15 @@ def test_a_scale_from_dots_in_no_square_grid_is_told(
         cv2.circle(picture, (25 + 30 * x, 25 + rows_apart * y), 5, (30, 30, 30), -1, cv2.LINE_AA)
     cv2.imwrite("gel.png", picture)
     assert calibrate("mini", "--from", "gel.png", "--pitch", "3") == 0
-    said = capsys.readouterr().err
-    assert ("--pitch is for dots in a square grid" in said) == told
+    output = capsys.readouterr().err
+    assert ("--pitch is for dots in a square grid" in output) == warned
     scale = yaml.safe_load(Path("calibration/mini.yaml").read_text())["scale"]
     apart = abs(scale["mm_per_pixel"][0] - scale["mm_per_pixel"][1])
     assert min(scale["stderr"]) >= 0.9 * apart / np.sqrt(2)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--from", "sim:idle?frames=3"], "one of --pitch MM and --area"),
         (["markerless", "--from", "sim:unmarked?frames=3", "--pitch", "2"], "found 0"),
@@ -150,14 +150,14 @@ def test_a_scale_from_dots_in_no_square_grid_is_told(
 )
 def test_what_gives_no_calibration_is_refused_in_words(
     words: list[str],
-    said: str,
+    message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert calibrate(*words) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.yaml"))
 
 
@@ -166,9 +166,9 @@ def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert calibrate("--from", "sim:ball?frames=60", "--pitch", "1.724", "--out", "film.yaml") == 0
-    told = capsys.readouterr().err
-    assert "press 1" not in told
-    assert "--set calibration=film.yaml" in told
+    output = capsys.readouterr().err
+    assert "press 1" not in output
+    assert "--set calibration=film.yaml" in output
     assert calibrate("check", "film.yaml", "--from", "sim:ball?frames=2") == 0
     assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in capsys.readouterr().err
     # As a camera, for ten minutes, unless it ends when it knows what it needs.
@@ -204,8 +204,8 @@ def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_picture
     monkeypatch.chdir(tmp_path)
     ball = ["--ball-radius", "2.375"]
     pitch = f"{open_scene('ball').layout.pitch * RAW_MM:.5f}"
-    made = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--kind", "test gel", "--out", "kind.yaml"]
-    assert calibrate(*made, *ball) == 0
+    words = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--kind", "test gel", "--out", "kind.yaml"]
+    assert calibrate(*words, *ball) == 0
     kind = yaml.safe_load(Path("kind.yaml").read_text())
     assert kind["kind"] == "test gel"
     assert kind["photometric"]["depth_stderr"] > 0.094
@@ -224,10 +224,10 @@ def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_picture
     assert calibrate(*refine) == 2
     assert "required --ball-radius MM" in capsys.readouterr().err
     assert calibrate(*refine, *ball) == 0
-    told = capsys.readouterr().err
-    assert "2 presses; learning" in told
-    assert "press 1 of 9" in told
-    assert "not its diameter" not in told
+    output = capsys.readouterr().err
+    assert "2 presses; learning" in output
+    assert "press 1 of 9" in output
+    assert "not its diameter" not in output
     found = yaml.safe_load(Path("calibration/left.yaml").read_text())
     assert found.get("kind") is None
     assert found["scale"] == kind["scale"]
@@ -260,10 +260,10 @@ def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(
     Path("forces/bad.csv").write_text("t,force\n0,1\n")
     capsys.readouterr()
     assert calibrate("force", "gel.yaml", "--from", "forces") == 0
-    told = capsys.readouterr().err
-    assert "forces/idle.avi is left out: " in told
-    assert "forces/bad.avi is left out: " in told
-    assert "forces/good.avi: 100 frames" in told
+    output = capsys.readouterr().err
+    assert "forces/idle.avi is left out: " in output
+    assert "forces/bad.avi is left out: " in output
+    assert "forces/good.avi: 100 frames" in output
     assert list(yaml.safe_load(Path("gel.yaml").read_text())["force"]["recordings"]) == ["forces/good.avi"]
     Path("forces/good.csv").unlink()
     assert calibrate("force", "gel.yaml", "--from", "forces", "--overwrite") == 2

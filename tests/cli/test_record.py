@@ -115,13 +115,13 @@ def test_repair_leaves_a_whole_file_alone_and_replaces_nothing_unasked(
     out.write_bytes(whole[:-200])
     copy.write_bytes(b"precious")
     folder.mkdir()
-    for words, said in (
+    for words, message in (
         (["--out", str(copy)], "--overwrite"),
         (["--out", str(folder), "--overwrite"], f"--out: {folder} is a folder; required a file"),
         (["--out", str(out), "--overwrite"], "is the file to repair"),
     ):
         assert main(["repair", str(out), *words]) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     assert copy.read_bytes() == b"precious"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "kept"]
     assert main(["repair", str(out), "--out", str(copy), "--overwrite"]) == 0

@@ -167,10 +167,10 @@ def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
     assert [text for text in answers.asked if "Is this" in text] == [
         f"Is this the sensor? {source}" for source in cameras[1:]
     ]
-    made = yaml.safe_load(out.read_text())
-    assert made["stages"]["capture"]["source"] == cameras[2]
-    assert made["stages"]["preprocess"]["rotate"] == 90
-    assert made["sensor"] == "digit"
+    pipeline = yaml.safe_load(out.read_text())
+    assert pipeline["stages"]["capture"]["source"] == cameras[2]
+    assert pipeline["stages"]["preprocess"]["rotate"] == 90
+    assert pipeline["sensor"] == "digit"
 
 
 @pytest.mark.parametrize(("recording", "dots"), [("gels/digit_fots", False), ("gels/gelslim_ball", True)])

@@ -131,9 +131,9 @@ def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
     assert "change: focus the lens" in table
     assert "?      rate         single pictures have no times" in table
     assert main(["doctor", "--source", str(tmp_path), "--json"]) == 3
-    told = json.loads(capsys.readouterr().out)
-    assert told["verdict"] == "fault"
-    (focus,) = [check for check in told["checks"] if check["name"] == "focus"]
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == "fault"
+    (focus,) = [check for check in report["checks"] if check["name"] == "focus"]
     assert (focus["verdict"], focus["unit"]) == ("fault", "px")
     assert focus["says"] in table
 

@@ -52,9 +52,9 @@ def field() -> Markers:
 
 
 def everything() -> dict[str, Any]:
-    given = field()
-    flow = flow_in_mask(given, MASK, dilate=8)
-    return {"contact": contact(), "flow": flow, "markers": given, "contact_mask": MASK}
+    dots = field()
+    flow = flow_in_mask(dots, MASK, dilate=8)
+    return {"contact": contact(), "flow": flow, "markers": dots, "contact_mask": MASK}
 
 
 @pytest.mark.parametrize(
@@ -116,11 +116,11 @@ def test_the_contact_view_is_black_outside_the_contact() -> None:
 
 
 def test_text_appears_and_stays_inside_tiny_and_odd_pictures() -> None:
-    given = everything()
-    plain = Annotator(text=False)(GRAY, **given)
-    assert not np.array_equal(plain[:40, :100], Annotator()(GRAY, **given)[:40, :100])
+    results = everything()
+    plain = Annotator(text=False)(GRAY, **results)
+    assert not np.array_equal(plain[:40, :100], Annotator()(GRAY, **results)[:40, :100])
     for shape in ((1, 1, 3), (7, 3, 3), (33, 61, 3), (900, 1201, 3)):
-        assert Annotator()(np.zeros(shape, np.uint8), **{**given, "contact_mask": None}).shape == shape
+        assert Annotator()(np.zeros(shape, np.uint8), **{**results, "contact_mask": None}).shape == shape
 
 
 def test_pictures_of_another_kind_are_refused() -> None:
