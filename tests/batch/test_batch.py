@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -71,17 +70,6 @@ def test_every_recording_has_a_result_and_a_second_call_does_nothing(call: Call)
     assert call() == 0
     assert "0 done now, 2 done before, 0 failed" in call.stderr
     assert call.result(0).stat().st_mtime_ns == written
-
-
-def test_a_worker_does_not_import_matplotlib(call: Call) -> None:
-    code = (
-        "import sys\nfrom tactflow.batch.recordings import find_recordings\n"
-        "from tactflow.batch.work import Task, resolved, work\nfrom pathlib import Path\n"
-        "task = Task(find_recordings(['rec'])[0], resolved(Path('p.yaml'), [], None, 'jsonl'), 'out', '.')\n"
-        "assert work(task).status == 'done'\nassert 'matplotlib' not in sys.modules\n"
-    )
-    assert call("--workers", "1") == 0
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_only_what_has_changed_is_done_again(call: Call) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.bench.quantities import QUANTITIES, Tally
+from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import BenchResult, load_errors, regressions
 from tactflow.engine.errors import ConfigError
 
@@ -17,20 +17,6 @@ def run(scene: str = "press", quick: bool = True, **errors: float) -> BenchResul
 
 def worse(result: BenchResult, stored: BenchResult, scenes: set[str] | None = None) -> list[str]:
     return regressions(result, {m.key: m.errors for m in stored.measured}, scenes)
-
-
-def test_values_of_many_frames_become_one_number() -> None:
-    tally = Tally()
-    for value in ([3.0, 4.0], [0.0], []):
-        tally.add(displacement_rms=value)
-    tally.percent(wrong_percent=[True, False, False, False])
-    tally.within("flow", [0.5, -1.5], [1.0, 1.0])
-    assert tally.errors() == {
-        "displacement_rms": pytest.approx((25 / 3) ** 0.5),
-        "wrong_percent": 25,
-        "flow_within_one": 50,
-        "flow_within_two": 100,
-    }
 
 
 def test_what_got_worse_by_more_than_its_tolerance_is_named() -> None:
