@@ -31,9 +31,9 @@ PATCHES: Final = 25
 """Independent errors of a template: those of neighbouring cells are common."""
 NOISE: Final = 1.0
 """Standard deviation of what is common to a patch and no motion, grey levels, at least."""
-UNEVEN: Final = 0.1
+UNEVEN: Final = 0.05
 """How unevenly the lamps light the gel around a contact, relative: what moves becomes brighter or darker."""
-ELSE: Final = 0.5
+ELSE: Final = 0.2
 """Part of a growth or a change of contrast that the picture shows in other ways: a cable that is pressed
 harder grows across, but not along."""
 STEPS: Final = 12

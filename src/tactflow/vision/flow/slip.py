@@ -37,7 +37,7 @@ ROUNDS: Final = 3
 """Of the search for the gel under a point: the field is smooth, so that each gains a digit."""
 LEAST_MOVED: Final = 1e-6
 """Motion, px, that has no direction."""
-EXCHANGED: Final = 0.1
+EXCHANGED: Final = 0.15
 """Share of the gel in contact that has come, or has left, from which on the stick ratio is measured anew:
 what presses harder or lets go moves the gel without slipping."""
 CORE: Final = 0.5
@@ -50,7 +50,7 @@ UNSURE: Final = 6.0
 ASIDE: Final = 2.0
 """How far gel may stay behind, relative to the RMS of how far it departs sideways: a press that spreads the
 gel does both alike, slip only the first. Chosen on the simulator."""
-_ROUNDS: Final = 4
+_ROUNDS: Final = 2
 """Fits to the part that sticks, each to what the last one found to stick. Chosen by hand."""
 Complexes = NDArray[np.complex128]
 """(M,), x + iy, px."""
@@ -282,16 +282,23 @@ def _pairs(points: Complexes) -> Floats:
     return np.asarray(points.view(np.float64).reshape(-1, 2))
 
 
+def _similarity(places: Complexes, moved: Complexes, share: Floats) -> tuple[complex, complex, Complexes]:
+    """The similarity nearest to displacements of places: mean + slope * away, by their mean, px, growth + i
+    turn, and the places from their middle. share : with the sum 1."""
+    middle, mean = complex(share @ places), complex(share @ moved)
+    away = places - middle
+    slope = complex(share @ (away.conj() * moved)) / max(float(share @ np.abs(away) ** 2), 1e-9)
+    return mean, slope, away
+
+
 def _rigid(places: Complexes, moved: Complexes, share: Floats) -> tuple[Floats, float]:
     """(3,): the rigid motion nearest to displacements of places: shift of the origin, px, and turn from +x to
     +y, radians; the variance that it leaves of each component, px^2. share : with the sum 1."""
-    middle, mean = share @ places, share @ moved
-    away = places - middle
-    spread = float((share @ (away.conj() * away)).real)
-    turn = float((share @ (away.conj() * moved)).imag) / max(spread, 1e-9)
-    left = moved - mean - 1j * turn * away
-    shift = mean - 1j * turn * middle
-    return np.array([shift.real, shift.imag, turn]), float((share @ (left.conj() * left)).real) / 2
+    mean, slope, away = _similarity(places, moved, share)
+    turn = 1j * slope.imag
+    shift = mean + turn * complex(away[0] - places[0])
+    left = np.abs(moved - mean - turn * away)
+    return np.array([shift.real, shift.imag, slope.imag]), float(share @ (left * left)) / 2
 
 
 def _core(places: Floats, share: Floats) -> Flags:
@@ -317,34 +324,24 @@ def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, nois
     >>> points = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), axis=-1)
     >>> moved = np.zeros((5, 5, 2))
     >>> moved[:, :4, 0] = 2.0
-    >>> stick_ratio(np.ones((5, 5)), np.ones((5, 5)), points, moved, 0.02)
+    >>> round(stick_ratio(np.ones((5, 5)), np.ones((5, 5)), points, moved, 0.02), 3)
     0.8
     """
     cells = np.minimum(before, now)
     inside = cells > 0
-    share, place, way = cells[inside], points[inside], moved[inside]
-    if not share.any():
+    if not inside.any():
         return 0.0
-    away = place - np.average(place, axis=0, weights=share)
-    sticks = _core(place, share)
+    share, places, way = cells[inside] / cells.sum(), _complex(points[inside]), _complex(moved[inside])
+    sticks = _core(points[inside], share)
     for _ in range(_ROUNDS):
+        weight = share * sticks
         if not sticks.any():
             return 0.0
-        affine, rigid = _fitted(away, way, share * sticks)
-        length = np.maximum(np.hypot(*rigid.T), 1e-9)
-        left = affine - way
-        behind = (left * rigid).sum(axis=1) / length
-        aside = (left[:, 0] * rigid[:, 1] - left[:, 1] * rigid[:, 0]) / length
-        motion, spread = (math.sqrt(np.average(part**2, weights=share)) for part in (length, aside))
-        sticks = np.abs(behind) <= max(UNSURE * noise, LAG * motion, ASIDE * spread)
+        mean, slope, away = _similarity(places, way, weight / weight.sum())
+        rigid = mean + 1j * slope.imag * away
+        length = np.abs(rigid)
+        # Along the motion, and aside of it.
+        behind = (mean + slope * away - way) * rigid.conj() / np.maximum(length, 1e-9)
+        motion, spread = (math.sqrt(share @ (part * part)) for part in (length, behind.imag))
+        sticks = np.abs(behind.real) <= max(UNSURE * noise, LAG * motion, ASIDE * spread)
     return float(share[sticks].sum() / share.sum())
-
-
-def _fitted(away: Floats, way: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """(n, 2): the affine motion, of points (n, 2), nearest to displacements (n, 2); its rigid part."""
-    basis = np.column_stack([np.ones(len(away)), away])
-    weighted = basis * weight[:, None]
-    ridge = np.diag([1e-9, 1.0, 1.0])
-    motion = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ way)
-    turn = (motion[1, 1] - motion[2, 0]) / 2
-    return basis @ motion, motion[0] + turn * away[:, ::-1] * np.array([-1.0, 1.0])

@@ -1,0 +1,156 @@
+"""Judge the motion of objects on the gel: on simulated scenes whose truth is known, and on real grasps.
+
+    python -m benchmarks.slip                      # the simulator
+    python -m benchmarks.slip --data RECORDINGS    # RECORDINGS/gels/franka_mini, with franka_slip.csv
+
+Simulated: frames in which slip is told, of those that slip and of all others; RMS errors of translation and
+rotation since the touch; shares of errors within one and two stated ones.
+
+Real: `franka_slip.csv` only says which recordings their authors called slip, and not wiggle. `slips.json`
+marks by eye the frames [from, to] in which the picture of the object visibly moves against the dots, in 25
+recordings of either class. Nothing is fitted to either, so that every object is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import tactflow
+from tactflow.sim.recipes import SCENES
+from tactflow.vision.arrays import Floats
+
+FRAMES = 600
+"""Of each scene."""
+ROLLS = ("roll", "tumble")
+"""Scenes in which the contact moves on without sliding: what it moves is not compared."""
+LATE = 0.1
+"""How late slip may be told, and for how long after it ended, s."""
+MARKS = Path(__file__).with_name("slips.json")
+
+
+class Row(NamedTuple):
+    """Of a scene: frames that slip, and those of them in which it is told; other frames with a contact, and
+    those in which it is told; errors (n, 3) of translation, px, and rotation, degrees; stated ones."""
+
+    slipping: int
+    found: int
+    others: int
+    false: int
+    errors: Floats
+    stated: Floats
+
+
+def simulated(name: str) -> Row:
+    """Measure a scene."""
+    spec = f"{name}?frames={FRAMES}"
+    scene = tactflow.open_scene(spec)
+    counts, errors, stated = np.zeros((2, 2), np.int64), [], []
+    start, slipped = np.zeros(3), -math.inf
+    for result in tactflow.stream(source=f"sim:{spec}", settings={"stages.slip": {}}):
+        truth, slip = scene.truth(result.seq, result["mapping"]), result.slip
+        slipped = result.t if truth.slipping else slipped
+        if truth.slipping or (truth.touching and result.t - slipped > LATE):
+            counts[int(not truth.slipping), int(slip is not None and slip.slipping)] += 1
+        if slip is None or slip.translation is None or slip.translation_stderr is None or not truth.touching:
+            continue
+        press = scene.presses(result.seq)[0]
+        under = np.array([[press.x, press.y]]) - press.shear
+        place = result["mapping"].to_processed(scene.camera.to_raw(under))[0]
+        true = np.array([*place, -math.degrees(press.angle - press.twist)])
+        if slip.since == result.seq:
+            start = true
+        else:
+            errors.append(np.array([*slip.translation, slip.rotation]) - (true - start))
+            stated.append([*slip.translation_stderr, slip.rotation_stderr])
+    (missed, found), (others, false) = counts.tolist()
+    parts = (np.array(part, np.float64).reshape(-1, 3) for part in (errors, stated))
+    return Row(missed + found, found, others + false, false, *parts)
+
+
+def report_simulated() -> None:
+    """Print a line for each scene, and the sums."""
+    print("| scene | told of those that slip | told of others | px | degrees | within one, two |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    every = []
+    for name, recipe in SCENES.items():
+        if recipe.programme is None or recipe.settings.get("markers") == "none":
+            continue
+        row = simulated(name)
+        every.append(row)
+        rms = np.sqrt(np.mean(row.errors**2, axis=0)) if len(row.errors) else np.full(3, np.nan)
+        known = "" if name in ROLLS else f"{math.hypot(*rms[:2]):.2f} | {rms[2]:.2f} | {within([row])}"
+        print(f"| {name} | {row.found} of {row.slipping} | {row.false} of {row.others} | {known or '| |'} |")
+    quiet = [row for row in every if not row.slipping]
+    false, others = (sum(getattr(row, name) for row in quiet) for name in ("false", "others"))
+    print(f"Scenes without slip: told in {false} of {others} frames with a contact.")
+    print(f"Scenes with slip, errors within one, two stated: {within(r for r in every if r.slipping)}")
+
+
+def within(rows: Iterable[Row]) -> str:
+    """Shares of errors, of translation and rotation, within one and two stated ones."""
+    ratio = np.concatenate([np.abs(row.errors) / np.maximum(row.stated, 1e-9) for row in rows])
+    return ", ".join(f"{100 * np.mean(ratio < bound):.0f} %" for bound in (1, 2))
+
+
+def told(path: Path) -> tuple[list[int], float]:
+    """Frames of a recording in which an object is said to slip; frames a second."""
+    settings: dict[str, Any] = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1}
+    settings["stages.slip"] = {}
+    results = [(r.seq, r.t, r.slip) for r in tactflow.stream(source=str(path), settings=settings)]
+    rate = (results[-1][0] - results[0][0]) / max(results[-1][1] - results[0][1], 1e-9)
+    return [seq for seq, _, slip in results if slip is not None and slip.slipping], rate
+
+
+def report_real(data: Path) -> None:
+    """Print how many recordings of each class are told, per object, and what becomes of the marks."""
+    with (data / "gels" / "franka_slip.csv").open() as file:
+        classes = {row["recording"]: row["slipped"] == "1" for row in csv.DictReader(file)}
+    marks: dict[str, list[list[int]]] = json.loads(MARKS.read_text())
+    objects: dict[str, dict[bool, list[bool]]] = defaultdict(lambda: {True: [], False: []})
+    onsets: list[float | None] = []
+    quiet = false = 0
+    for recording, slipped in classes.items():
+        frames, rate = told(data / "gels" / "franka_mini" / f"{recording}.avi")
+        objects[recording.split("-")[0]][slipped].append(bool(frames))
+        if recording not in marks:
+            continue
+        late = math.ceil(LATE * rate)
+        spans = [(first - late, last + late) for first, last in marks[recording]]
+        inside = [[seq for seq in frames if first <= seq <= last] for first, last in spans]
+        onsets += [
+            (seqs[0] - mark[0]) / rate if seqs else None
+            for seqs, mark in zip(inside, marks[recording], strict=True)
+        ]
+        false += len(frames) - len({seq for seqs in inside for seq in seqs})
+        quiet += not spans and not frames
+    objects["all"] = {kind: [t for by in objects.values() for t in by[kind]] for kind in (True, False)}
+    for name, by in objects.items():
+        print(f"{name}: {sum(by[True])} of {len(by[True])} slip, {sum(by[False])} of {len(by[False])} wiggle")
+    known = [onset for onset in onsets if onset is not None]
+    near = sum(abs(onset) <= LATE for onset in known)
+    print(
+        f"marks: {len(known)} of {len(onsets)} motions found, {near} within {LATE} s of their begin, "
+        f"median {np.median(known):+.2f} s; frames told outside of them: {false}; recordings without "
+        f"motion that are quiet: {quiet} of {sum(not spans for spans in marks.values())}"
+    )
+
+
+def main() -> None:
+    """Judge the simulator, or the recordings of a folder."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder of the recordings")
+    data = parser.parse_args().data
+    report_simulated() if data is None else report_real(data)
+
+
+if __name__ == "__main__":
+    main()
