@@ -1,14 +1,11 @@
-"""The same tables in the terminal and in the report."""
+"""The tables in the terminal."""
 
 from __future__ import annotations
 
-import re
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
-from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import BenchResult
 from tactflow.bench.tables import sections
 from tactflow.report import markdown
@@ -46,18 +43,3 @@ def test_every_kind_of_measurement_has_its_row(result: BenchResult) -> None:
     for above, below in pairwise(lines):
         if above.startswith("|") and below.startswith("|"):
             assert len(above) == len(below)
-
-
-def test_the_report_has_tables_and_a_plot_for_each_quantity_of_several_methods(
-    result: BenchResult, tmp_path: Path
-) -> None:
-    pytest.importorskip("matplotlib")
-    write_bench_report(result, tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert re.findall(r"<figcaption>(.*?)</figcaption>", page) == [
-        "marker displacement error, RMS",
-        "markers with a wrong identity",
-    ]
-    assert page.count("<svg") == 2
-    assert "<exact>" not in page
-    assert "Whole pipelines, scene by scene" in page

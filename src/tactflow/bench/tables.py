@@ -1,4 +1,4 @@
-"""The result as sections of text and tables, for the terminal and the report."""
+"""The result as sections of text and tables."""
 
 from __future__ import annotations
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
 from tactflow.bench.pipelines import CLASSIC
-from tactflow.bench.report import write_bench_report
 from tactflow.bench.results import load_errors, regressions
 from tactflow.bench.run import DEFAULT, MARKERLESS, run_bench
 from tactflow.bench.tables import sections
@@ -15,7 +13,6 @@ from tactflow.cli.options import refuse_output, writing
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.report import markdown
-from tactflow.system.extras import missing
 from tactflow.system.terminal import notes, progress_bar, say, show
 
 WORSE = 3
@@ -45,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="write every number here, as JSON (default: bench.json)",
     )
-    add("--html", type=Path, metavar="PATH", help="write the report with plots here, as one HTML file")
     add(
         "--against",
         type=Path,
@@ -57,11 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print the tables, write what was asked for; returns the exit code."""
     stored = None if args.against is None else load_errors(args.against, quick=args.quick)
-    if args.html is not None and (problem := missing("plots", "plot", ["matplotlib"])):
-        raise ConfigError(problem)
-    for name in ("json", "html"):
-        if getattr(args, name) is not None:
-            refuse_output(f"--{name}", getattr(args, name), overwrite=True)
+    refuse_output("--json", args.json, overwrite=True)
     scenes = frozenset(args.scene) if args.scene else None
     with notes("ERROR"), progress_bar("rendering") as update:
         result = run_bench(
@@ -71,8 +63,10 @@ def run(args: argparse.Namespace) -> int:
             progress=lambda what, n, total: update(description=what, completed=n, total=total),
         )
     show(markdown(sections(result)))
-    _write(args.json, result.save)
-    _write(args.html, lambda path: write_bench_report(result, path))
+    with writing(args.json):
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        result.save(args.json)
+    say(f"tactflow: wrote {args.json}")
     if stored is None:
         return 0
     worse = regressions(result, stored, scenes)
@@ -99,12 +93,3 @@ def _files(words: list[str]) -> dict[str, Path]:
         if path not in files.values():
             files[path.stem if path.stem not in files else str(path)] = path
     return files
-
-
-def _write(path: Path | None, write: Callable[[Path], object]) -> None:
-    if path is None:
-        return
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(path)
-    say(f"tactflow: wrote {path}")
