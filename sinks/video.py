@@ -1,4 +1,4 @@
-"""Video: annotated frames as a file to watch."""
+"""Video: annotated frames in a video file."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from tactflow.system.files import expanded, next_name
 class Video(Sink):
     """Writes annotated frames to a video file; its extension chooses the codec.
 
-    The file plays at the pace at which the frames were captured: without `fps`, the rate is the median of
-    the first frames' time differences. Players show frames at a constant rate, so frames that a live run
-    dropped shorten the film.
+    The file plays at the rate of capture: without `fps`, the rate is the median of the first frames' time
+    differences. Players show frames at a constant rate, so frames dropped in a live run shorten the video.
     """
 
     threaded = True
 
     class Params(StageParams):
-        """Where to write, and how."""
+        """File, and its rate."""
 
         path: str = Field(
             "annotated.avi",
@@ -57,7 +56,7 @@ class Video(Sink):
 
     @classmethod
     def on_restart(cls, params: Video.Params) -> Video.Params:
-        """It goes on in another file, `annotated-001.avi`, beside the one that it has begun."""
+        """Continue in a new file, `annotated-001.avi`, next to the first."""
         return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
@@ -75,8 +74,8 @@ class Video(Sink):
     def write(self, tick: Tick, annotated: Picture) -> None:
         """Add one frame.
 
-        Raises StageError if the picture changes its size, or the disk is nearly full. The film then ends with
-        the frame before.
+        Raises StageError if the picture changes its size, or the disk is nearly full. The video then ends
+        with the previous frame.
         """
         if self._film is not None:
             self._film.add(tick.frame.t, annotated)
@@ -84,8 +83,8 @@ class Video(Sink):
     def close(self) -> None:
         """Finish the file.
 
-        Raises StageError if not all frames are in it: the disk, or a limit on the size of files, ended it
-        early, or another program has taken it away.
+        Raises StageError if frames are missing: the disk or a limit on file sizes was reached, or another
+        program removed the file.
         """
         if self._film is not None:
             self._film.close()
