@@ -85,9 +85,9 @@ class Template(NamedTuple):
     contrast: float
 
     @property
-    def place(self) -> Floats:
-        """(2,), its centre, px."""
-        return self.center * CELL + (CELL - 1) / 2
+    def place(self) -> complex:
+        """Its centre, x + iy, px."""
+        return complex(*(self.center * CELL + (CELL - 1) / 2).tolist())
 
 
 class Registration(NamedTuple):

@@ -173,7 +173,7 @@ class SlipTracker:
         """How the picture has moved since the keyframe: on as before, or else not since the last frame, or
         with the gel."""
         moved = _complex(field.displacement[key.cells]) - key.before
-        x, y, turn = _rigid(key.rest + key.before - _place(key), moved, key.share)[0].tolist()
+        x, y, turn = _rigid(key.rest + key.before - key.template.place, moved, key.share)[0].tolist()
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
         best: Registration | None = None
         for start in (2 * self._last - self._before, self._last, expected):
@@ -262,12 +262,12 @@ def _aged(key: _Key, found: Registration) -> bool:
 
 def _slid(key: _Key, found: Registration, field: DisplacementField, time: float) -> _Moment:
     """The slip up to a time."""
-    place, radius = _place(key), key.template.radius
+    place, radius = key.template.place, key.template.radius
     x, y, turn = found.motion[:3].tolist()
     now = (key.rest + key.before - place) * cmath.exp(1j * turn / radius) + complex(x, y) * PX
     under = key.rest - place
     for _ in range(ROUNDS):
-        moved = _complex(field.at(_pairs(under + place)))
+        moved = _complex(field.at((under + place).view(np.float64).reshape(-1, 2)))
         under = now - moved
     slid, left = _rigid(key.rest - place, under + place - key.rest, key.share)
     to_px = np.array([PX, PX, 1 / radius])
@@ -279,19 +279,9 @@ def _slid(key: _Key, found: Registration, field: DisplacementField, time: float)
     return _Moment(time, gel, key.slid + slid, covariance, key.covariance)
 
 
-def _place(key: _Key) -> complex:
-    """The centre of the keyframe's picture, px."""
-    return complex(*key.template.place.tolist())
-
-
 def _complex(pairs: Floats) -> Complexes:
     """Points or displacements (M, 2) as x + iy."""
     return np.ascontiguousarray(pairs).view(np.complex128)[:, 0]
-
-
-def _pairs(points: Complexes) -> Floats:
-    """(M, 2) of x + iy."""
-    return np.asarray(points.view(np.float64).reshape(-1, 2))
 
 
 def _similarity(places: Complexes, moved: Complexes, share: Floats) -> tuple[complex, complex, Complexes]:
