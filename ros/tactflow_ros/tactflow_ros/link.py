@@ -27,8 +27,11 @@ class LinkError(Exception):
     """Invalid address or keys; the message states the remedy."""
 
 
-def connect(socket: zmq.Socket, endpoint: str, keys: str, what: str) -> None:
-    """Connect without waiting for the publisher. keys : folder of the subscriber, or "". Raises LinkError."""
+def connect(socket: zmq.Socket, endpoint: str, keys: str, parameter: str) -> None:
+    """Connect without waiting for the publisher. Raises LinkError.
+
+    keys : folder of the subscriber, or "". parameter : name of the address in messages.
+    """
     socket.linger = 0
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
     # ZeroMQ accepts IPv6 addresses only with this option.
@@ -44,7 +47,8 @@ def connect(socket: zmq.Socket, endpoint: str, keys: str, what: str) -> None:
         raise LinkError(f"keys: {error}; tactflow keys new creates such a folder") from None
     except zmq.ZMQError as error:
         raise LinkError(
-            f"{what}: required an address such as tcp://127.0.0.1:5556, got {endpoint!r}: {error.strerror}"
+            f"{parameter}: required an address such as tcp://127.0.0.1:5556, got {endpoint!r}: "
+            f"{error.strerror}"
         ) from None
 
 

@@ -119,30 +119,30 @@ def pose(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
 
 
 def object_pose(message: Message, head: Header) -> PoseStamped | None:
-    """The object that touches the gel; its axes were those of the frame when it was touched. None if lost."""
-    found = message.get("pose")
-    if found is None or found["status"] != "tracked":
+    """Pose of the object in contact, with the axes of the frame at first contact. None if lost."""
+    pose = message.get("pose")
+    if pose is None or pose["status"] != "tracked":
         return None
     result = PoseStamped(header=head)
     place, turn = result.pose.position, result.pose.orientation
-    moved = zip(found["center"], found["translation"], strict=True)
-    place.x, place.y, place.z = ((start + way) * MM for start, way in moved)
-    angle = math.radians(math.hypot(*found["rotation"]))
+    axes = zip(pose["center"], pose["translation"], strict=True)
+    place.x, place.y, place.z = ((start + shift) * MM for start, shift in axes)
+    angle = math.radians(math.hypot(*pose["rotation"]))
     # The sine of half of the angle over the angle in degrees, which has a limit at 0.
     part = math.sin(angle / 2) / math.degrees(angle) if angle else math.radians(0.5)
-    turn.x, turn.y, turn.z = (part * axis for axis in found["rotation"])
+    turn.x, turn.y, turn.z = (part * axis for axis in pose["rotation"])
     turn.w = math.cos(angle / 2)
     return result
 
 
 def object_transform(message: Message, head: Header, child: str) -> TransformStamped | None:
     """The same as `object_pose` for /tf. child : frame of the object."""
-    found = object_pose(message, head)
-    if found is None:
+    stamped = object_pose(message, head)
+    if stamped is None:
         return None
     result = TransformStamped(header=head, child_frame_id=child)
-    result.transform.rotation = found.pose.orientation
-    to, place = result.transform.translation, found.pose.position
+    result.transform.rotation = stamped.pose.orientation
+    to, place = result.transform.translation, stamped.pose.position
     to.x, to.y, to.z = place.x, place.y, place.z
     return result
 
@@ -159,13 +159,13 @@ def flow(message: Message, head: Header, unit: Unit) -> Vector3Stamped | None:
 
 def slip(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
     """How far the object has moved over the gel, and how far it has turned on it."""
-    found = message.get("slip")
-    if found is None or found.get("translation") is None:
+    moved = message.get("slip")
+    if moved is None or moved.get("translation") is None:
         return None
     result = PoseStamped(header=head)
     place = result.pose.position
-    ((place.x, place.y),) = unit.vectors(found["translation"]).tolist()
-    _turn(result, found["rotation"])
+    ((place.x, place.y),) = unit.vectors(moved["translation"]).tolist()
+    _turn(result, moved["rotation"])
     return result
 
 

@@ -250,7 +250,7 @@ class Hdf5(_ArrayFile):
 
 
 class _Disk(io.FileIO):
-    """A file that remembers why it could not be written, and takes what follows for written.
+    """A file that stores its first write error, and ignores later writes.
 
     HDF5 2.0 crashes at the end of the process if a file could not be completed.
     """
@@ -258,16 +258,16 @@ class _Disk(io.FileIO):
     _error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        left = memoryview(data).cast("B")
-        while self._error is None and len(left):
+        rest = memoryview(data).cast("B")
+        while self._error is None and len(rest):
             try:
-                left = left[super().write(left) :]
+                rest = rest[super().write(rest) :]
             except OSError as error:
                 self._error = error
         return memoryview(data).nbytes
 
     def check(self) -> None:
-        """Raise the error of a write that failed."""
+        """Raise the stored error."""
         if self._error is not None:
             raise self._error
 
