@@ -84,8 +84,10 @@ def report_simulated(frames: int) -> None:
             continue
         row = simulated(name, frames)
         every.append(row)
-        rms = np.sqrt(np.mean(row.errors**2, axis=0)) if len(row.errors) else np.full(3, np.nan)
-        known = "" if name in ROLLS else f"{math.hypot(*rms[:2]):.2f} | {rms[2]:.2f} | {within([row])}"
+        known = ""
+        if len(row.errors) and name not in ROLLS:
+            x, y, turn = np.sqrt(np.mean(row.errors**2, axis=0)).tolist()
+            known = f"{math.hypot(x, y):.2f} | {turn:.2f} | {within([row])}"
         print(f"| {name} | {row.found} of {row.slipping} | {row.false} of {row.others} | {known or '| |'} |")
     quiet = [row for row in every if not row.slipping]
     false, others = (sum(getattr(row, name) for row in quiet) for name in ("false", "others"))

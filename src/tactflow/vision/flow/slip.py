@@ -247,6 +247,7 @@ class SlipTracker:
 def _keyframe(
     template: Template, field: DisplacementField, share: Floats, slid: Floats, covariance: Floats
 ) -> _Key:
+    """A frame that others are compared with. share : (rows, columns), of each cell in contact."""
     inside = _core(field.grid.points, share) & (share > 0)
     rest, before = _complex(field.grid.points[inside]), _complex(field.displacement[inside])
     count = float(share[inside].sum())
