@@ -217,7 +217,7 @@ class SlipTracker:
             # At the RMS radius, where a turn moves the object as much as a shift.
             lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
             covariance = now.covariance + then.covariance - 2 * then.inherited
-            covariance *= fresh * np.outer(lever, lever)
+            covariance = (fresh * covariance + np.diag(gel_variance)) * np.outer(lever, lever)
             # What errors alone may make counts less: a smooth ball does not show how it turns.
             shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLID * radius) ** 2)
             moved = shrink @ ((now.slid - then.slid) * lever)
