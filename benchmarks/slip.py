@@ -80,7 +80,7 @@ def report_simulated(frames: int) -> None:
     print("| --- | --- | --- | --- | --- | --- |")
     every = []
     for name, recipe in SCENES.items():
-        if recipe.programme is None or recipe.settings.get("markers") == "none":
+        if recipe.programme is None or recipe.settings.get("markers") == (0, 0):
             continue
         row = simulated(name, frames)
         every.append(row)
