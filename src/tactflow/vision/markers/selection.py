@@ -49,7 +49,7 @@ CLEAR: Final = 0.55
 """Clearance of a spot that is a mark where a single corner or line of the lattice wants one. Chosen on
 sts_640."""
 
-ALIKE: Final = 1.6
+ALIKE: Final = 1.7
 """Ratio of the responses of such a spot and of the marks around, either way, at most."""
 
 NEAR: Final = 3.2
