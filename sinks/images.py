@@ -1,4 +1,4 @@
-"""Images: every n-th annotated frame in a numbered file."""
+"""Images: every n-th annotated frame as a numbered file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tactflow.system.files import expanded, make_folder, next_name
 from tactflow.system.outputs import cannot_write
 
 UNFINISHED = ".unfinished"
-"""Name of a picture while it is written, so that no program reads half of it."""
+"""Name of a picture until all of it is written, so that nobody reads half of one."""
 
 
 class Images(Sink):
@@ -30,7 +30,7 @@ class Images(Sink):
     threaded = True
 
     class Params(StageParams):
-        """Folder, file format and number of pictures."""
+        """Where to write, what kind of file, and how many."""
 
         folder: str = Field(
             "images", min_length=1, description="folder, relative to the current directory; created"
@@ -63,7 +63,7 @@ class Images(Sink):
 
     @classmethod
     def on_restart(cls, params: Images.Params) -> Images.Params:
-        """Continue in a new folder, `images-001`, next to the first."""
+        """It goes on in another folder, `images-001`, beside the one that it has begun."""
         return params.changed(folder=str(next_name(expanded(params.folder))), overwrite=False)
 
     def open(self) -> None:
@@ -87,7 +87,7 @@ class Images(Sink):
         return {"files": self._files}
 
     def write(self, tick: Tick, annotated: Picture) -> None:
-        """Write one file if the frame is due.
+        """Write one file if it is this frame's turn.
 
         Raises StageError if it cannot be written.
         """

@@ -1,4 +1,4 @@
-"""Record: every accepted frame without loss, and its results, in an MCAP file that can be replayed."""
+"""Record: every accepted frame without loss, and its results, in an MCAP file that can be played again."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 BACKLOG_SHARE = 4
-"""Frames written from memory per new frame, so that saving the ring never delays the run."""
+"""Frames from memory that are written per new frame, so that saving them never holds up the run."""
 
 
 class Record(Recorder):
-    """Records to a file from the start, on request, or during contact.
+    """Records to a file from the start, when told to, or when something touches the gel.
 
-    With `ring`, the last seconds are kept compressed in memory, and become the beginning of the file. A
-    recording always contains the reference frames of its frames.
+    With `ring`, the last seconds are kept in memory, compressed, and become the beginning of the file. A
+    recording always holds the reference frames that its frames are compared with.
 
     A recording from the start goes to `path` itself and all others to `path` with a number, `press-001.mcap`;
-    those never replace a file. With `rotate_size` or `rotate_after`, a long recording continues in further
-    numbered files, each of which can be replayed by itself.
+    those never replace a file. With `rotate_size` or `rotate_after`, a long recording goes on in further
+    numbered files, each of which can be played by itself.
     """
 
     threaded = True
@@ -46,7 +46,7 @@ class Record(Recorder):
     queue_capacity = 32
 
     class Params(StageParams):
-        """The file, and the trigger of a recording."""
+        """Where to record to, and what begins a recording."""
 
         path: str = Field(
             "recording.mcap", pattern=r"\.mcap$", description="file, relative to the current directory"
@@ -90,17 +90,17 @@ class Record(Recorder):
 
         @property
         def begins(self) -> Literal["start", "button", "contact"]:
-            """The trigger, with its default."""
+            """The trigger that is meant."""
             return self.trigger or ("start" if self.ring is None else "button")
 
         def needed_inputs(self) -> Mapping[str, str]:
-            """The trigger contact needs the input contact."""
+            """A contact must be seen to begin a recording."""
             return {"contact": "trigger"} if self.trigger == "contact" else {}
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is written yet.
 
-        sensor : prefix of the channels of the file. control : the run, whose settings are written with the
+        sensor : names the channels of the file. control : the run, whose settings are written beside the
         frames; or None.
         """
         super().__init__(params)
@@ -121,13 +121,13 @@ class Record(Recorder):
 
     @classmethod
     def outputs(cls, params: Record.Params) -> Sequence[Output]:
-        """The file, or the base name of the numbered files."""
+        """The file, or the one whose name the numbered files carry."""
         refuses = params.begins == "start" and not params.overwrite
         return (Output(expanded(params.path), "file", "path", refuses_existing=refuses),)
 
     @classmethod
     def on_restart(cls, params: Record.Params) -> Record.Params:
-        """Continue in a new file, next to the first."""
+        """It goes on in another file, beside the one that it has begun."""
         return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
@@ -144,11 +144,11 @@ class Record(Recorder):
 
     @property
     def recording(self) -> bool:
-        """Whether a file is being written. A recording of the ring ends by itself."""
+        """Whether a file is being written. In ring mode it ends by itself."""
         return self._file is not None
 
     def start_recording(self) -> None:
-        """Begin a new, numbered file with the frames of the ring. Do nothing if a file is being written.
+        """Begin a new, numbered file with what the ring holds, which then is all of it. Nothing if recording.
 
         Raises StageError if it cannot be written.
         """
@@ -158,12 +158,12 @@ class Record(Recorder):
             self._open_next()
             self._backlog = deque(self._ring)
             self._ends = self._backlog[-1].time if self._backlog else None
-            # While the run is paused, no new frame triggers the writing of the ring.
+            # While the run is paused, no frame comes that would take the ring along.
             if self._backlog and self._control is not None and self._control.paused:
                 self.stop_recording()
 
     def stop_recording(self) -> None:
-        """Write the rest of the backlog, and finish the file. Do nothing if no file is being written.
+        """Finish the file, with all that belongs to it. Nothing if not recording.
 
         Raises StageError if it cannot be written.
         """
@@ -181,9 +181,9 @@ class Record(Recorder):
         return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
     def write(self, result: Result) -> None:
-        """Record one frame, or keep it in the ring.
+        """Record one frame, or keep it for later.
 
-        Raises StageError if it cannot be written. The file then ends with the previous frame and stays valid.
+        Raises StageError if it cannot be written. The file then ends with the frame before and can be played.
         """
         with self._lock:
             if not self.wants() and not result.frame.reference:
@@ -201,7 +201,7 @@ class Record(Recorder):
             self._keep(entry)
 
     def close(self) -> None:
-        """Write the rest, and finish the file."""
+        """Write what is left, and finish the file."""
         self.stop_recording()
 
     def _entry(self, result: Result) -> Entry:
@@ -212,7 +212,7 @@ class Record(Recorder):
         frame = result.frame
         time = nanoseconds(frame.t)
         data = {"frames": encode_frame(frame)}
-        # A reference image from outside the source has no results.
+        # A reference image that is not part of the source has no results.
         if frame.seq >= 0:
             data["results"] = encode_message(result, detail=True)
             if self._previews is not None and self._previews.due(frame.t):
@@ -223,7 +223,7 @@ class Record(Recorder):
         return Entry(time, frame.seq, frame.reference, frame.epoch, data)
 
     def _follow(self, touching: bool, time: int) -> None:
-        """Begin a file when a contact begins; end it `after` seconds after the contact."""
+        """Begin a file when a contact begins; it ends some time after the contact."""
         if touching and not self._touching:
             self.start_recording()
         if touching:
@@ -235,7 +235,7 @@ class Record(Recorder):
         return bool(self._backlog) and (self._ends is None or self._backlog[0].time <= self._ends)
 
     def _keep(self, entry: Entry) -> None:
-        """Add the entry to the ring, and drop references whose epochs are over."""
+        """Remember the entry in the ring, and references for as long as frames of their epoch may follow."""
         ring = self._ring
         if self.params.ring is not None:
             ring.append(entry)
@@ -253,7 +253,7 @@ class Record(Recorder):
                     )
         if entry.reference:
             self._references.append(entry)
-        oldest = min(entries[0].epoch for entries in (ring, self._backlog, [entry]) if entries)
+        oldest = min(waiting[0].epoch for waiting in (ring, self._backlog, [entry]) if waiting)
         self._references = [reference for reference in self._references if reference.epoch >= oldest]
 
     def _open_file(self, path: Path, overwrite: bool = False) -> RecordingWriter:
@@ -269,18 +269,18 @@ class Record(Recorder):
         return file
 
     def _write_entry(self, entry: Entry) -> None:
-        """Write one entry, to a further file if this one is full."""
+        """Write one entry, where the file is large or long enough to a further one."""
         file = self._file
         assert file is not None
         try:
             if file.frames and self._is_full(file, entry):
-                # `recording` stays True meanwhile, otherwise the run would skip the next frame.
+                # `recording` stays True meanwhile, or the run would leave out the next frame.
                 self._finish_file(file)
                 file = self._open_next()
             if file.frames == 0:
                 for reference in self._references:
                     if reference.epoch == entry.epoch and reference.seq < entry.seq:
-                        # With the time of the first frame, and without results.
+                        # At the beginning of the file's time line, without results of that time.
                         file.write(replace(reference, data={"frames": reference.data["frames"]}), entry.time)
             file.write(entry)
         except BaseException:

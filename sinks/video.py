@@ -1,4 +1,4 @@
-"""Video: annotated frames in a video file."""
+"""Video: annotated frames as a file to watch."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from tactflow.system.files import expanded, next_name
 class Video(Sink):
     """Writes annotated frames to a video file; its extension chooses the codec.
 
-    The file plays at the rate of capture: without `fps`, the rate is the median of the first frames' time
-    differences. Players show frames at a constant rate, so frames dropped in a live run shorten the video.
+    The file plays at the pace at which the frames were captured: without `fps`, the rate is the median of
+    the first frames' time differences. Players show frames at a constant rate, so frames that a live run
+    dropped shorten the film.
     """
 
     threaded = True
 
     class Params(StageParams):
-        """File, and its rate."""
+        """Where to write, and how."""
 
         path: str = Field(
             "annotated.avi",
@@ -56,7 +57,7 @@ class Video(Sink):
 
     @classmethod
     def on_restart(cls, params: Video.Params) -> Video.Params:
-        """Continue in a new file, `annotated-001.avi`, next to the first."""
+        """It goes on in another file, `annotated-001.avi`, beside the one that it has begun."""
         return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
@@ -74,8 +75,8 @@ class Video(Sink):
     def write(self, tick: Tick, annotated: Picture) -> None:
         """Add one frame.
 
-        Raises StageError if the picture changes its size, or the disk is nearly full. The video then ends
-        with the previous frame.
+        Raises StageError if the picture changes its size, or the disk is nearly full. The film then ends with
+        the frame before.
         """
         if self._film is not None:
             self._film.add(tick.frame.t, annotated)
@@ -83,8 +84,8 @@ class Video(Sink):
     def close(self) -> None:
         """Finish the file.
 
-        Raises StageError if frames are missing: the disk or a limit on file sizes was reached, or another
-        program removed the file.
+        Raises StageError if not all frames are in it: the disk, or a limit on the size of files, ended it
+        early, or another program has taken it away.
         """
         if self._film is not None:
             self._film.close()

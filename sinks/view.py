@@ -1,4 +1,4 @@
-"""View: a live page of the run in the browser."""
+"""View: the run, live, on a page in the browser."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ log = logging.getLogger("tactflow")
 class View(Guiding):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
-    While no page is open or ready for another frame, nothing is encoded. A view that cannot be served is
-    reported once and never stops a run.
+    While no page is open, or none is ready for another frame, nothing is wanted and nothing is encoded. A
+    view that cannot be shown is reported once and never stops a run.
     """
 
     threaded = True
@@ -38,7 +38,7 @@ class View(Guiding):
     observer = True
 
     class Params(StageParams):
-        """Address of the page, rate and size of its pictures."""
+        """Where the page is served, and how much it shows."""
 
         host: str = Field(
             "127.0.0.1",
@@ -84,7 +84,7 @@ class View(Guiding):
 
         Parameters
         ----------
-        sensor : title of the tab.
+        sensor : names the tab.
         control : handle on the run, for the statistics and the buttons.
         """
         super().__init__(params)
@@ -100,7 +100,7 @@ class View(Guiding):
 
     @classmethod
     def among(cls, params: View.Params, folder: Path, address: str | None) -> View.Params:  # noqa: ARG003
-        """Show a tab for each other sensor."""
+        """Its page shows a tab for each of the others."""
         return params.changed(neighbours=str(folder))
 
     def open(self) -> None:
@@ -116,7 +116,7 @@ class View(Guiding):
         port = listener.getsockname()[1]
         if p.port not in (0, port) and self._neighbours is None:
             log.warning("view: port %d is taken (by another run?), using %d", p.port, port)
-        # Imported late: its packages take 0.1 s, and most commands serve no page.
+        # Not at the top: its packages take a tenth of a second, and most commands serve no page.
         from tactflow.view.hub import Hub
         from tactflow.view.server import Server
 
@@ -133,30 +133,30 @@ class View(Guiding):
         hub = self._hub
         if hub is None:
             return False
-        # A frame of a paused run is a single step, sent to every page.
+        # A frame of a paused run is a single step, which every page shall see.
         stepped = bool(hub.pages) and self._control is not None and self._control.paused
         return stepped or (hub.wanted and time.perf_counter() >= self._due)
 
     def counters(self) -> dict[str, int]:
-        """encoded : encoded pictures; and those of `Hub.counters`."""
+        """encoded : pictures made; and those of `Hub.counters`."""
         return {"encoded": self._encoded} | ({} if self._hub is None else self._hub.counters())
 
     def write(self, result: Result, valid: Valid | None = None) -> None:
         """Send the picture and the results; the page draws one over the other."""
-        # Pages may have become busy since the run asked.
+        # What was wanted a moment ago may have become too much meanwhile.
         if not self.wants():
             return
         now, interval = time.perf_counter(), 1.0 / self.params.max_fps
-        # Counted from when this frame was due, so that an uneven source does not lower the rate.
+        # Counted from when this one was due, so that an uneven source does not lower the rate.
         self._due = max(self._due, now - interval / 2) + interval
         captured = result.frame.captured
         self._last = result, valid, (now - captured) * 1000 if captured else -1.0
         self._send(captured)
 
     def _send(self, captured: float = 0.0) -> None:
-        """Send the last frame; again while paused, if a page selects another picture.
+        """Send the last frame, once more if a page of a paused run shows what it did not show before.
 
-        captured : `time.perf_counter` at its capture, s; 0 excludes it from the measured delay.
+        captured : `time.perf_counter` at its capture, s; 0 where the delay until it is seen tells nothing.
         """
         with self._sending:
             hub, p = self._hub, self.params
@@ -176,12 +176,12 @@ class View(Guiding):
             hub.publish(*packet, captured)
 
     def close(self) -> None:
-        """Tell the pages that the run has ended, and stop the server."""
+        """Tell the pages that the run has ended, and serve no more."""
         server, self._server = self._server, None
         if server is None:
             return
         if self._neighbours is not None:
             self._neighbours.leave()
         server.close()
-        # The summary at the end of a run does not name a closed page.
+        # A summary at the end of a run does not name a page that is gone.
         self.description = None

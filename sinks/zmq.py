@@ -25,31 +25,31 @@ log = logging.getLogger("tactflow")
 
 STATS_TOPIC = b"tactflow.stats "
 LARGEST = 2**31 - 1
-"""Maximum of ZeroMQ's options, which are of type `int` in C."""
+"""ZeroMQ takes its numbers as `int` of C."""
 
 
 class Zmq(Sink):
     """Publishes one message per frame: `tactflow.<sensor>`, a space, the JSON of `tactflow.frame/1`.
 
-    While this sensor has no subscriber, nothing is encoded. A slow subscriber loses messages; it never slows
-    the run.
+    Knows who listens: while nobody has subscribed to this sensor, nothing is wanted and nothing encoded.
+    A subscriber that does not keep up loses messages; it never slows the run.
 
-    Subscribers to exactly `tactflow.stats` get the statistics of the run every `stats_every` seconds:
-    `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter prefix, such
-    as `tactflow.`, does not request them, but receives them while another subscriber does.
+    Whoever subscribes to `tactflow.stats` by that name gets the statistics of the run every `stats_every`
+    seconds: `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter
+    prefix, such as `tactflow.`, does not ask for them, but receives them while somebody else does.
 
-    Subscribers to exactly `tactflow_picture.<sensor>` or `tactflow_depth.<sensor>` get the processed picture
-    (JPEG) or the depth map (float32, mm, row by row, little-endian) at the rate `pictures`: the topic, a
-    space, JSON with sensor, seq, t and size (width, height), a line end, the data.
+    Whoever subscribes to `tactflow_picture.<sensor>` or `tactflow_depth.<sensor>` by that name gets the
+    processed picture (JPEG) or the depth map (float32, mm, row by row, little-endian) at the rate `pictures`:
+    the topic, a space, JSON with sensor, seq, t and size (width, height), a line end, the data.
 
-    With `control`, other programs can pause the run, take a new reference, start and end recordings.
+    With `control`, other programs may pause the run, take a new reference, start and end recordings.
     """
 
     threaded = True
     when_live = "latest"
 
     class Params(StageParams):
-        """Address, queue for slow subscribers, and access to commands."""
+        """Where to publish, how much may wait for a slow subscriber, and who may send commands."""
 
         endpoint: str = Field(
             "tcp://127.0.0.1:5556",
@@ -135,7 +135,7 @@ class Zmq(Sink):
 
         @property
         def commanders(self) -> str | None:
-            """Folder with the keys of programs that may send commands; None: no keys are required."""
+            """The folder that says who may send commands; None: who can reach the address."""
             return self.control_keys or self.keys
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
@@ -143,8 +143,8 @@ class Zmq(Sink):
 
         Parameters
         ----------
-        sensor : suffix of the topic.
-        control : handle on the run, for its statistics and for commands; or None.
+        sensor : names the topic.
+        control : the run, asked for its statistics and told what to do; None: there is nothing to ask.
         """
         super().__init__(params)
         self.endpoint = params.endpoint
@@ -164,30 +164,30 @@ class Zmq(Sink):
 
     @classmethod
     def binds(cls, params: Zmq.Params) -> dict[str, str]:
-        """The address for commands; several sensors can share only that of the results."""
+        """The address at which it takes commands; several sensors share only the one of the results."""
         control = params.control
         return {} if control is None or Address.parse(control).picks_a_port else {"control": control}
 
     @classmethod
     def publishes(cls, params: Zmq.Params) -> Publication:
-        """Its endpoint and the options of the socket."""
+        """At its endpoint."""
         return Publication(params.endpoint, params.backlog, params.keys, params.linger)
 
     @classmethod
     def among(cls, params: Zmq.Params, folder: Path, address: str | None) -> Zmq.Params:  # noqa: ARG003
-        """Use a local endpoint without keys, because the relay checks keys."""
+        """With another endpoint, of this machine alone: it is the relay that asks for keys."""
         if address is None:
             return params
-        control_keys = params.commanders if params.control is not None else params.control_keys
-        return params.changed(endpoint=address, keys=None, control_keys=control_keys)
+        kept = params.commanders if params.control is not None else params.control_keys
+        return params.changed(endpoint=address, keys=None, control_keys=kept)
 
     @property
     def control_endpoint(self) -> str | None:
-        """The actual address for commands; None if none are accepted."""
+        """The real address at which commands are taken; None while none are."""
         return None if self._commands is None else self._commands.endpoint
 
     def open(self) -> None:
-        """Bind the sockets; afterwards `endpoint` and `control_endpoint` have the actual ports.
+        """Bind the sockets; afterwards `endpoint` and `control_endpoint` are the real addresses.
 
         Raises StageError if an address is taken or cannot be bound, or the keys are wrong.
         """
@@ -202,7 +202,7 @@ class Zmq(Sink):
             log.info("taking commands on %s", self.control_endpoint)
         self.wait_for_subscriber(p.wait_for_subscriber)
         if self._control is not None and p.stats_every:
-            # In a thread of its own, so that statistics are sent even without frames.
+            # Not in the run's threads: statistics also come while no frame does.
             self._stats_thread = threading.Thread(
                 target=self._publish_statistics,
                 args=(self._publisher, self._control),
@@ -212,65 +212,63 @@ class Zmq(Sink):
             self._stats_thread.start()
 
     def wait_for_subscriber(self, seconds: float) -> bool:
-        """Wait for a subscriber to the results, at most this long; returns whether there is one."""
+        """Wait until somebody has subscribed to the results, at most so long; whether somebody has."""
         return self._publisher is not None and self._publisher.wait_for(self._topic, seconds)
 
-    def _requested_topics(self) -> list[bytes]:
-        """The topics of pictures and depth maps with a subscriber to exactly their name."""
+    def _asked(self) -> list[bytes]:
+        """The topics of pictures and depth maps that somebody has subscribed to by name."""
         if self._publisher is None or not self.params.pictures:
             return []
         topics = (self._picture_topic, self._depth_topic)
         return [topic for topic in topics if self._publisher.is_subscribed(topic, by_name=True)]
 
     def wants(self) -> bool:
-        """Whether this sensor has a subscriber. From any thread; takes about 3 us."""
+        """Whether anybody has subscribed to this sensor. From any thread; takes about 3 us."""
         publisher = self._publisher
-        return publisher is not None and (
-            publisher.is_subscribed(self._topic) or bool(self._requested_topics())
-        )
+        return publisher is not None and (publisher.is_subscribed(self._topic) or bool(self._asked()))
 
     def counters(self) -> dict[str, int]:
-        """serialised : encoded messages. subscriptions : current number of distinct ones."""
+        """serialised : messages encoded. subscriptions : distinct ones now."""
         subscriptions = 0 if self._publisher is None else self._publisher.subscriptions
         return {"serialised": self._serialised, "subscriptions": subscriptions}
 
     def write(self, result: Result) -> None:
-        """Send one message to the subscribers; never waits."""
+        """Send one message to whoever has subscribed; never waits."""
         if self._publisher is None or not self.wants():
             return
         p, frame = self.params, result.frame
         self._publisher.send(self._topic + encode_message(result, detail=p.detail, field=p.field))
         self._serialised += 1
-        topics = self._requested_topics()
-        if topics and frame.seq >= 0 and self._rate.due(frame.t):
+        asked = self._asked()
+        if asked and frame.seq >= 0 and self._rate.due(frame.t):
             image = frame.image if result.image is None else result.image
             height, width = image.shape[:2]
             about = {"sensor": self._sensor, "seq": frame.seq, "t": frame.t, "size": [width, height]}
-            for topic in topics:
+            for topic in asked:
                 data = self._data(topic, image, result)
                 if data is not None:
                     self._publisher.send(topic + orjson.dumps(about) + b"\n" + data)
 
     def _data(self, topic: bytes, image: Image, result: Result) -> bytes | None:
-        """The picture as JPEG, or the depth map; None without a calibration of depth."""
+        """The picture as JPEG, or the depth map; None where the calibration knows no depth."""
         if topic == self._picture_topic:
             return encode_jpeg(image, self.params.quality)
         if result.depth is not None:
             self._had_depth = True
             return result.depth.heights.astype("<f4").tobytes()
-        is_flat = self._had_depth and result.contact is None
-        return np.zeros(image.shape[:2], "<f4").tobytes() if is_flat else None
+        flat = self._had_depth and result.contact is None
+        return np.zeros(image.shape[:2], "<f4").tobytes() if flat else None
 
     def _publish_statistics(self, publisher: Publisher, control: Control) -> None:
-        """Publish the statistics while they have a subscriber; body of a thread."""
+        """Body of the thread that publishes the statistics while somebody has asked for them."""
         while not self._closing.wait(self.params.stats_every):
             if publisher.is_subscribed(STATS_TOPIC, by_name=True):
                 statistics = {"sensor": self._sensor, **control.snapshot()}
-                # Counters of a user's sink may be NumPy numbers.
+                # A sink of the user's own may count with numbers of NumPy.
                 publisher.send(STATS_TOPIC + orjson.dumps(statistics, option=orjson.OPT_SERIALIZE_NUMPY))
 
     def close(self) -> None:
-        """Deliver queued messages for at most `linger` seconds, and free the addresses."""
+        """Deliver what is under way, for at most `linger` seconds, and free the addresses."""
         if self._commands is not None:
             self._commands.close()
             self._commands = None

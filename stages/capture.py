@@ -22,16 +22,16 @@ from tactflow.sources.references import References
 
 
 class Capture(Source):
-    """Reads frames and marks those that show the untouched gel.
+    """Reads frames and says which of them show the untouched gel.
 
-    Recordings are read as fast as the stages process them, or, with `realtime`, at the recorded rate and with
-    the drop policy of a live camera. Their first frames are examined in advance: a better reference than the
-    very first frame comes before all others, with number -1. Frames of a live source are skipped until it is
-    steady. A recording of tactflow contains its references, seq and epochs.
+    Recordings are handed over as fast as they are taken, or, with `realtime`, at their own pace and then
+    like a live camera. Their first frames are examined ahead: if one of them is a better reference than the
+    very first, it comes before all others, with number -1. Those of a live source are left out until it is
+    steady. A recording of tactflow's own brings its references, seq and epochs.
     """
 
     class Params(StageParams):
-        """The source, and its reference frames."""
+        """What to capture, and which frames are the reference."""
 
         source: str = Field("sim:press", description=KINDS)
         realtime: bool = Field(
@@ -107,8 +107,8 @@ class Capture(Source):
     ) -> None:
         """Prepare; nothing is opened yet.
 
-        sensor : stored in every frame. directory : searched for relative paths after the current directory.
-        opener : opens the source; called like `open_source`.
+        sensor : name given to every frame. directory : where relative paths are looked for if they are not
+        in the current directory. opener : opens the source; called like `open_source`.
         """
         super().__init__(params)
         self.live = params.realtime
@@ -148,13 +148,13 @@ class Capture(Source):
         self.description = source.description
 
     def close(self) -> None:
-        """Close the source."""
+        """Give the source back."""
         self._stop.set()
         if self._source is not None:
             self._source.close()
 
     def stop(self) -> None:
-        """End `frames()` soon, even while it waits for the next frame."""
+        """End `frames()` soon; wakes it if it waits for the next frame."""
         self._stop.set()
         if self._source is not None:
             self._source.stop()
@@ -165,18 +165,18 @@ class Capture(Source):
 
     @property
     def state(self) -> str:
-        """State of the source: `running`, `waiting since ...` or `reconnecting since ...`."""
+        """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
         return "running" if self._source is None else self._source.state
 
     @property
     def missed(self) -> int:
-        """Frames of a live source that were replaced by newer ones or only examined: gaps in `seq`."""
+        """Frames of a live source that a newer one overtook, or that were only examined: gaps in `seq`."""
         return 0 if self._source is None else self._source.missed + self._references.left_out
 
     def frames(self) -> Iterator[Frame]:
         """Every frame of the source, in order, until its end or `stop()`.
 
-        Raises SourceError if a frame cannot be read, or the reference image has another size than the frames.
+        Raises SourceError if a frame cannot be read, or the reference image is not as large as the frames.
         """
         p, source = self.params, self._source
         if source is None:
@@ -195,7 +195,7 @@ class Capture(Source):
             )
 
     def _unskipped(self, source: FrameReader) -> Iterator[Arrival]:
-        """The frames without the first `skip` frames of the source, and of each connection to it."""
+        """The frames without the first ones of the source, and of each connection to it."""
         connection, begins = 0, self.params.skip
         while not self._stop.is_set() and (arrival := source.read_arrival()) is not None:
             if arrival.connection != connection:

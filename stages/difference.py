@@ -110,7 +110,7 @@ class Difference(Stage):
         if frame.reference or not self._detector.has_reference:
             self._detector.add_reference(unmarked, valid)
             self._check = self._check or ReferenceCheck(unmarked)
-        result = self._detector.detect(unmarked, marker_mask)
+        result = self._detector.detect(unmarked)
         if not result.touching or self._check is None or not self._check.was_touched(unmarked, result.mask):
             self._doubted = 0
             return ContactPorts(result.mask, result.touching, result.deviations)

@@ -1,4 +1,4 @@
-"""Pipelines from Python: load, check and run one, call a single stage."""
+"""Pipelines from Python: load, check and run one, call a single stage. What `import tactflow` offers."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ def load(
     ----------
     pipeline : a file, or the name of a shipped pipeline such as "markerless"; None: `./pipeline.yaml`, else
         the shipped default.
-    source : replaces the source of the capture stage, like `--source`: "video.avi", "sim:press", "0" ...;
+    source : replaces the source of the capture stage, as `--source` does: "video.avi", "sim:press", "0" ...;
         or the frames themselves, (H, W, 3) uint8 BGR or (H, W) grey: an array, a list, any iterator. Their
         rate is 30 Hz unless settings has another `stages.capture.fps`.
-    settings : values to replace, like `--set`; None for a whole stage or sink removes it.
-    sensor : name of a sensor of a file with `sensors:`; None is the first.
-    realtime : replay a recording at its own rate, dropping frames like a camera.
+    settings : values to replace, as `--set` does; None for a whole stage or sink removes it.
+    sensor : which sensor of a file with `sensors:`; None is the first.
+    realtime : play a recording at its own pace, dropping frames like a camera.
 
     Raises
     ------
-    ConfigError : the message lists every mistake with file, line and column.
+    ConfigError : the message holds every mistake with file, line and column.
 
     Examples
     --------
@@ -86,19 +86,19 @@ def load(
 
 
 _MEMORY = "frames in memory"
-"""Name of the source for frames from Python."""
+"""What stands in place of the source where the frames came from Python."""
 
 
 def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:
     """The pipeline with a source that reads these frames."""
     node = pipeline.source
     cls: type = node.component.cls
-    signature = inspect.signature(cls)
-    if "opener" not in signature.parameters:
+    takes = inspect.signature(cls)
+    if "opener" not in takes.parameters:
         raise ConfigError(f"{node.id}: {cls.__name__} cannot take frames from memory; use the stage capture")
 
     class FromMemory(cls):  # type: ignore[misc]
-        __signature__ = signature
+        __signature__ = takes
 
         def __init__(self, *args: Any, **options: Any) -> None:
             super().__init__(*args, opener=self._open_frames, **options)
@@ -112,9 +112,9 @@ def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:
 
 
 def check(pipeline: str | Path | None = None, *, settings: Settings | None = None) -> list[str]:
-    """The mistakes in a pipeline file, each a text with its position; empty if the file is valid.
+    """Every mistake in a pipeline file, each a text with its place; empty if it can be run.
 
-    pipeline, settings : as for `load`; its errors are returned, not raised.
+    pipeline, settings : as for `load`, whose errors are what it returns; it raises none.
 
     Examples
     --------
@@ -144,20 +144,20 @@ def run(
 
     Parameters
     ----------
-    pipeline : a loaded pipeline, or an argument for `load`.
-    source, settings, sensor, realtime : as for `load`; ignored for a loaded pipeline.
-    max_frames : stop after this many frames.
+    pipeline : what `load` returned, or what it takes.
+    source, settings, sensor, realtime : as for `load`; only where `pipeline` is not loaded yet.
+    max_frames : stop after so many.
 
     Returns
     -------
-    The outcome; `stats` are those of the statistics file.
+    How it ended; `stats` are those of the statistics file.
 
     Raises
     ------
     ConfigError : the pipeline file is wrong; nothing was started.
     TactflowError : a stage, a sink or the source failed.
-    KeyboardInterrupt : Ctrl-C; the run has ended, without the frames in progress. A second one aborts the
-        part that is being closed; the others are closed.
+    KeyboardInterrupt : Ctrl-C; the run has ended, without what was under way. A second one leaves the part
+        that is being closed as it is; the others are closed.
 
     Examples
     --------
@@ -177,7 +177,7 @@ def run(
 
 
 def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
-    """A run of a pipeline; compiles loops, and sets the number of OpenCV's threads.
+    """A run of a pipeline; loops are compiled, and OpenCV has the threads that the pipeline sets.
 
     options : of `Runner`.
     """
@@ -191,14 +191,14 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
 def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
     """One Ctrl-C, SIGTERM or SIGHUP drains the pipeline; a second one ends it at once; a third is not caught.
 
-    Yields the list of received signals.
+    Gives those that came.
     """
     caught: list[int] = []
 
     def handle(number: int, _: FrameType | None) -> None:
         caught.append(number)
         if len(caught) == 1:
-            # Not an exception: Python drops those raised while it frees an object or imports a module.
+            # In any case: Python drops what is raised while it frees an object or imports a module.
             runner.stop("signal")
             return
         on_ending(signal.SIG_DFL)
@@ -213,22 +213,22 @@ def stage(use: type[S], /, **params: Any) -> S: ...
 @overload
 def stage(use: str, /, **params: Any) -> Stage: ...
 def stage(use: str | type[Stage], /, **params: Any) -> Any:
-    """Create one stage for calls without the engine: `stage("hull").process(mask)`.
+    """One stage by itself, to be called without the engine: `stage("hull").process(mask)`.
 
     Parameters
     ----------
-    use : a stage class, or a value of `use:` in a pipeline file: "hull", "package.module:Class",
+    use : a stage class, or what `use:` says in a pipeline file: "hull", "package.module:Class",
         "./file.py:Class".
     params : its parameters.
 
     Returns
     -------
-    The opened stage. `tactflow stages NAME` lists the arguments and results of its `process`; an argument
-    `frame` may be omitted, and is then created from the picture. The first picture is the reference.
+    The stage, opened. Its `process` takes and returns what `tactflow stages NAME` says; where that includes
+    `frame`, it may be left out, and is then made of the picture. The first picture is the reference.
 
     Raises
     ------
-    ConfigError : the stage does not exist, or a parameter is wrong.
+    ConfigError : there is no such stage, or a parameter is wrong.
 
     Examples
     --------
@@ -239,12 +239,12 @@ def stage(use: str | type[Stage], /, **params: Any) -> Any:
     (False, True)
     """
     if isinstance(use, str):
-        name, described = use, resolve(use, "stages", Path())
+        name, found = use, resolve(use, "stages", Path())
     else:
-        name, described = use.__name__, component(use, use.__name__, use.__module__, ())
-    checked = validated(described.params, params, name, origin=f'stage("{name}")')
-    options = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
-    instance: Any = build(described.cls, checked, options)
+        name, found = use.__name__, component(use, use.__name__, use.__module__, ())
+    checked = validated(found.params, params, name, origin=f'stage("{name}")')
+    offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
+    instance: Any = build(found.cls, checked, offered)
     instance.open()
-    instance.process = with_frames_made(instance.process, configured(described, checked).ports.inputs)
+    instance.process = with_frames_made(instance.process, configured(found, checked).ports.inputs)
     return instance

@@ -126,6 +126,3 @@ def test_the_command_learns_it_and_the_pipeline_has_depth(
     assert "mm fits\nit still fits" in capsys.readouterr().out
     dimmer = ["--source", "sim:ball?frames=40&light=bright&markers=none"]
     assert main([*check[:-2], *dimmer]) == 3
-    capsys.readouterr()
-    assert main([*check[:-1], f"sim:ball?frames=36000&{gel}", "--realtime"]) == 0
-    assert "presses today, 1: depth" in capsys.readouterr().out

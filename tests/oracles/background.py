@@ -79,22 +79,3 @@ def plain_scaled_change(
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
     smooth = cv2.sepFilter2D(np.stack(list(scaled), axis=2), cv2.CV_32F, weights, np.ones(1))
     change[:] = smooth.reshape(change.shape)
-
-
-def plain_change_strength(
-    change: Float,
-    inside: NDArray[np.uint8],
-    gain: np.float32,
-    strongest: Float,
-    strength: Float,
-    common: Float,
-) -> None:
-    """Smoothed along y, weighed length and mean over the channels, 0 outside."""
-    weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
-    side = len(strength) // len(inside)
-    counts = (inside != 0).repeat(side, axis=0).repeat(side, axis=1)
-    smooth = cv2.sepFilter2D(change.reshape(*strength.shape, 3), cv2.CV_32F, np.ones(1), weights)
-    pixels = smooth.reshape(*strength.shape, 3) * counts[..., None]
-    square = gain * (pixels**2).sum(axis=2) - (pixels @ strongest) ** 2
-    strength[:] = np.sqrt(np.maximum(square, 0))
-    common[:] = pixels.mean(axis=2)

@@ -27,11 +27,8 @@ class LinkError(Exception):
     """Invalid address or keys; the message states the remedy."""
 
 
-def connect(socket: zmq.Socket, endpoint: str, keys: str, parameter: str) -> None:
-    """Connect without waiting for the publisher. Raises LinkError.
-
-    keys : folder of the subscriber, or "". parameter : name of the address in messages.
-    """
+def connect(socket: zmq.Socket, endpoint: str, keys: str, what: str) -> None:
+    """Connect without waiting for the publisher. keys : folder of the subscriber, or "". Raises LinkError."""
     socket.linger = 0
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
     # ZeroMQ accepts IPv6 addresses only with this option.
@@ -47,8 +44,7 @@ def connect(socket: zmq.Socket, endpoint: str, keys: str, parameter: str) -> Non
         raise LinkError(f"keys: {error}; tactflow keys new creates such a folder") from None
     except zmq.ZMQError as error:
         raise LinkError(
-            f"{parameter}: required an address such as tcp://127.0.0.1:5556, got {endpoint!r}: "
-            f"{error.strerror}"
+            f"{what}: required an address such as tcp://127.0.0.1:5556, got {endpoint!r}: {error.strerror}"
         ) from None
 
 

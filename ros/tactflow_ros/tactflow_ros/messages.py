@@ -119,30 +119,30 @@ def pose(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
 
 
 def object_pose(message: Message, head: Header) -> PoseStamped | None:
-    """Pose of the object in contact, with the axes of the frame at first contact. None if lost."""
-    pose = message.get("pose")
-    if pose is None or pose["status"] != "tracked":
+    """The object that touches the gel; its axes were those of the frame when it was touched. None if lost."""
+    found = message.get("pose")
+    if found is None or found["status"] != "tracked":
         return None
     result = PoseStamped(header=head)
     place, turn = result.pose.position, result.pose.orientation
-    axes = zip(pose["center"], pose["translation"], strict=True)
-    place.x, place.y, place.z = ((start + shift) * MM for start, shift in axes)
-    angle = math.radians(math.hypot(*pose["rotation"]))
+    moved = zip(found["center"], found["translation"], strict=True)
+    place.x, place.y, place.z = ((start + way) * MM for start, way in moved)
+    angle = math.radians(math.hypot(*found["rotation"]))
     # The sine of half of the angle over the angle in degrees, which has a limit at 0.
     part = math.sin(angle / 2) / math.degrees(angle) if angle else math.radians(0.5)
-    turn.x, turn.y, turn.z = (part * axis for axis in pose["rotation"])
+    turn.x, turn.y, turn.z = (part * axis for axis in found["rotation"])
     turn.w = math.cos(angle / 2)
     return result
 
 
 def object_transform(message: Message, head: Header, child: str) -> TransformStamped | None:
     """The same as `object_pose` for /tf. child : frame of the object."""
-    stamped = object_pose(message, head)
-    if stamped is None:
+    found = object_pose(message, head)
+    if found is None:
         return None
     result = TransformStamped(header=head, child_frame_id=child)
-    result.transform.rotation = stamped.pose.orientation
-    to, place = result.transform.translation, stamped.pose.position
+    result.transform.rotation = found.pose.orientation
+    to, place = result.transform.translation, found.pose.position
     to.x, to.y, to.z = place.x, place.y, place.z
     return result
 
@@ -159,13 +159,13 @@ def flow(message: Message, head: Header, unit: Unit) -> Vector3Stamped | None:
 
 def slip(message: Message, head: Header, unit: Unit) -> PoseStamped | None:
     """How far the object has moved over the gel, and how far it has turned on it."""
-    moved = message.get("slip")
-    if moved is None or moved.get("translation") is None:
+    found = message.get("slip")
+    if found is None or found.get("translation") is None:
         return None
     result = PoseStamped(header=head)
     place = result.pose.position
-    ((place.x, place.y),) = unit.vectors(moved["translation"]).tolist()
-    _turn(result, moved["rotation"])
+    ((place.x, place.y),) = unit.vectors(found["translation"]).tolist()
+    _turn(result, found["rotation"])
     return result
 
 

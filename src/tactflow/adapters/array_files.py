@@ -250,7 +250,7 @@ class Hdf5(_ArrayFile):
 
 
 class _Disk(io.FileIO):
-    """A file that stores its first write error, and ignores later writes.
+    """A file that remembers why it could not be written, and takes what follows for written.
 
     HDF5 2.0 crashes at the end of the process if a file could not be completed.
     """
@@ -258,16 +258,16 @@ class _Disk(io.FileIO):
     _error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        rest = memoryview(data).cast("B")
-        while self._error is None and len(rest):
+        left = memoryview(data).cast("B")
+        while self._error is None and len(left):
             try:
-                rest = rest[super().write(rest) :]
+                left = left[super().write(left) :]
             except OSError as error:
                 self._error = error
         return memoryview(data).nbytes
 
     def check(self) -> None:
-        """Raise the stored error."""
+        """Raise the error of a write that failed."""
         if self._error is not None:
             raise self._error
 

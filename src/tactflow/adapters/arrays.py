@@ -18,15 +18,15 @@ from tactflow.sources.paths import find_path, listed, refuse_devices, split_quer
 
 SETTINGS = {
     "dataset": "name of the frames",
-    "times": "name of their times (floats in s, integers in ns)",
+    "times": "name of their times (numbers with a point are s, whole ones ns)",
     "order": "rgb (bgr if not given)",
 }
 EXPORTED = {"dataset": "/frames", "times": "/t"}
-"""Names in an export of tactflow; the default for files that contain both."""
+"""What `tactflow export` writes, and what is read of a file that has both if nothing else is asked for."""
 BLOCK = 64 << 20
-"""Maximum bytes per read; frames are otherwise read chunk by chunk. Chosen by hand."""
+"""Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
 LARGEST_CHUNK = 1 << 30
-"""Maximum bytes of an uncompressed chunk, so that a damaged file does not fill the memory. Chosen by hand."""
+"""Bytes of an uncompressed chunk at most, so that a damaged file does not take all memory. Chosen by hand."""
 ZARR_CHUNK = re.compile(r"(?:c[./])?(\d+)(?:[./]\d+)*")
 """Path of a chunk or shard in the folder of a Zarr array: its index along each axis."""
 
@@ -35,12 +35,12 @@ class ArrayDataset(FrameReader):
     """Frames of one array of an HDF5 file or a Zarr folder.
 
     spec : `file.h5?dataset=/frames`; `times=/t` names their times, else frame i is taken at i / fps;
-    `order=rgb` for colors in that order. An export of tactflow needs none of these. directory, fps : as for
-    `open_source`. Raises SourceError if the file or array does not exist (the message lists the existing
-    arrays), it contains no frames, or a package is missing.
+    `order=rgb` if the colors are in that order. An export of tactflow needs none of these. directory, fps :
+    as for `open_source`. Raises SourceError if there is no such file or array (it lists those that are
+    there), it holds no frames, or a package is missing.
     """
 
-    # HDF5 and the codecs of both formats raise errors of many types.
+    # HDF5 and the codecs of both formats raise all kinds of errors.
     parser_errors = (Exception,)
 
     def __init__(self, spec: str, directory: Path | None = None, fps: float | None = None) -> None:
@@ -84,12 +84,12 @@ class ArrayDataset(FrameReader):
             yield frame, float(t)
 
     def _count_stored(self, stored: Collection[int], length: int) -> int:
-        """Number of frames up to the last stored chunk; missing chunks would read as the fill value.
+        """Frames up to the last chunk that is stored: others read as the fill value, for any length.
 
         stored : indices of chunks along the first axis. length : frames in each.
         """
         chunks, claimed = max(stored, default=-1) + 1, int(self._array.shape[0])
-        # Zarr omits chunks of black pictures. If most are missing, the file is not a recording.
+        # Zarr leaves out chunks of black pictures. Where most are missing, it is no recording.
         if 2 * len(stored) < max(chunks, 1):
             raise SourceError(f"{self.name}: only {len(stored)} of its chunks are stored; was it written?")
         if chunks * length < claimed:
@@ -107,7 +107,7 @@ class ArrayDataset(FrameReader):
                 f"{self.name}: times are {array.dtype} of shape {array.shape}; required {length} numbers"
             )
         times = np.asarray(array[: self.total])
-        # Integers are subtracted before the conversion to float: Unix time in ns has 19 digits.
+        # Whole numbers are subtracted before they are rounded: Unix time in ns has 19 digits.
         seconds: NDArray[np.float64] = (times - times[:1]) / (1e9 if array.dtype.kind in "iu" else 1.0)
         if not np.isfinite(seconds).all():
             raise SourceError(f"{self.name}: required finite times")
@@ -115,14 +115,14 @@ class ArrayDataset(FrameReader):
 
 
 def _hdf5_arrays(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
-    """The arrays of an HDF5 file by name, and a function that closes it."""
+    """The arrays of an HDF5 file by name, and what closes it."""
     import h5py  # type: ignore[import-untyped]
 
     file = h5py.File(path, "r")
     arrays: dict[str, Any] = {}
 
     def visit(name: str, item: Any) -> None:
-        # Without arrays stored in other files, which may be any file of this machine.
+        # Not those whose pixels lie in other files, which may be any file of this machine.
         if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
             arrays[f"/{name}"] = item
 
@@ -131,7 +131,7 @@ def _hdf5_arrays(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
 
 
 def _zarr_arrays(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
-    """The arrays of a Zarr folder by name, and a function that does nothing: Zarr keeps no file open."""
+    """The arrays of a Zarr folder by name; nothing needs to be closed."""
     import zarr
 
     root = zarr.open(str(path), mode="r")
@@ -141,7 +141,7 @@ def _zarr_arrays(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
 
 
 def _is_pickled(array: Any) -> bool:
-    """Whether reading a Zarr array may execute code in it, as old versions of numcodecs do."""
+    """Whether reading a Zarr array may execute code in it: only new versions of numcodecs refuse to."""
     codecs = (*(array.filters or ()), *(array.compressors or ()))
     return any(getattr(codec, "codec_id", None) == "pickle" for codec in codecs)
 
@@ -160,33 +160,33 @@ def _open(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
 
 
 def _stored_chunks(array: Any) -> tuple[Collection[int], int]:
-    """Indices of the stored chunks along the first axis, and the number of frames in each."""
+    """Indices of the stored chunks along the first axis, and the frames in each."""
     if hasattr(array, "store"):
-        # The zarr package would test every possible chunk.
+        # The zarr package itself would look for every chunk that may be.
         folder = Path(array.store.root, array.path)
         paths = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-        indices = {int(match[1]) for path in paths if (match := ZARR_CHUNK.fullmatch(path))}
-        return indices, (array.shards or array.chunks)[0]
+        found = {int(match[1]) for path in paths if (match := ZARR_CHUNK.fullmatch(path))}
+        return found, (array.shards or array.chunks)[0]
     if array.chunks is None:
         return range(array.id.get_storage_size() > 0), array.shape[0]
-    indices = set()
-    array.id.chunk_iter(lambda chunk: indices.add(chunk.chunk_offset[0] // array.chunks[0]))
-    return indices, array.chunks[0]
+    found = set()
+    array.id.chunk_iter(lambda chunk: found.add(chunk.chunk_offset[0] // array.chunks[0]))
+    return found, array.chunks[0]
 
 
 def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:
     array = None if name is None else arrays.get(f"/{name.strip('/')}")
     if array is not None:
         return array
-    available = [
+    found = [
         f"{key} ({array.dtype} {' x '.join(map(str, array.shape))})" for key, array in sorted(arrays.items())
     ]
     problem = f"add ?{setting}=" if name is None else f"there is no {name}; required"
-    raise SourceError(f"{spec}: {problem} one of: {listed(available)}")
+    raise SourceError(f"{spec}: {problem} one of: {listed(found)}")
 
 
 def _check(array: Any, name: str) -> None:
-    """Raise SourceError if an array contains no frames, or its chunks are too large."""
+    """Raise SourceError if an array holds no frames, or too large ones."""
     shape, dtype = array.shape, array.dtype
     are_files = (array.ndim == 1 and dtype.kind == "O") or (array.ndim == 2 and dtype == np.uint8)
     if 0 in shape or not are_files:
@@ -197,7 +197,7 @@ def _check(array: Any, name: str) -> None:
 
 
 def _read_chunks(array: Any, length: int) -> Iterator[NDArray[Any]]:
-    """Iterate over the frames; the file is read in whole chunks, because they are compressed."""
+    """One frame after the other; the file is read by whole chunks, as they are compressed."""
     frame_bytes = max(math.prod(array.shape[1:]) * array.dtype.itemsize, 1)
     together = max(1, min(array.chunks[0] if array.chunks else 1, BLOCK // frame_bytes))
     for begin in range(0, length, together):

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 SETTINGS = {"topic": "name of a topic with pictures"}
 DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf", "json": "json"}
-"""Package that decodes the messages of an MCAP file, by their encoding."""
+"""Encoding of the messages in an MCAP file -> package that decodes them."""
 PACKAGES = ("sensor_msgs/msg", "sensor_msgs", "foxglove", "foxglove_msgs/msg", "foxglove_msgs")
-"""Packages that define the types of messages with pictures."""
+"""Where the types of messages with pictures are defined."""
 CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
-"""FFmpeg's decoder by the format of a `CompressedVideo`."""
+"""Format of a `CompressedVideo` -> FFmpeg's decoder."""
 ENCODINGS: dict[str, tuple[int, int | None]] = {
     **dict.fromkeys(("bgr8", "8UC3", "bgr16", "16UC3"), (3, None)),
     **dict.fromkeys(("rgb8", "rgb16"), (3, cv2.COLOR_RGB2BGR)),
@@ -42,23 +42,23 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     **dict.fromkeys(("bayer_gbrg8", "bayer_gbrg16"), (1, cv2.COLOR_BayerGBRG2BGR)),
     **dict.fromkeys(("bayer_grbg8", "bayer_grbg16"), (1, cv2.COLOR_BayerGRBG2BGR)),
 }
-"""Number of channels and conversion to BGR by encoding, named as in `sensor_msgs/image_encodings.hpp` and by
-Foxglove. Encodings with 16 in the name have 16-bit pixels."""
+"""Encoding -> channels, and the conversion to BGR; named as in `sensor_msgs/image_encodings.hpp` and by
+Foxglove. Those with 16 in their name have 16-bit pixels."""
 
 
 Topics = Mapping[str, tuple[str, int | None]]
-"""Type and number of messages by topic; the number is None if unknown."""
+"""Topic -> type and number of its messages; None if that is unknown."""
 
 
 class Bag(FrameReader):
     """The pictures of one topic.
 
-    A frame's time is the stamp in its message, or the time of recording if the stamp is 0; the first frame
-    has time 0.
+    A frame's time is the stamp in its message, or, where that is 0, when it was recorded; from 0 at the first
+    frame.
 
-    spec : `file.mcap?topic=/name`, likewise a `.bag` or `.db3` file or a rosbag2 folder. directory : as for
-    `open_source`. Raises SourceError if the file or topic does not exist (the message lists the existing
-    topics), or a package is missing.
+    spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder. directory : as for
+    `open_source`. Raises SourceError if there is no such file or topic (it lists those that are there), or a
+    package is missing.
     """
 
     parser_errors = (Exception,)
@@ -99,27 +99,27 @@ class Bag(FrameReader):
 
 
 def _choose(spec: str, topic: str | None, topics: Topics) -> str:
-    """The requested topic, if it has pictures; without a request, the only topic with pictures."""
-    with_pictures = [name for name, (kind, _) in sorted(topics.items()) if _decoder(kind) is not None]
-    if topic in with_pictures:
+    """The requested topic, if it is there and has pictures; without a request, the only one that has some."""
+    pictures = [name for name, (kind, _) in sorted(topics.items()) if _decoder(kind) is not None]
+    if topic in pictures:
         return topic
-    if topic is None and len(with_pictures) == 1:
-        return with_pictures[0]
+    if topic is None and len(pictures) == 1:
+        return pictures[0]
     texts = {
         name: f"{name} ({kind}{'' if count is None else f', {count}'})"
         for name, (kind, count) in sorted(topics.items())
     }
-    without = listed([text for name, text in texts.items() if name not in with_pictures])
-    if topic is None and not with_pictures:
-        raise SourceError(f"{spec}: no topic holds pictures; there are {without}")
+    others = listed([text for name, text in texts.items() if name not in pictures])
+    if topic is None and not pictures:
+        raise SourceError(f"{spec}: no topic holds pictures; there are {others}")
     if topic is None:
         problem = "add ?topic="
     elif topic in topics:
         problem = f"{topic} has messages of type {topics[topic][0]}, which hold no picture; required"
     else:
         problem = f"there is no topic {topic}; required"
-    choices = listed([texts[name] for name in with_pictures])
-    raise SourceError(f"{spec}: {problem} one of: {choices}; topics without pictures: {without}")
+    found = listed([texts[name] for name in pictures])
+    raise SourceError(f"{spec}: {problem} one of: {found}; topics without pictures: {others}")
 
 
 # -- files with messages ------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ class RosBag:
         }
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """The writing time of each message of a topic, ns, and the message, with its fields as attributes."""
+        """When each message of a topic was written, ns, and the message, whose fields are attributes."""
         connections = [connection for connection in self._reader.connections if connection.topic == topic]
         for connection, written, data in self._reader.messages(connections):
             yield written, self._reader.deserialize(data, connection.msgtype)
@@ -157,7 +157,7 @@ class RosBag:
 
 
 class McapFile:
-    """An .mcap file of any writer, including truncated files."""
+    """An .mcap file, whoever wrote it, also one that was cut off."""
 
     def __init__(self, path: Path) -> None:
         require(path, "MCAP files", "bags", "mcap", "zstandard")
@@ -182,17 +182,17 @@ class McapFile:
             raise damaged(str(path), error) from error
         statistics = self._summary.statistics
         self.topics: dict[str, tuple[str, int | None]] = {}
-        # A topic may have several channels, one per writer.
+        # A topic may have several channels, one for each of its writers.
         for channel in self._summary.channels.values():
             schema = self._summary.schemas.get(channel.schema_id)
             count = None
             if statistics is not None:
-                _, previous = self.topics.get(channel.topic, ("", 0))
-                count = (previous or 0) + statistics.channel_message_counts.get(channel.id, 0)
+                _, before = self.topics.get(channel.topic, ("", 0))
+                count = (before or 0) + statistics.channel_message_counts.get(channel.id, 0)
             self.topics[channel.topic] = (schema.name if schema else "no type", count)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Same as `RosBag.messages`."""
+        """As `RosBag.messages`."""
         from tactflow.recording.reader import messages
 
         channels = self._summary.channels.values()
@@ -201,7 +201,7 @@ class McapFile:
             yield message.log_time, parsers[message.channel_id](message.data)
 
     def _parser(self, channel: Channel) -> Callable[[bytes], Any]:
-        """The function that decodes the messages of a channel."""
+        """What decodes the messages of a channel."""
         schema, encoding = self._summary.schemas[channel.schema_id], channel.message_encoding
         if encoding not in DECODERS:
             raise SourceError(
@@ -221,7 +221,7 @@ class McapFile:
         return _from_ros(schema, encoding)
 
     def close(self) -> None:
-        """Do nothing: no file stays open between reads."""
+        """Nothing stays open between two reads."""
 
 
 def _from_ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
@@ -237,7 +237,7 @@ def _from_ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
 
 
 def _from_json(data: bytes) -> Any:
-    """Decode a message of Foxglove's JSON schemas, with bytes in base64."""
+    """A message of Foxglove's JSON schemas, whose bytes are written in base64."""
     message = json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
     message.data = base64.b64decode(message.data)
     return message
@@ -247,7 +247,7 @@ def _from_json(data: bytes) -> Any:
 
 
 def _stamp(message: Any) -> int:
-    """The capture time of a message's picture, ns; 0 if the message has none."""
+    """When the picture of a message was taken, ns; 0 where it does not say."""
     time = message.header.stamp if hasattr(message, "header") else message.timestamp
     names = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
     seconds, rest = next(pair for pair in names if all(hasattr(time, name) for name in pair))
@@ -255,7 +255,7 @@ def _stamp(message: Any) -> int:
 
 
 def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any] | None] | None:
-    """The function that decodes the picture of a message of this type; None for types without pictures."""
+    """What takes the picture out of a message of this type; None where messages hold none."""
     package, _, name = kind.replace(".", "/").rpartition("/")
     if package not in PACKAGES:
         return None
@@ -267,7 +267,7 @@ def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any] | None] | None:
 def raw_image(message: Any, name: str) -> NDArray[Any]:
     """The pixels of an `Image` or `RawImage`: (H, W) or (H, W, 3) uint8 or uint16, in the order BGR.
 
-    Raises SourceError if the encoding is unknown, or the message has fewer bytes than its size needs.
+    Raises SourceError if the encoding is unknown, or there are fewer bytes than the message promises.
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     check_pixel_count(name, width, height)
@@ -293,21 +293,21 @@ def raw_image(message: Any, name: str) -> NDArray[Any]:
 
 
 def compressed_image(message: Any, name: str) -> NDArray[Any]:
-    """The pixels of a `CompressedImage`, as returned by `decode_image`. Raises SourceError."""
+    """The pixels of a `CompressedImage`, as `decode_image` gives them. Raises SourceError."""
     if "compressedDepth" in getattr(message, "format", ""):
         raise SourceError(f"{name}: compressed depth, not a picture")
     return decode_image(bytes(message.data), name)
 
 
 class VideoDecoder:
-    """Decodes a video in packets of one picture each."""
+    """Decodes a video that comes in pieces, one picture each."""
 
     def __init__(self) -> None:
         self._codec: av.VideoCodecContext | None = None
         self._begun = False
 
     def __call__(self, message: Any, name: str) -> NDArray[np.uint8] | None:
-        """The picture of one packet, (H, W, 3) uint8 BGR; None before the first key frame.
+        """The picture of one piece, (H, W, 3) uint8 BGR; None as long as the video has not begun.
 
         Raises SourceError if PyAV is not installed, or the codec is unknown.
         """

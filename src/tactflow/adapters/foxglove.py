@@ -1,4 +1,4 @@
-"""Foxglove: a server of live pictures, annotations and results for the Foxglove app."""
+"""Foxglove: live pictures, what was found on them, and results, for Foxglove to connect to."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 BACKLOG = 32
-"""Messages queued per viewer. Chosen by hand."""
+"""Messages that may wait for each viewer. Chosen by hand."""
 
 
 class Foxglove(Sink):
     """Serves the channels of a recording live: `/main/image`, `/main/annotations`, `/main/results`, and
     `/main/pose`, the pose of the object for the 3D panel, in metres.
 
-    In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. Channels without a viewer are
-    not encoded, and a slow viewer loses messages; the run never waits.
+    In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. Channels that nobody looks at
+    are not encoded, and a slow viewer loses messages; the run never waits.
     """
 
     threaded = True
@@ -62,11 +62,11 @@ class Foxglove(Sink):
 
     @classmethod
     def binds(cls, params: Foxglove.Params) -> dict[str, str]:
-        """Its address."""
+        """Where it serves."""
         return {"port": f"ws://{params.host}:{params.port}"} if params.port else {}
 
     def __init__(self, params: Params, sensor: str = "main") -> None:
-        """Prepare; nothing is served yet. sensor : prefix of the channels."""
+        """Prepare; nothing is served yet. sensor : names the channels."""
         super().__init__(params)
         self.address = self.description = f"ws://{params.host}:{params.port}"
         self._sensor = sensor
@@ -76,7 +76,7 @@ class Foxglove(Sink):
         self._sent = 0
 
     def open(self) -> None:
-        """Start the server; afterwards `address` has the actual port.
+        """Begin to serve; afterwards `address` is the real one.
 
         Raises StageError if a package is missing, or the address is taken or not one of this machine.
         """
@@ -89,7 +89,7 @@ class Foxglove(Sink):
 
         from tactflow.recording.schemas import channel_type, channel_types
 
-        # Kept, because its channels end with it.
+        # Kept, as channels end with it.
         self._context = context = foxglove.Context()
         for name, kind in (channel_types() | {"pose": channel_type(PoseInFrame)}).items():
             encoding, data = kind.schema
@@ -99,7 +99,7 @@ class Foxglove(Sink):
                 topic, schema=schema, message_encoding=kind.packing, context=context
             )
         p = self.params
-        # It logs a warning for every connection of another program.
+        # It complains of every connection that is not Foxglove's, and anybody may connect.
         logging.getLogger("foxglove").setLevel(logging.ERROR)
         try:
             self._server = foxglove.start_server(
@@ -114,7 +114,7 @@ class Foxglove(Sink):
         log.info("foxglove: %s", self.address)
 
     def wants(self) -> bool:
-        """Whether a channel has a viewer. From any thread."""
+        """Whether anybody looks at a channel. From any thread."""
         return any(channel.has_sinks() for channel in list(self._channels.values()))
 
     def counters(self) -> dict[str, int]:
@@ -122,7 +122,7 @@ class Foxglove(Sink):
         return {"messages": self._sent}
 
     def write(self, result: Result) -> None:
-        """Send the channels that have a viewer; never waits."""
+        """Send the channels that somebody looks at; never waits."""
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.schemas import encode_annotations, encode_picture
 
@@ -141,7 +141,7 @@ class Foxglove(Sink):
                 self._sent += 1
 
     def close(self) -> None:
-        """Stop the server, which closes the connections."""
+        """Stop the server; viewers see that the connection is closed."""
         server, self._server = self._server, None
         if server is not None:
             server.stop()
@@ -152,7 +152,7 @@ class Foxglove(Sink):
 
 
 def _encode_pose(result: Result, sensor: str, nanoseconds: int) -> bytes | None:
-    """One `foxglove.PoseInFrame`, m; None if no object is tracked."""
+    """One `foxglove.PoseInFrame`, m; None where no object is tracked."""
     pose = result.pose
     if pose is None or pose.status == "lost":
         return None
@@ -164,8 +164,8 @@ def _encode_pose(result: Result, sensor: str, nanoseconds: int) -> bytes | None:
 
     from tactflow.recording.frames import timestamp
 
-    axes = zip(pose.center, pose.translation, strict=True)
-    x, y, z = ((start + shift) / 1000 for start, shift in axes)
+    moved = zip(pose.center, pose.translation, strict=True)
+    x, y, z = ((start + way) / 1000 for start, way in moved)
     qx, qy, qz, qw = Rotation.from_rotvec(pose.rotation, degrees=True).as_quat().tolist()
     place = Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
     whole = PoseInFrame(timestamp=timestamp(nanoseconds), frame_id=sensor, pose=place)

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 VERSION = "v3.0"
-"""Version of the layout, checked by LeRobot."""
+"""Of the layout, as LeRobot compares it."""
 PICTURES = "observation.images."
 TACTILE = "observation.tactile"
 WINDOW = "window"
-"""Key of the values of all results since the previous row."""
+"""Key under which a row keeps the numbers of all results since the row before."""
 NAMES = {
     "contact": ["touching", "x", "y", "area", "angle"],
     "flow": ["known", "dx", "dy"],
@@ -49,19 +49,19 @@ NAMES = {
     "drag": ["known", "x_N", "y_N"],
     "pose": ["known", "x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg"],
 }
-"""Features and the names of their values: the first two in px, the others only with a calibration, whatever
-parts it has. All values are 0 where the first is 0."""
+"""Features and the names of their numbers: the first two in px, the others only with a calibration, whatever
+parts it has. All numbers are 0 where the first is 0."""
 FORCES = ("Fx_N", "Fy_N", "Fz_N")
-"""Force on a marker: always unknown, because tactflow measures only the total force on the gel."""
+"""Force on a marker: always unknown, as tactflow knows only that on the whole gel."""
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
-"""Integer columns of every dataset, besides `timestamp`."""
+"""Integer columns that every dataset has, besides `timestamp`."""
 CHUNK = 1000
-"""Files per folder, as in LeRobot."""
+"""Files in one folder, as LeRobot has it."""
 QUALITY = {"crf": "18", "g": "2", "preset": "veryfast"}
-"""Options of the video encoder: almost no visible loss, and every second picture is a key frame, for random
-access. Chosen by hand."""
+"""Of the video: hardly any visible loss, and every other picture is a key frame, for random access. Chosen by
+hand."""
 SAMPLED = 10
-"""One of this many pictures enters the statistics of colors. Chosen by hand."""
+"""Every so many pictures are used for their statistics. Chosen by hand."""
 
 
 def export(
@@ -77,15 +77,15 @@ def export(
 
     Parameters
     ----------
-    folder : empty or missing.
+    folder : empty, or not there.
     episodes : the name of each recording, and its results with pictures.
     fps : of the dataset, frames per second.
-    task : description of the task, in words.
+    task : what is done, in words.
     pictures : "video" (H.264, lossy) or "png" (lossless).
 
     Raises
     ------
-    StageError : a package is missing, or a recording does not fit the previous ones. OSError : the files
+    StageError : a package is missing, or a recording does not go with those before. OSError : the files
         cannot be written.
     """
     writer = DatasetWriter(folder, fps, task, video=pictures == "video")
@@ -95,7 +95,7 @@ def export(
 
 
 class DatasetWriter:
-    """Writes one dataset. Parameters as for `export`; video : store pictures as a video."""
+    """Writes one dataset. Parameters as for `export`; video : whether pictures are kept as a video."""
 
     def __init__(self, folder: Path, fps: int, task: str, *, video: bool = True) -> None:
         problem = missing("LeRobot datasets", "lerobot", ["pyarrow", "av"])
@@ -120,8 +120,8 @@ class DatasetWriter:
 
         Raises
         ------
-        StageError : the sensor or the size of its pictures differs from the previous episodes, only some have
-            a calibration, or a picture is missing. OSError : the files cannot be written.
+        StageError : the sensor or the size of its pictures differs from the episodes before, only some have a
+            calibration, or there is no picture. OSError : the files cannot be written.
         """
         episode = len(self._episodes)
         file = f"chunk-{episode // CHUNK:03d}/file-{episode % CHUNK:03d}"
@@ -137,7 +137,7 @@ class DatasetWriter:
                 rows.append(self._row(result, image, index, episode))
                 if encode is not None:
                     encode(image)
-            # Not after a failed write: FFmpeg would end the process.
+            # Not after a write that failed, which would end the process.
             if encode is not None:
                 encode(None)
         if not rows:
@@ -154,7 +154,7 @@ class DatasetWriter:
 
         meta = self._folder / "meta"
         _write(pa.Table.from_pylist(self._episodes), meta / "episodes" / "chunk-000" / "file-000.parquet")
-        # LeRobot finds a task by the index of a pandas table; this metadata names the column of the index.
+        # LeRobot finds a task by the index of a pandas table; this says which column that is.
         types = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
         columns = [
             {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
@@ -167,7 +167,7 @@ class DatasetWriter:
         (meta / "stats.json").write_text(json.dumps(self._statistics(), indent=4))
 
     def _check(self, result: Result) -> NDArray[np.uint8]:
-        """The picture of a result; StageError if it does not fit the previous ones."""
+        """The picture of a result, if it goes with those before."""
         image = result.image
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")
@@ -183,7 +183,7 @@ class DatasetWriter:
         return image
 
     def _remembered(self, results: Iterable[Result]) -> Iterator[Result]:
-        """The same results; keeps the values of each until the next frame of the dataset."""
+        """The same results; the numbers of each are kept until the next frame of the dataset."""
         for result in results:
             self._recent.append(
                 (result.t, [number for values in _values(result).values() for number in values])
@@ -208,7 +208,7 @@ class DatasetWriter:
         return row | {"timestamp": index / self._fps} | dict(zip(INTEGERS, integers, strict=True))
 
     def _marker_rows(self, result: Result) -> dict[str, NDArray[Any]]:
-        """The features of the markers; empty before the first frame with markers."""
+        """The features of the markers; empty as long as no frame had any."""
         if result.markers is not None:
             markers = self._order.align(result.markers)
             return _marker_features(result.sensor, markers, _points(markers, result))
@@ -219,11 +219,11 @@ class DatasetWriter:
         return _marker_features(sensor, lost, np.full((len(lost.offset), 6), np.nan))
 
     def _complete(self, rows: list[dict[str, Any]]) -> None:
-        """Complete every row of an episode with all features in fixed lengths, and update the statistics.
+        """Give every row of an episode all features, in their fixed lengths, and count their values.
 
         Raises
         ------
-        StageError : this recording has markers, and the previous ones have none.
+        StageError : this recording has markers, and those before had none.
         """
         sensor = self._camera.removeprefix(PICTURES)
         if self._order.origin is not None:
@@ -321,7 +321,7 @@ class DatasetWriter:
         }
 
     def _statistics(self) -> dict[str, Any]:
-        """Statistics for normalization: of each value, and of each color (in [0, 1], red first)."""
+        """What training normalises by: of each number, and of each color (in [0, 1], red first)."""
         statistics: dict[str, Any] = {}
         for name, moments in self._moments.items():
             summary: dict[str, Any] = {key: value.tolist() for key, value in moments.summary().items()}
@@ -336,7 +336,7 @@ class DatasetWriter:
 
 
 def _values(result: Result) -> dict[str, list[float]]:
-    """The values of each feature of a frame: all 0 where the first is 0."""
+    """The numbers of each feature of a frame: all 0 where the first is 0."""
     return {
         name: [1.0, *map(float, numbers)] if numbers else [0.0] * len(NAMES[name])
         for name, numbers in _numbers(result).items()
@@ -390,34 +390,34 @@ def _feature(name: str, value: NDArray[Any], calibrated: bool) -> dict[str, Any]
 
 
 def _numbers(result: Result) -> dict[str, Sequence[float] | None]:
-    """The values of each feature of a frame after the first one; None where the first is 0."""
+    """What each feature of a frame holds behind its first number; None where that is 0."""
     contact, depth, force, scale = result.contact, result.depth, result.force, result.scale
     mean = None if result.flow is None else result.flow.mean
-    features: dict[str, Sequence[float] | None] = dict.fromkeys(NAMES if scale else ("contact", "flow"))
-    features["flow"] = mean
+    found: dict[str, Sequence[float] | None] = dict.fromkeys(NAMES if scale else ("contact", "flow"))
+    found["flow"] = mean
     if contact is not None:
-        features["contact"] = [*contact.center, contact.area, math.radians(contact.angle or 0.0)]
+        found["contact"] = [*contact.center, contact.area, math.radians(contact.angle or 0.0)]
     if scale is None:
-        return features
+        return found
     if contact is not None:
-        features["contact_mm"] = [*scale.point(contact.center), scale.area(contact.area)]
+        found["contact_mm"] = [*scale.point(contact.center), scale.area(contact.area)]
     if mean is not None:
-        features["flow_mm"] = scale.vector(mean)
+        found["flow_mm"] = scale.vector(mean)
     if depth is not None:
-        features["depth"] = [depth.greatest, depth.volume]
+        found["depth"] = [depth.greatest, depth.volume]
     if force is not None:
         x, y, z = force.value
-        features["force"] = [z, force.in_range]
-        features["drag"] = None if x is None or y is None else [x, y]
+        found["force"] = [z, force.in_range]
+        found["drag"] = None if x is None or y is None else [x, y]
     if result.pose is not None and result.pose.status == "tracked":
-        features["pose"] = [*result.pose.translation, *result.pose.rotation]
-    return features
+        found["pose"] = [*result.pose.translation, *result.pose.rotation]
+    return found
 
 
 def _open_video(
     stack: ExitStack, path: Path, fps: int, image: NDArray[np.uint8]
 ) -> Callable[[NDArray[np.uint8] | None], None]:
-    """Create an H.264 video; returns a function that adds an (H, W, 3) uint8 BGR picture, None flushes."""
+    """Begin an H.264 video; what adds a picture, (H, W, 3) uint8 BGR, or at None writes what is left."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)

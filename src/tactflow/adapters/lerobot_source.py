@@ -63,30 +63,29 @@ class LeRobotEpisode(FrameReader):
     def _read_pictures(self) -> Iterator[NDArray[Any]]:
         import pyarrow.dataset as ds  # type: ignore[import-untyped]
 
-        in_episode = ds.field("episode_index") == self._episode
-        table = ds.dataset(self._data)
-        for batch in table.to_batches(columns=[self._camera], filter=in_episode, batch_size=16):
+        wanted = ds.field("episode_index") == self._episode
+        for batch in ds.dataset(self._data).to_batches(columns=[self._camera], filter=wanted, batch_size=16):
             for row in batch.to_pylist():
                 yield decode_image(row[self._camera]["bytes"], self.name)
 
     def _decode_video(self, path: Path) -> Iterator[NDArray[np.uint8]]:
         import av
 
-        missing = self.total or 0
+        left = self.total or 0
         with av.open(str(path)) as file:
             (stream, *_) = file.streams.video
             check_pixel_count(self.name, stream.width, stream.height)
-            # Seeks to the previous key frame; decoding starts there.
+            # To the key frame before; from there every picture is decoded.
             file.seek(round(self._begin / (stream.time_base or 1)), stream=stream)
             for frame in file.decode(stream):
                 if frame.time is not None and frame.time < self._begin - 0.5 / self._rate:
                     continue
-                if missing == 0:
+                if left == 0:
                     return
-                missing -= 1
+                left -= 1
                 yield np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
-        if missing:
-            raise SourceError(f"{self.name}: is damaged or cut off ({missing} pictures are missing)")
+        if left:
+            raise SourceError(f"{self.name}: is damaged or cut off ({left} pictures are missing)")
 
 
 def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int, bool]:

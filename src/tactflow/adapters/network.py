@@ -191,15 +191,15 @@ class Network(Stage):
         return Declared(inputs, outputs, "stateful" if stateful else "pure")
 
     def __init__(self, params: Params, directory: Path = Path()) -> None:
-        """Prepare; nothing is read yet. directory : searched for a relative path."""
+        """Prepare; nothing is read yet. directory : where a relative path is looked for."""
         super().__init__(params)
-        beside_pipeline = directory / expanded(params.file)
-        self._file = beside_pipeline if beside_pipeline.exists() else expanded(params.file)
+        found = directory / expanded(params.file)
+        self._file = found if found.exists() else expanded(params.file)
         self.description = str(self._file)
         self._session: InferenceSession | None = None
         self._feeds = {name: _Feed(value) for name, value in params.inputs.items()}
         self._names = [port.name for port in self.declare(params).inputs]
-        self._outputs: list[str] = []
+        self._wanted: list[str] = []
 
     def open(self) -> None:
         """Read the file, and compare its inputs and outputs with the parameters.
@@ -250,17 +250,17 @@ class Network(Stage):
                     f"{self._file}: there is no output {name}; there are {', '.join(outputs)}: name one by "
                     f"outputs.{port}.output"
                 )
-            required = _required_shapes(port, value, self._first.params)
-            if not any(_agree(_sides(outputs[name].shape), shape) for shape in required):
+            wanted = _wanted_shapes(port, value, self._first.params)
+            if not any(_agree(_sides(outputs[name].shape), shape) for shape in wanted):
                 raise StageError(
                     f"{self._file}: output {name} has the shape {_shown(outputs[name].shape)}, but the port "
-                    f"{port} needs {' or '.join(map(_shown, required))}"
+                    f"{port} needs {' or '.join(map(_shown, wanted))}"
                 )
-            self._outputs.append(name)
+            self._wanted.append(name)
 
     @property
     def _first(self) -> _Feed:
-        """The first input: outputs with the size of a picture refer to it."""
+        """The input whose picture outputs of a picture's size belong to."""
         return next(iter(self._feeds.values()))
 
     def close(self) -> None:
@@ -278,11 +278,11 @@ class Network(Stage):
         values = dict(zip(self._names, inputs, strict=True))
         background = values.get("untouched")
         feeds = {name: feed(values[feed.params.port], background) for name, feed in self._feeds.items()}
-        names = list(dict.fromkeys(self._outputs))
-        arrays = dict(zip(names, self._session.run(names, feeds), strict=True))
+        found = self._session.run(list(dict.fromkeys(self._wanted)), feeds)
+        by_name = dict(zip(dict.fromkeys(self._wanted), found, strict=True))
         results: list[Any] = []
-        for name, (port, value) in zip(self._outputs, self.params.outputs.items(), strict=True):
-            array = np.asarray(arrays[name], np.float32)
+        for name, (port, value) in zip(self._wanted, self.params.outputs.items(), strict=True):
+            array = np.asarray(by_name[name], np.float32)
             if value.scale != 1:
                 array = array * np.float32(value.scale)
             if not np.isfinite(array).all():
@@ -291,7 +291,7 @@ class Network(Stage):
         return tuple(results)
 
     def _result(self, port: str, params: OutputParams, array: Floats) -> list[Any]:
-        """The values of the ports of an output."""
+        """The values of the ports that an output becomes."""
         if port == "force":
             return [_force(array.ravel().tolist())]
         if port == "features":
@@ -490,7 +490,7 @@ def _force(numbers: Sequence[float]) -> Force:
     return Force((x, y, max(numbers[-1], 0.0)), (unknown, unknown, np.nan), False)
 
 
-def _required_shapes(port: str, params: OutputParams, first: InputParams) -> list[tuple[Side, ...]]:
+def _wanted_shapes(port: str, params: OutputParams, first: InputParams) -> list[tuple[Side, ...]]:
     """Shapes that an output may have, without the batch."""
     if port == "force":
         return [(1,), (3,)]

@@ -1,4 +1,4 @@
-"""Parquet: results as tables for pandas, Polars, DuckDB and other programs that read Parquet."""
+"""Parquet: results as tables for pandas, Polars, DuckDB and everything else that reads Parquet."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ TABLES = {
     "contacts": (SEQ, CONTACT, *contact_columns()),
     "frames": tuple(frame_columns()),
 }
-"""Tables in the order of writing: the markers and contacts of a frame are stored before the frame."""
+"""In the order in which they are written: what belongs to a frame of `frames` is there before it."""
 PART_ROWS = 200_000
-"""Maximum rows of a table before a part is written early: with some 20 numbers each they take 100 MB."""
+"""A part is written early when a table has so many rows: with some 20 numbers each they take 100 MB."""
 BATCH_ROWS = 1000
-"""Rows per conversion to Arrow: converting a whole part at once would block the other threads."""
+"""Rows are converted to Arrow by so many: all those of a part at once would hold up the other threads."""
 
 Rows = dict[str, list[tuple[Any, ...]]]
-"""Rows by name of the table."""
+"""Name of a table -> its rows."""
 
 
 class Parquet(Sink):
     """Writes result messages to `path/frames/`, `path/contacts/` and `path/markers/`.
 
     `frames` has a row for each frame, `contacts` one for each separate contact, `markers` one for each dot of
-    each frame. Each table is a folder of parts, `part-00000.parquet`, readable by pandas, pyarrow, Polars and
-    DuckDB. A part is written every `flush` seconds and at the end, and renamed when it is complete: if the
-    process ends abruptly, at most the rows since the last part are lost.
+    each frame. Each table is a folder of parts, `part-00000.parquet`, as pandas, pyarrow, Polars and DuckDB
+    read it. A part is written every `flush` seconds and at the end, and gets its name when it is complete:
+    if the process ends abruptly, at most the rows since the last part are lost.
     """
 
     threaded = True
@@ -76,7 +76,7 @@ class Parquet(Sink):
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is opened yet.
 
-        sensor, control : name of the sensor, and the run; written to the metadata.
+        sensor, control : whose results they are, and the run, for the metadata.
         """
         super().__init__(params)
         self._folder = expanded(params.path)
@@ -97,7 +97,7 @@ class Parquet(Sink):
 
     @classmethod
     def on_restart(cls, params: Parquet.Params) -> Parquet.Params:
-        """Append to its tables."""
+        """It appends to its tables."""
         return params.changed(overwrite=False, append=True)
 
     def open(self) -> None:
@@ -109,7 +109,7 @@ class Parquet(Sink):
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
             raise StageError(problem)
-        # Imported before the run starts; the first array also imports pandas, if installed.
+        # Now, and not in the middle of the run; the first array imports pandas, where that is installed.
         import pyarrow.parquet  # type: ignore[import-untyped]
 
         pyarrow.array([0])
@@ -130,9 +130,9 @@ class Parquet(Sink):
         return self._counts
 
     def write(self, result: Result) -> None:
-        """Add one frame, and write a part when it is due.
+        """Keep one frame, and write a part when it is time.
 
-        Raises StageError if the part cannot be written, as on a full disk. Previous parts stay.
+        Raises StageError if the part cannot be written, as on a full disk. The parts before stay.
         """
         message = orjson.loads(encode_message(result, detail=True))
         for name, rows in _rows(message).items():
@@ -146,7 +146,7 @@ class Parquet(Sink):
         self._flush()
 
     def _check_existing(self) -> None:
-        """Refuse or remove existing tables, or continue their numbering."""
+        """Refuse existing tables, remove them, or continue behind them."""
         present = [part for name in TABLES for part in (self._folder / name).glob("part-*.parquet")]
         if present and not (self.params.overwrite or self.params.append):
             raise StageError(
@@ -154,7 +154,7 @@ class Parquet(Sink):
                 "add to them, or give another folder"
             )
         if self.params.overwrite:
-            # Frames first, so that no frame remains without its rows in the other tables.
+            # Frames first, so that none is left without its rows of the other tables.
             for part in reversed(present):
                 part.unlink()
             present = []
@@ -171,13 +171,13 @@ class Parquet(Sink):
             return
         try:
             for name, schema in self._schemas.items():
-                # Incomplete parts have a name with a leading dot, ignored by readers of folders.
+                # Its name begins with a dot until it is complete: readers of folders leave such files out.
                 part = self._folder / name / f"part-{self._next:05d}.parquet"
-                # A removed folder is an error; it is not created again.
+                # A folder that somebody removed is an error, not made anew.
                 with completed(part, make_parent=False) as unfinished, unfinished.open("wb") as file:
                     pq.write_table(_table(rows[name], schema), file, compression="zstd")
                     file.flush()
-                    # Flushed to the disk before it is renamed, so that a power cut leaves no empty part.
+                    # On the disk before it gets its name, so that a power cut leaves no empty part.
                     os.fsync(file.fileno())
         except OSError as error:
             hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
@@ -201,7 +201,7 @@ def _table(rows: Sequence[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
 
 
 def _make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
-    """The Arrow schema of each table. metadata : added to every table."""
+    """The Arrow schema of each table. metadata : of every table."""
     import pyarrow as pa
 
     types = {
@@ -223,7 +223,7 @@ def _make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
 
 
 def _rows(message: Mapping[str, Any]) -> Rows:
-    """The rows of each table for one parsed result message."""
+    """The rows of each table that one parsed result message gives."""
     seq, markers = message["seq"], message["markers"] or {"position": (), "origin": (), "status": ()}
     contacts = [
         (seq, index, *(column.value(contact) for column in contact_columns()))

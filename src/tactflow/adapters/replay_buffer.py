@@ -1,10 +1,10 @@
-"""`tactflow export replay-buffer`: the Zarr replay buffer of Diffusion Policy, with the tactile arrays that
+"""`tactflow export replay-buffer`: the Zarr replay buffer of Diffusion Policy, with the arrays of touch that
 Reactive Diffusion Policy trains on.
 
 Layout: group `data` with one array per quantity, time first, and `meta/episode_ends`
-(https://github.com/real-stanford/diffusion_policy, `common/replay_buffer.py`). Names and units of the
-tactile arrays: https://github.com/xiaoxiaoxh/reactive_diffusion_policy, which divides markers by the width
-and the height of the picture (`common/tactile_marker_utils.py`).
+(https://github.com/real-stanford/diffusion_policy, `common/replay_buffer.py`). Names and units of the arrays
+of touch: https://github.com/xiaoxiaoxh/reactive_diffusion_policy, whose markers are divided by the width and
+the height of the picture (`common/tactile_marker_utils.py`).
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 BATCH = 64
-"""Frames per chunk, and pictures in memory at a time. Chosen by hand."""
+"""Frames of a chunk; so many pictures are in memory together. Chosen by hand."""
 COMPONENTS = 15
 """Length of the embedding, as in Reactive Diffusion Policy."""
 COMPRESSION = {"cname": "zstd", "clevel": 3, "shuffle": 1}
-"""Options of Blosc, as in Reactive Diffusion Policy."""
+"""Of Blosc, as Reactive Diffusion Policy writes it."""
 
 
 def export(folder: Path, episodes: Iterable[tuple[str, Iterable[Result]]], *, fps: int, **_: object) -> None:
@@ -40,13 +40,13 @@ def export(folder: Path, episodes: Iterable[tuple[str, Iterable[Result]]], *, fp
 
     Parameters
     ----------
-    folder : empty or missing.
+    folder : empty, or not there.
     episodes : the name of each recording, and its results with pictures and markers.
     fps : of the dataset, frames per second.
 
     Raises
     ------
-    StageError : a package is missing, or a recording does not fit the previous ones. OSError : the files
+    StageError : a package is missing, or a recording does not go with those before. OSError : the files
         cannot be written.
     """
     problem = missing("replay buffers", "zarr", ["zarr"])
@@ -56,7 +56,7 @@ def export(folder: Path, episodes: Iterable[tuple[str, Iterable[Result]]], *, fp
     for name, results in episodes:
         log.info("%s: %d frames", name, buffer.add(at_rate(results, fps)))
     transform, mean = buffer.finish()
-    # Names of the files that Reactive Diffusion Policy reads.
+    # The names that Reactive Diffusion Policy reads them by.
     np.save(folder / "pca_transform_matrix.npy", transform)
     np.save(folder / "pca_mean_matrix.npy", mean)
 
@@ -67,7 +67,7 @@ class ReplayBuffer:
     def __init__(self, path: Path) -> None:
         import zarr
 
-        # Diffusion Policy uses version 2 of the package, which only reads this format.
+        # Diffusion Policy uses version 2 of the package, which only knows this format.
         root = zarr.open_group(path, mode="w", zarr_format=2)
         self._data: Any = root.create_group("data")
         self._meta: Any = root.create_group("meta")
@@ -82,8 +82,8 @@ class ReplayBuffer:
 
         Raises
         ------
-        StageError : the sensor, the size of its pictures or its markers differ from the previous episodes, or
-            a picture or the markers are missing. OSError : the files cannot be written.
+        StageError : the sensor, the size of its pictures or its markers differ from the episodes before, or
+            there is no picture or no marker. OSError : the files cannot be written.
         """
         begin = frames = self._ends[-1] if self._ends else 0
         pending = map(self._row, results)
@@ -106,7 +106,7 @@ class ReplayBuffer:
         """
         ends = np.array(self._ends, np.int64)
         self._meta.create_array("episode_ends", data=ends, chunks=ends.shape, compressors=None)
-        # Small compared to the pictures, which the loaders also keep in memory.
+        # Small beside the pictures, which the loaders keep in memory, too.
         offsets = self._data[f"{self._sensor}_marker_offset"][:].reshape(ends[-1], -1)
         transform, mean = fit_embedding(offsets)
         self._append(f"{self._sensor}_marker_offset_emb", (offsets - mean) @ transform)
@@ -116,18 +116,18 @@ class ReplayBuffer:
         """The arrays of one frame."""
         image, markers = self._check(result)
         size = np.array([image.shape[1], image.shape[0]], np.float64)
-        arrays: dict[str, NDArray[Any]] = {
+        touch: dict[str, NDArray[Any]] = {
             "img": image[:, :, ::-1],
             "initial_marker": (markers.origin / size).astype(np.float32),
             "marker_offset": (markers.offset / size).astype(np.float32),
             "marker_status": markers.status,
         }
-        row = {f"{result.sensor}_{name}": array for name, array in arrays.items()}
+        row = {f"{result.sensor}_{name}": array for name, array in touch.items()}
         row["timestamp"] = np.array(result.t)
         return row
 
     def _check(self, result: Result) -> tuple[NDArray[np.uint8], AlignedMarkers]:
-        """The picture and the markers of a result; StageError if they do not fit the previous ones."""
+        """The picture and the markers of a result, if it goes with those before."""
         image = result.image
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")

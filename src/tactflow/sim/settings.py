@@ -126,5 +126,5 @@ def parse_query(query: str, defaults: Mapping[str, Any]) -> Settings:
     choices = [str(choice) for choice in get_args(Settings.model_fields[key].annotation)]
     guess = closest(values[key], choices)
     hint = f"; did you mean {guess}?" if guess else ""
-    required = f"required {key}: {setting_descriptions()[key]}"
-    raise ValueError(f"simulated sensor: {required}, got {values[key]!r}{hint}")
+    wanted = f"required {key}: {setting_descriptions()[key]}"
+    raise ValueError(f"simulated sensor: {wanted}, got {values[key]!r}{hint}")

@@ -6,7 +6,6 @@ import csv
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,8 +15,6 @@ from numpy.typing import NDArray
 from tactflow.sim import open_scene
 from tactflow.sim.gel import RIM, SINK_IN
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
-from tactflow.vision.contact import detector as contact
-from tactflow.vision.contact.filling import is_solid, traced
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.mask import find_dot, marker_mask
@@ -468,12 +465,6 @@ class _Sensor:
     def look(self, index: int) -> ContactResult:
         return self.detector.detect(self._unmarked(self.preprocess(self.scene.frame(index))))
 
-    def look_below_markers(self, index: int) -> ContactResult:
-        """The same, told where the markers are."""
-        assert self.dot is not None
-        image = self.preprocess(self.scene.frame(index))
-        return self.detector.detect(self._unmarked(image), marker_mask(image, self.dot))
-
 
 @pytest.mark.parametrize(
     ("scene", "least"),
@@ -516,41 +507,10 @@ def test_in_a_small_picture_contacts_between_many_dots_keep_their_outline(scene:
     sensor = _Sensor(scene, 60, downsample=4)
     overlaps = []
     for index in range(20, 40, 4):
-        result, truth = sensor.look_below_markers(index), sensor.scene.truth(index, sensor.preprocess.mapping)
+        result, truth = sensor.look(index), sensor.scene.truth(index, sensor.preprocess.mapping)
         overlaps.append(_overlap(result.mask > 0, truth.contact_mask))
     # Measured: 0.82 to 0.96 in single frames; at half resolution 0 to 0.7.
     assert min(overlaps) > 0.78
-
-
-@pytest.mark.parametrize("scene", ["press", "cable", "two", "press?light=mixed"])
-def test_looking_closely_only_around_a_contact_gives_what_looking_everywhere_gives(
-    scene: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    around, everywhere = _Sensor(scene, 90), _Sensor(scene, 90)
-    windows = contact.contact_components
-
-    def whole(square: NDArray[np.float32], *thresholds: Any) -> list[Any]:
-        rows, columns = slice(0, square.shape[0]), slice(0, square.shape[1])
-        found = []
-        for part in windows(square, *thresholds):
-            shares.append(part.inside.size / square.size)
-            belongs = np.zeros(square.shape, np.bool_)
-            belongs[part.rows, part.columns] = part.inside
-            found.append(part._replace(rows=rows, columns=columns, inside=belongs))
-        return found
-
-    shares: list[float] = []
-    touching = 0
-    for index in range(12, 60, 4):
-        near = around.look_below_markers(index)
-        with monkeypatch.context() as patch:
-            patch.setattr(contact, "contact_components", whole)
-            far = everywhere.look_below_markers(index)
-        touching += near.touching
-        assert np.array_equal(near.mask, far.mask)
-        assert near.strength == far.strength
-    assert touching >= 5
-    assert max(shares) < 1
 
 
 @pytest.mark.parametrize("scene", ["idle?drift=0.18", "idle?flicker=0.06&gain=0.03", "idle?noise=6", "idle"])
@@ -595,12 +555,6 @@ def test_real_presses_of_a_ball_are_all_found_where_the_labels_say(shared_data: 
     assert np.median(distance) < 2.6
     assert np.percentile(distance, 95) < 6.5
     assert abs(np.median(growth)) < 5
-
-
-def test_a_region_with_a_neck_of_one_pixel_is_not_solid() -> None:
-    region = np.array([[0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1], [0, 0, 1, 1]], np.uint8)
-    assert not is_solid(traced(region))
-    assert is_solid(traced(np.ones((4, 4), np.uint8)))
 
 
 def test_real_grasps_agree_with_the_force_of_the_grip(shared_data: Path) -> None:

@@ -43,14 +43,6 @@ def test_what_both_see_has_the_outline_of_the_light() -> None:
     assert fused.mask is seen
 
 
-def test_a_second_region_is_contact_only_if_markers_around_it_move_as_well() -> None:
-    pressed, beside, far = light(120, 100, 170, 150), light(60, 60, 90, 90), light(275, 15, 310, 60)
-    for seen, kept in ((pressed | far, pressed), (pressed | beside, pressed | beside), (far, far)):
-        fused = fuse_contact(seen, markers(3.0), MotionTest(ORIGIN))
-        assert fused.evidence == "both"
-        assert np.array_equal(fused.mask, kept)
-
-
 def test_a_touch_between_the_markers_is_shown_by_the_light() -> None:
     fused = fuse_contact(light(125, 100, 140, 110), markers(), MotionTest(ORIGIN))
     assert fused.evidence == "light"
@@ -97,14 +89,6 @@ def test_beside_markers_of_unknown_size_nothing_is_taken_for_a_rim() -> None:
     fused = fuse_contact(sliver, sizes_unknown, MotionTest(ORIGIN))
     assert fused.evidence == "light"
     assert fused.mask is sliver
-
-
-def test_the_rim_of_a_marker_beside_a_contact_is_no_second_one() -> None:
-    pressed, rim, contact = light(120, 100, 170, 150), light(200, 117, 207, 123), light(190, 105, 215, 130)
-    for seen, kept in ((pressed | rim, pressed), (pressed | contact, pressed | contact), (rim, rim)):
-        fused = fuse_contact(seen, markers(3.0), MotionTest(ORIGIN))
-        assert fused.evidence == "both"
-        assert np.array_equal(fused.mask, kept)
 
 
 def test_a_touch_on_a_marker_that_is_larger_than_it_counts() -> None:

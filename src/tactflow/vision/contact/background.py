@@ -1,7 +1,7 @@
 """Background model of a gel: what it looks like untouched, and how unusual a frame is beside that.
 
 Frames are compared as means over cells of 4 x 4 px, lightly smoothed; where a contact is to be outlined, as
-means over 2 x 2 px, or pixel by pixel.
+means over 2 x 2 px.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import MAD_TO_SIGMA, Floats32
 from tactflow.vision.contact.background_kernels import (
-    change_strength,
+    BESIDE,
+    MIDDLE,
     scaled_change,
     smooth_cells,
     weigh_change,
 )
-from tactflow.vision.contact.contact_outline import WindowChange
-from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
-from tactflow.vision.contact.response import light_response
+from tactflow.vision.contact.illumination import SATURATED, IlluminationModel, positions, under_illumination
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
@@ -49,16 +48,17 @@ _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
 class Change(NamedTuple):
     """How a frame differs from the background.
 
-    whole, half : (4h, 4w, 3) and (2h, 2w, 3) uint8, the frame, also at half resolution. illumination : (3, 4)
-    float32, coefficients of `IlluminationModel.fit`. squared : (h, w) float32, squared deviation of each
-    cell, chi-square with three degrees of freedom where nothing touches. colour : the same of its colour
-    alone, with two. evidence : the larger of both. largest, largest_colour : of `squared` and `colour`.
+    half : (2h, 2w, 3) uint8, the frame at half resolution. cells : (3, h, w) float32, grey levels.
+    illumination : (3, 4) float32, coefficients of `IlluminationModel.fit`. squared : (h, w) float32, squared
+    deviation of each cell, chi-square with three degrees of freedom where nothing touches. colour : the
+    same of its colour alone, with two. evidence : the larger of both. largest, largest_colour : of `squared`
+    and `colour`.
     remaining : ratio of this change to that of the previous frame, over the cells that were in contact then;
     1 if none was.
     """
 
-    whole: NDArray[np.uint8]
     half: NDArray[np.uint8]
+    cells: Floats32
     illumination: Floats32
     squared: Floats32
     colour: Floats32
@@ -70,7 +70,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Untouched:
-    """What outlines are compared with, (h, 3 w) float32 each at some resolution.
+    """What outlines are compared with, (h, 3 w) float32 each, at half resolution.
 
     mean : grey levels. scale : turns grey levels into standard deviations. pattern : part of such a change
     that is left out, as `scaled_change` takes it.
@@ -86,7 +86,8 @@ class Derived:
     """What follows from what is known of the untouched gel: (3, h, w) float32 of cells.
 
     weight : one over the standard deviation. brightness : (h, w), one over the squared length of the mean, so
-    weighed. colour_factor : (h, w), how much more a change of colour counts than one of brightness.
+    weighed. colour_factor : (h, w), how much more a change of colour counts than one of brightness. scale :
+    (h, w), one over the standard deviation for `signed_change`; 0 where the light tells nothing.
     """
 
     illumination: IlluminationModel
@@ -94,6 +95,7 @@ class Derived:
     weight: Floats32
     brightness: Floats32
     colour_factor: Floats32
+    scale: Floats32
 
     @classmethod
     def of(
@@ -113,14 +115,17 @@ class Derived:
         # One factor for all channels, so that a change in proportion to the brightness is none of colour.
         factor = (variance / (steady + (tint * mean) ** 2)).min(axis=0)
         length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
+        scale = 1 / np.sqrt(steady.max(axis=0) + (repeatability * mean.mean()) ** 2)
+        scale = scale * (mean.max(axis=0) < SATURATED)
         if gel is not None:
-            weight = weight * gel
+            weight, scale = weight * gel, scale * gel
         return cls(
             illumination=illumination,
             mean=np.ascontiguousarray(mean, np.float32),
             weight=np.asarray(weight, np.float32),
             brightness=np.asarray(1 / length**2, np.float32),
             colour_factor=np.asarray(factor, np.float32),
+            scale=np.asarray(scale, np.float32),
         )
 
 
@@ -156,8 +161,8 @@ class BackgroundModel:
         shift: float,
         valid: NDArray[np.uint8] | None = None,
     ) -> None:
-        whole, half = _halves(image)
-        self._pictures = {1: _planes(whole), 2: _planes(half)}
+        half = _halved(image)
+        self._half = _planes(half)
         self._mean: Floats32 = _smoothed(half)
         self._squares = np.zeros_like(self._mean)
         self._noise = _spatial_noise(halved(half))
@@ -165,24 +170,22 @@ class BackgroundModel:
         self._frames = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
         self._known: Derived | None = None
-        self._untouched: dict[int, _Untouched] = {}
+        self._untouched: _Untouched | None = None
 
     def add(self, image: NDArray[np.uint8]) -> None:
         """Learn from one more frame of the same size; the more, the better the noise is known."""
         known = self._derived()
-        whole, half = _halves(image)
+        half = _halved(image)
         smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
         change: Floats32 = smooth - under_illumination(known.mean, coefficients)
         count = self._frames
         self._squares = self._squares + change * change * np.float32(count / (count + 1))
         self._mean = self._mean + change / np.float32(count + 1)
-        for side, picture in ((1, whole), (2, half)):
-            mean = self._pictures[side]
-            self._pictures[side] = mean + (_planes(picture) - mean) / np.float32(count + 1)
+        self._half = self._half + (_planes(half) - self._half) / np.float32(count + 1)
         self._frames += 1
         self._known = None
-        self._untouched.clear()
+        self._untouched = None
 
     def compare(
         self, image: NDArray[np.uint8], before: NDArray[np.bool_] | None, evidence_before: Floats32 | None
@@ -193,11 +196,11 @@ class BackgroundModel:
         (h, w) float32, the previous frame's evidence.
         """
         known = self._derived()
-        if not self._untouched:
+        if self._untouched is None:
             # At the reference: the first frame with contact shall not wait for it.
             self._untouched = self._compared_with()
         high, wide = known.colour_factor.shape
-        whole, half = _halves(image)
+        half = _halved(image)
         smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
         squared, colour, evidence = np.empty((3, high, wide), np.float32)
@@ -220,38 +223,48 @@ class BackgroundModel:
         )
         remaining = math.sqrt(now / was) if was > 0 else 1.0
         return Change(
-            whole, half, coefficients, squared, colour, evidence, largest, largest_colour, remaining
+            half, smooth, coefficients, squared, colour, evidence, largest, largest_colour, remaining
         )
+
+    def signed_change(self, change: Change) -> Floats32:
+        """(3, h, w): how each cell has changed, in standard deviations that are the same for all channels.
+
+        change : of this frame. 0 where the light tells nothing. How far the light varies is taken from the
+        brightness of the whole picture: relative to itself, a dark channel that a tilt lights up would
+        outshine the others.
+        """
+        known = self._derived()
+        expected = under_illumination(known.mean, change.illumination)
+        return np.asarray((change.cells - expected) * known.scale, np.float32)
 
     def window_change(
-        self, change: Change, rows: slice, columns: slice, inside: NDArray[np.bool_], side: int = 2
-    ) -> WindowChange:
-        """How strongly a window has changed, in standard deviations.
+        self, change: Change, rows: slice, columns: slice, inside: NDArray[np.bool_]
+    ) -> Floats32:
+        """How a window has changed: (2 h, 2 w, 3) float32, at half resolution, in standard deviations.
 
-        Slopes of all directions count alike, as far as `light_response` can tell how they show.
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
-        count. side : of the result's pixels, px: 2 for half resolution, 1 for the frame's own.
+        count; the others have not changed.
         """
-        untouched = self._untouched[side]
-        picture, each = (change.half if side == 2 else change.whole), CELL // side
-        high, wide = each * inside.shape[0], each * inside.shape[1]
+        assert self._untouched is not None
+        high, wide = 2 * inside.shape[0], 2 * inside.shape[1]
         scaled = np.empty((high, 3 * wide), np.float32)
         scaled_change(
-            picture.reshape(len(picture), -1),
-            each * rows.start,
-            each * columns.start,
+            change.half.reshape(len(change.half), -1),
+            2 * rows.start,
+            2 * columns.start,
             change.illumination,
-            positions(picture.shape[1]),
-            positions(len(picture)),
-            untouched.mean,
-            untouched.scale,
-            untouched.pattern,
+            positions(change.half.shape[1]),
+            positions(len(change.half)),
+            self._untouched.mean,
+            self._untouched.scale,
+            self._untouched.pattern,
             scaled,
         )
-        response = light_response(scaled, inside)
-        strength, brightness = np.empty((2, high, wide), np.float32)
-        change_strength(scaled, inside.view(np.uint8), *response, strength, brightness)
-        return WindowChange(strength, brightness)
+        smooth = cv2.sepFilter2D(
+            scaled, cv2.CV_32F, np.ones(1, np.float32), np.array([BESIDE, MIDDLE, BESIDE])
+        )
+        counts = inside.repeat(2, axis=0).repeat(2, axis=1)
+        return np.asarray(smooth.reshape(high, wide, 3) * counts[..., None], np.float32)
 
     def _derived(self) -> Derived:
         if self._known is not None:
@@ -262,17 +275,14 @@ class BackgroundModel:
         self._known = Derived.of(mean, steady, self._repeatability, self._tint, self._gel)
         return self._known
 
-    def _compared_with(self) -> dict[int, _Untouched]:
-        """What outlines are compared with, by the side of its pixels, px.
+    def _compared_with(self) -> _Untouched:
+        """What outlines are compared with.
 
-        How much a place counts is told at half resolution for both: pixel by pixel, the noise of the
-        reference and the grain of the gel have slopes of their own, and an even change would look uneven.
-        How far the light varies is taken from the brightness of the whole picture: relative to itself, a dark
-        channel that a tilt lights up would outshine the others. Where a pattern on the gel has moved, all
-        channels change in proportion: in that direction e, standard deviations, the variance is 1 + e^2, in
-        others still 1.
+        How far the light varies is taken from the brightness of the whole picture, as for `signed_change`.
+        Where a pattern on the gel has moved, all channels change in proportion: in that direction e, standard
+        deviations, the variance is 1 + e^2, in others still 1.
         """
-        mean, shift = self._pictures[2], self._shift / 2
+        mean, shift = self._half, self._shift / 2
         light = self._repeatability * mean.mean()
         together, apart = _steepness_of_pattern(mean)
         variance = _fine_noise(mean) + light**2 + (shift * apart) ** 2
@@ -282,9 +292,7 @@ class BackgroundModel:
         left_out = (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, np.float32(1e-6))
         if self._gel is not None:
             scale = scale * self._gel.repeat(2, axis=0).repeat(2, axis=1)
-        half = mean, scale, pattern * np.sqrt(left_out)
-        whole = self._pictures[1], *(planes.repeat(2, axis=1).repeat(2, axis=2) for planes in half[1:])
-        return {1: _Untouched(*map(_interleaved, whole)), 2: _Untouched(*map(_interleaved, half))}
+        return _Untouched(*map(_interleaved, (mean, scale, pattern * np.sqrt(left_out))))
 
 
 def _interleaved(planes: Floats32) -> Floats32:
@@ -305,13 +313,13 @@ def _smoothed(half: NDArray[np.uint8]) -> Floats32:
     return planes
 
 
-def _halves(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Pixels, and means over 2 x 2 px; the border is repeated to make whole cells."""
+def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Means over 2 x 2 px; the border is repeated to make whole cells."""
     bottom, right = -image.shape[0] % CELL, -image.shape[1] % CELL
     whole = np.ascontiguousarray(image)
     if bottom or right:
         whole = np.asarray(cv2.copyMakeBorder(whole, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
-    return whole, halved(whole)
+    return halved(whole)
 
 
 def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
@@ -320,7 +328,7 @@ def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDAr
         return None
     gel = lit_area(half)[::2, ::2]
     if not valid.all():
-        cells = halved(_halves(np.repeat(valid[:, :, None], 3, axis=2))[1])
+        cells = halved(_halved(np.repeat(valid[:, :, None], 3, axis=2)))
         gel = gel & (cells[:, :, 0] >= CELL_VALID)
     return None if gel.all() else np.asarray(gel)
 

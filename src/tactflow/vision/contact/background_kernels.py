@@ -202,38 +202,3 @@ def _scale_line(
         changes[3 * x] = blue - along * pattern[3 * x]
         changes[3 * x + 1] = green - along * pattern[3 * x + 1]
         changes[3 * x + 2] = red - along * pattern[3 * x + 2]
-
-
-@kernel("void(float32[:, ::1], uint8[:, ::1], float32, float32[::1], float32[:, ::1], float32[:, ::1])")
-def change_strength(
-    change: Floats32,
-    inside: Byte,
-    gain: np.float32,
-    strongest: Floats32,
-    strength: Floats32,
-    common: Floats32,
-) -> None:
-    """Smooth a change along y, and reduce its channels to one.
-
-    change : (h, 3 w), of `scaled_change`. inside : (r, s), not 0 where a block of the window counts. gain,
-    strongest : a `Response`. strength : (h, w), filled with the length of the change over the channels, so
-    weighed. common : (h, w), filled with their mean. Both 0 where nothing counts.
-    """
-    high, wide = strength.shape
-    side, line = high // len(inside), np.empty(3 * wide, np.float32)
-    for y in range(high):
-        length, tone, cells = strength[y], common[y], inside[y // side]
-        upper = change[min(1, high - 1) if y == 0 else y - 1]
-        here, lower = change[y], change[max(high - 2, 0) if y == high - 1 else y + 1]
-        for i in range(3 * wide):
-            line[i] = (upper[i] + lower[i]) * BESIDE + here[i] * MIDDLE
-        for x in range(wide):
-            blue, green, red = line[3 * x], line[3 * x + 1], line[3 * x + 2]
-            along = blue * strongest[0] + green * strongest[1] + red * strongest[2]
-            square = gain * (blue * blue + green * green + red * red) - along * along
-            length[x] = np.sqrt(square if square > 0 else np.float32(0))
-            tone[x] = (blue + green + red) * np.float32(1 / 3)
-        for cell in range(cells.size):
-            if not cells[cell]:
-                length[side * cell : side * cell + side] = 0
-                tone[side * cell : side * cell + side] = 0

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats32, Mask
-from tactflow.vision.contact.filling import SQUARE
 
+SQUARE: Final = np.ones((3, 3), np.uint8)
+"""A cell and its neighbours."""
 STRAY: Final = 0.04
 """Separate changes with less of the summed squared deviation than this part of the strongest one's are no
 contacts of their own: wrinkles, reflections, what is left of a marker that was removed. Chosen on wrs_cam1,

@@ -11,15 +11,15 @@ alarms, and then *where*, by a rule that does not depend on the noise:
    fainter change of colour is contact if it is wide, which neither noise nor compressed blocks are.
 5. Contact ends at the noise, or at a part of the strongest recent change, since a released gel creeps back;
    but not while it fades faster than by creeping: then it is still being unloaded.
-6. Each connected change around such a place is examined again at half resolution, or pixel by pixel if it is
-   small, where `contact_outline` finds its border.
+6. Where it touches, the shape of the gel tells (`heights`, `level_lines`), and the outline is found there at
+   half resolution (`contact_outline`).
 
 References
 ----------
 T. Aach, A. Kaup, R. Mester, "Statistical model-based change detection in moving video", Signal Processing 31
 (1993), for the test; K. Friston et al., "Assessing the significance of focal activations using their spatial
-extent", Human Brain Mapping 1 (1994), for the test by extent. `illumination` and `contact_outline` name the
-sources of theirs.
+extent", Human Brain Mapping 1 (1994), for the test by extent. The other files name the sources of
+theirs.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Floats32, check_color_image
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
 from tactflow.vision.contact.components import Component, contact_components, union, wide_change
-from tactflow.vision.contact.contact_outline import contact_level
-from tactflow.vision.contact.resolution import draw_level, window_mask
+from tactflow.vision.contact.contact_outline import contact_level, draw_level
+from tactflow.vision.contact.heights import HeightModel
+from tactflow.vision.contact.level_lines import ContactFinder
 
 ContactMethod = Literal["noise", "colour"]
 
@@ -59,18 +60,6 @@ white noise, smoothed as the cells are."""
 GONE: Final = 0.5
 """A faint change of which less remains after a frame no longer has the outline that it had, and is gone.
 Chosen by hand."""
-BRIDGE: Final = 4.0
-"""Half the width of the gaps in an outline that a removed marker may have left, pixels at half resolution.
-Chosen by hand."""
-FEW_CELLS: Final = 200
-"""Cells that have changed, below which a contact is outlined pixel by pixel, not at half resolution. Chosen
-on `press`, `dense` and `mini_ball` at several sizes: overlaps grow there by up to 0.9, further up by 0.02."""
-CROWDED: Final = 0.7
-"""Part of a picture that lies below markers or next to them, from which on every contact
-is outlined pixel by pixel: too little is seen between them otherwise. At 0.68 (`dense`, 300 x 400 px) that is
-no better, at 0.9 contacts overlap by 0.86 instead of 0.61 (`finger` with the dots of `dense`)."""
-NEXT_TO: Final = 5
-"""Side of the square around a pixel in which a marker is next to it, px: one pixel of half resolution."""
 COLOUR_BLUR: Final = 5
 """For `colour`: side of the square over which changes are averaged, px. Chosen by hand."""
 COLOUR_OPENING: Final = 7
@@ -197,7 +186,7 @@ class ContactDetector:
         self._evidence: Floats32 | None = None
         self._suspected: NDArray[np.bool_] | None = None
         self._mask: NDArray[np.uint8] | None = None
-        self._crowded: bool | None = None
+        self._heights, self._contacts = HeightModel(), ContactFinder()
 
     @property
     def has_reference(self) -> bool:
@@ -223,30 +212,25 @@ class ContactDetector:
             self._background.add(image)
         self._last = image
 
-    def detect(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None = None) -> ContactResult:
+    def detect(self, image: NDArray[np.uint8]) -> ContactResult:
         """Compare a frame with the untouched gel.
 
         image : (H, W, 3) uint8, BGR grey levels, without markers, of the reference's size.
-        hidden : (H, W) uint8, not 0 where a marker was removed (`noise` only). There the outline follows what
-            is seen to both sides. None: what was painted there is taken for seen.
-        Raises ValueError if they are not of that kind, or without a reference.
+        Raises ValueError if it is not of that kind, or without a reference.
         """
         self._check(image)
-        _check_mask(hidden, image)
         if self._last is None:
             raise ValueError("required a reference frame first: call add_reference")
         if self._method == "colour":
             return _colour_distance(image, self._last, self._distance)
-        if self._crowded is None and hidden is not None:
-            self._crowded = _is_crowded(hidden)
-        return self._against_noise(image, hidden)
+        return self._against_noise(image)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
         check_color_image(image)
         if self._last is not None and image.shape != self._last.shape:
             raise ValueError(f"required the reference's shape {self._last.shape}, got {image.shape}")
 
-    def _against_noise(self, image: NDArray[np.uint8], hidden: NDArray[np.uint8] | None) -> ContactResult:
+    def _against_noise(self, image: NDArray[np.uint8]) -> ContactResult:
         assert self._background is not None
         before, self._before = self._before, None
         change = self._background.compare(image, before, self._evidence)
@@ -269,24 +253,23 @@ class ContactDetector:
         deviations = np.stack([change.squared, change.colour])
         if faint and change.remaining < 1 - self._creep and self._mask is not None:
             return ContactResult(self._mask.copy(), True, strength, deviations)
-        mask = np.zeros(image.shape[:2], np.uint8)
-        touching = False
-        for component in found:
-            touching |= self._draw(change, component, hidden, mask)
-        self._mask = mask if touching else None
-        return ContactResult(mask, touching, strength, deviations)
+        self._mask = self._outlined(change, image.shape[:2])
+        return ContactResult(self._mask, True, strength, deviations)
 
-    def _draw(
-        self, change: Change, component: Component, hidden: NDArray[np.uint8] | None, mask: NDArray[np.uint8]
-    ) -> bool:
-        """Set a component's contact to 255 in the mask; returns whether there is any."""
+    def _outlined(self, change: Change, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+        """(H, W): the contacts that a change shows; the cells that have changed, where no shape does."""
         assert self._background is not None
-        rows, columns, inside, cells, _ = component
-        top, left = CELL * rows.start, CELL * columns.start
-        side = 1 if self._crowded or cells < FEW_CELLS else 2
-        window = self._background.window_change(change, rows, columns, inside, side)
-        removed = None if hidden is None else window_mask(hidden, top, left, inside, side)
-        return draw_level(contact_level(window, 2 * BRIDGE / side, removed), top, left, mask, side)
+        assert self._before is not None
+        heights = self._heights(self._background.signed_change(change))
+        mask = np.zeros(shape, np.uint8)
+        regions = self._contacts(heights, self._before)
+        for rows, columns, inside, core in regions:
+            window = self._background.window_change(change, rows, columns, inside)
+            surely = core.repeat(2, axis=0).repeat(2, axis=1)
+            draw_level(contact_level(window, surely), CELL * rows.start, CELL * columns.start, mask)
+        if not regions:
+            draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL)
+        return mask
 
     def _clear(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
         """Contact by the size of the change, so that its outline can be seen.
@@ -341,12 +324,6 @@ def _check_mask(mask: NDArray[np.uint8] | None, image: NDArray[np.uint8]) -> Non
         raise ValueError(
             f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
         )
-
-
-def _is_crowded(hidden: NDArray[np.uint8]) -> bool:
-    """Whether markers leave too little to see at half resolution."""
-    near = cv2.dilate(hidden, np.ones((NEXT_TO, NEXT_TO), np.uint8))
-    return cv2.countNonZero(near) > CROWDED * hidden.size
 
 
 def _colour_distance(

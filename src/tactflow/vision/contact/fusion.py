@@ -2,13 +2,11 @@
 
 Each has a test with a rate of false alarms of its own, and if either sees a contact there is one: the rates
 add up. The markers also check the light: a change that covers many of them, none of which moves, is one of
-the lamp or the camera; a second one, around which none moves, is a reflection of the first; and one no larger
-than a marker, beside a marker, is what its removal has left.
+the lamp or the camera; and one no larger than a marker, beside a marker, is what its removal has left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -22,14 +20,8 @@ from tactflow.vision.geometry.region import Region, measure_region
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
 UNMOVED: Final = 6
-"""Markers below a change of the light, none of which moves, from which on it is no contact; and as many
-around one region while others move. Measured: of the frames in contact of the simulator, mini_ball,
+"""Markers below a change of the light, none of which moves, from which on it is no contact. Measured: of the frames in contact of the simulator, mini_ball,
 gelslim_ball, handmade_dots, sts_640 and franka_mini, those in which no marker moved had 5 at most."""
-
-DRAGGED: Final = 0.1
-"""Part of the largest motion up to which a marker is not pressed but dragged along with all of the gel. The
-markers around a simulated reflection move by 0.06 of it at most; around separate contacts of franka_mini the
-one that moves most does so by 0.13 at least."""
 MARGIN: Final = 0.125
 """How much wider than the hull of its markers a region is, pitches. Chosen by hand."""
 SPREAD: Final = 5.0
@@ -85,7 +77,7 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
             return FusedContact(light, None)
         return FusedContact(_hull_of(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
-        return FusedContact(_without_strays(light, region, markers, motion, test.pitch), "both")
+        return FusedContact(light, "both")
     if _rests(light, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
     mask = _without_rims(light, region, markers)
@@ -98,65 +90,6 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     below = inside_mask(markers.position[seen], light)
     resting = motion.still()[seen][below]
     return len(resting) >= UNMOVED and bool(resting.all())
-
-
-def _without_strays(light: Mask, region: Region, markers: Markers, motion: Motion, reach: float) -> Mask:
-    """Of several regions those that are neither reflections nor rims of markers; none is left out alone.
-
-    region : all of them. reach : how far around a region markers tell what it is, px.
-    """
-    if region.in_one_piece:
-        return light
-    left, top, width, height = region[:4]
-    window = light[top : top + height, left : left + width]
-    outlines, _ = cv2.findContours(window, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top))
-    if len(outlines) < 2:
-        return light
-    moved = _without_reflections(light, outlines, markers, motion, reach)
-    if all(pixels > _largest_rim(markers) for pixels in _fewest_pixels(light, outlines)):
-        return moved
-    kept = _without_rims(moved, region, markers)
-    return kept if cv2.countNonZero(kept) else moved
-
-
-def _largest_rim(markers: Markers) -> float:
-    """Pixels of what removing a marker may leave, at most; 0 where the size of markers is not known."""
-    return 0.0 if markers.radius is None else np.pi * (markers.radius + SPREAD) ** 2
-
-
-def _fewest_pixels(light: Mask, outlines: Sequence[cv2.typing.MatLike]) -> Iterator[int]:
-    """How many pixels each region has at least: those in its box, less where boxes of others overlap it.
-
-    To tell the regions apart pixel by pixel takes fifty times as long.
-    """
-    boxes = [cv2.boundingRect(outline) for outline in outlines]
-    for number, (left, top, width, height) in enumerate(boxes):
-        pixels = cv2.countNonZero(light[top : top + height, left : left + width])
-        for x, y, wide, high in boxes[:number] + boxes[number + 1 :]:
-            across = min(left + width, x + wide) - max(left, x)
-            down = min(top + height, y + high) - max(top, y)
-            pixels -= max(across, 0) * max(down, 0)
-        yield pixels
-
-
-def _without_reflections(
-    light: Mask, outlines: Sequence[cv2.typing.MatLike], markers: Markers, motion: Motion, reach: float
-) -> Mask:
-    """The regions around which markers move; the same array if these are all, or none.
-
-    Whatever presses the gel moves the markers beside it. outlines : of the regions.
-    """
-    seen = markers.status == _TRACKED
-    places, unmoved = markers.position[seen], motion.still(DRAGGED)[seen]
-    boxes = np.array([cv2.boundingRect(outline) for outline in outlines], np.float64)[:, None]
-    low, high = boxes[..., :2] - reach, boxes[..., :2] + boxes[..., 2:] + reach
-    beside = ((low <= places) & (places <= high)).all(axis=2)
-    resting = (np.count_nonzero(beside, axis=1) >= UNMOVED) & ~(beside & ~unmoved).any(axis=1)
-    if not resting.any() or resting.all():
-        return light
-    kept = light.copy()
-    cv2.drawContours(kept, [outlines[index] for index in np.flatnonzero(resting).tolist()], -1, 0, cv2.FILLED)
-    return kept
 
 
 def _without_rims(light: Mask, region: Region, markers: Markers) -> Mask:
@@ -172,7 +105,7 @@ def _without_rims(light: Mask, region: Region, markers: Markers) -> Mask:
     left, top, width, height = region[:4]
     window = light[top : top + height, left : left + width]
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(window)
-    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= _largest_rim(markers))
+    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + SPREAD) ** 2)
     places = centers[small] + (left, top)
     away = np.hypot(*(places[:, None] - markers.position).transpose(2, 0, 1)).min(axis=1)
     rims = small[(away <= radius + SPREAD) & (small > 0)]

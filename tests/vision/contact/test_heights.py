@@ -1,0 +1,124 @@
+"""The shape of a gel from how its light has changed, and the contacts that it shows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tactflow.vision.contact.heights import HeightModel, Heights
+from tactflow.vision.contact.level_lines import ContactFinder, Region, level_lines
+
+Float = NDArray[np.float32]
+SHAPE = 60, 80
+
+
+def bump(x: float, y: float, radius: float, high: float = 1.0, shape: tuple[int, int] = SHAPE) -> Float:
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    away = ((columns - x) ** 2 + (rows - y) ** 2) / radius**2
+    return np.asarray(high * np.exp(-(away**2)), np.float32)
+
+
+def slopes(surface: Float) -> Float:
+    """(2, h, w), along x and y."""
+    down, across = np.gradient(surface)
+    return np.asarray(np.stack([across, down]), np.float32)
+
+
+def seen(surface: Float, lamps: NDArray[np.float64]) -> Float:
+    """Change of three channels, with noise; lamps : (3, 2), how each answers to slopes."""
+    noise = np.random.default_rng(0).normal(0, 0.002, (3, *surface.shape))
+    return np.asarray(np.tensordot(lamps, slopes(surface), 1) + noise, np.float32)
+
+
+def regions(heights: Heights, changed: NDArray[np.bool_] | None = None) -> list[Region]:
+    return ContactFinder()(heights, np.ones(heights.values.shape, np.bool_) if changed is None else changed)
+
+
+def core(region: Region, shape: tuple[int, int] = SHAPE) -> NDArray[np.bool_]:
+    cells = np.zeros(shape, np.bool_)
+    cells[region.rows, region.columns] = region.core > 0
+    return cells
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**16))
+def test_whatever_colours_answer_to_slopes_the_surface_is_found_up_to_a_factor(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    lamps = draw.normal(0, 1, (3, 2))
+    lamps[:2] += 1.5 * np.eye(2)
+    surface = bump(*draw.uniform(25, 35, 2), draw.uniform(6, 12)) + bump(55, 35, 5, 0.4)
+    heights = HeightModel()(seen(surface, lamps))
+    if np.linalg.cond(lamps) > 20:
+        return
+    assert heights.slopes is not None
+    # Measured: 0.995 at least.
+    assert abs(np.corrcoef(heights.values.ravel(), surface.ravel())[0, 1]) > 0.98
+
+
+def test_a_cylinder_shows_one_slope_and_is_found_after_a_ball() -> None:
+    lamps = np.array([[1.0, 0.2], [-0.4, 0.9], [-0.5, -1.0]])
+    model = HeightModel()
+    model(seen(bump(40, 30, 10), lamps))
+    ridge = np.asarray(np.exp(-(((np.mgrid[:60, :80][1] - 40) / 6.0) ** 4)), np.float32)
+    heights = model(seen(ridge, lamps))
+    assert abs(np.corrcoef(heights.values[20:40].ravel(), ridge[20:40].ravel())[0, 1]) > 0.95
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_brightens_or_darkens_as_a_whole_is_depth(sign: int) -> None:
+    surface = bump(40, 30, 10)
+    heights = HeightModel()(np.stack([sign * surface] * 3))
+    assert heights.slopes is None
+    assert np.corrcoef(heights.values.ravel(), surface.ravel())[0, 1] > 0.99
+
+
+def test_in_gray_pictures_of_coloured_light_the_size_of_the_change_is_the_shape() -> None:
+    steep = np.linalg.norm(slopes(bump(40, 30, 10)), axis=0)
+    uneven = steep * np.where(np.mgrid[:60, :80][0] > 30, -1, 1)
+    heights = HeightModel()(np.asarray([uneven] * 3, np.float32))
+    assert heights.slopes is None
+    (region,) = regions(heights)
+    assert core(region)[24:36, 32:48].all() or core(region)[30, 32] or core(region)[24, 40]
+
+
+def test_a_change_of_nothing_has_no_lines() -> None:
+    heights = HeightModel()(np.zeros((3, *SHAPE), np.float32))
+    assert level_lines(heights.values) == []
+    assert regions(heights) == []
+
+
+def test_an_object_in_a_moat_is_the_contact_whichever_way_it_points() -> None:
+    surface = bump(40, 30, 8) - 0.3 * bump(40, 30, 16)
+    for sign in (1, -1):
+        (region,) = regions(Heights(sign * surface, np.zeros((2, 3), np.float32)))
+        assert core(region)[30, 40]
+        assert 100 < core(region).sum() < 260
+
+
+def test_two_objects_are_two_contacts_and_a_faint_wrinkle_is_none() -> None:
+    surface = bump(20, 30, 8) + bump(55, 30, 8, 0.8) + bump(40, 50, 5, 0.05)
+    found = regions(Heights(surface, None))
+    assert [bool(core(region)[30, x]) for region, x in zip(found, (20, 55), strict=True)] == [True, True]
+
+
+def test_a_contact_encloses_cells_that_have_changed() -> None:
+    surface, changed = bump(20, 30, 8) + bump(55, 30, 8, 0.8), np.zeros(SHAPE, np.bool_)
+    changed[28:32, 53:57] = True
+    (region,) = regions(Heights(surface, None), changed)
+    assert core(region)[30, 55]
+
+
+def test_a_ring_is_outlined_around_and_not_within() -> None:
+    rows, columns = np.mgrid[:60, :80]
+    ring = np.exp(-(((np.hypot(columns - 40, rows - 30) - 15) / 4.0) ** 4)).astype(np.float32)
+    (region,) = regions(Heights(ring, np.zeros((2, 3), np.float32)))
+    assert core(region)[30, 25]
+    assert core(region)[30, 40]
+
+
+def test_a_contact_that_the_border_cuts_off_is_found() -> None:
+    (region,) = regions(Heights(bump(40, 0, 12), None))
+    assert core(region)[0, 40]
