@@ -5,8 +5,8 @@
 1. `background` compares its cells, 4 x 4 px, with those of the untouched gel, under the frame's light, which
    `illumination` fits: a `Change`.
 2. `components` tells whether connected changes are contacts.
-3. `heights` integrates the change to the shape of the gel, up to a factor, and `level_lines` finds the regions
-   where it climbs to an object.
+3. `heights` integrates the change to the shape of the gel, up to a factor, and `level_lines` finds the
+   regions where it climbs to an object.
 4. `contact_outline` finds the outline of each of these in the change at half resolution.
 
 `fusion` joins that mask with what the markers show.

@@ -20,8 +20,9 @@ from tactflow.vision.geometry.region import Region, measure_region
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
 UNMOVED: Final = 6
-"""Markers below a change of the light, none of which moves, from which on it is no contact. Measured: of the frames in contact of the simulator, mini_ball,
-gelslim_ball, handmade_dots, sts_640 and franka_mini, those in which no marker moved had 5 at most."""
+"""Markers below a change of the light, none of which moves, from which on it is no contact. Measured: of the
+frames in contact of the simulator, mini_ball, gelslim_ball, handmade_dots, sts_640 and franka_mini, those in
+which no marker moved had 5 at most."""
 MARGIN: Final = 0.125
 """How much wider than the hull of its markers a region is, pitches. Chosen by hand."""
 SPREAD: Final = 5.0

@@ -28,8 +28,9 @@ INTEGRABLE: Final = 0.2
 """Part of the slopes' power that may be missing in those of a surface. One slope of a round contact, which is
 what light from one side shows, misses 0.25 with nothing beside it; sensors with lamps on several sides miss
 0.00 to 0.15."""
-WEAKEST: Final = 2e-3
-"""Power of a mixture of channels, relative to the strongest one, from which on it tells something."""
+WEAKEST: Final = 0.01
+"""Power of a mixture of channels, relative to the strongest one, from which on it tells of a slope: a tenth
+in size. Below is noise, in a faint contact that brightens as a whole."""
 
 
 class Heights(NamedTuple):
@@ -66,7 +67,7 @@ class HeightModel:
     def __call__(self, change: Floats32) -> Heights:
         """Shape of the gel, (h, w); change : (3, h, w) float32, in standard deviations, 0 where no gel is."""
         high, wide = change.shape[1:]
-        margin = round(MARGIN * max(high, wide))
+        margin = max(round(MARGIN * max(high, wide)), 1)
         size = tuple(fft.next_fast_len(side + 2 * margin, real=True) for side in (high, wide))
         spectrum = np.asarray(fft.rfft2(change, size), np.complex64)
         down = np.asarray(fft.fftfreq(size[0])[:, None], np.float32)
