@@ -13,10 +13,11 @@ the contact as a whole, or to slopes of one direction. Then the size of the chan
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, linalg
 
 from tactflow.vision.arrays import Floats32
@@ -31,6 +32,9 @@ what light from one side shows, misses 0.25 with nothing beside it; sensors with
 WEAKEST: Final = 0.01
 """Power of a mixture of channels, relative to the strongest one, from which on it tells of a slope: a tenth
 in size. Below is noise, in a faint contact that brightens as a whole."""
+MORE: Final = 0.02
+"""Part of all the power so far that a frame has at least to tell more: a sensor is known after fifty such
+frames."""
 
 
 class Heights(NamedTuple):
@@ -62,58 +66,75 @@ class HeightModel:
 
     def __init__(self) -> None:
         self._missing, self._power = np.zeros((6, 6)), np.zeros((3, 3))
-        self._mixtures = np.zeros((2, 3), np.float32)
+        self._slopes: Floats32 | None = None
+        self._before = np.zeros((2, 3), np.float32)
 
     def __call__(self, change: Floats32) -> Heights:
         """Shape of the gel, (h, w); change : (3, h, w) float32, in standard deviations, 0 where no gel is."""
+        self._learn(change)
+        if self._slopes is None:
+            return Heights(cv2.magnitude(cv2.magnitude(change[0], change[1]), change[2]), None)
         high, wide = change.shape[1:]
-        margin = max(round(MARGIN * max(high, wide)), 1)
-        size = tuple(fft.next_fast_len(side + 2 * margin, real=True) for side in (high, wide))
-        spectrum = np.asarray(fft.rfft2(change, size), np.complex64)
-        down = np.asarray(fft.fftfreq(size[0])[:, None], np.float32)
-        across = np.asarray(fft.rfftfreq(size[1])[None], np.float32)
-        self._learn(spectrum, across, down)
-        mixtures = self._slopes()
-        if mixtures is None:
-            return Heights(np.sqrt(np.square(change).sum(axis=0)), None)
-        slopes = np.tensordot(mixtures, spectrum, 1)
+        slopes, size = np.tensordot(self._slopes, change, 1), _extended(high, wide)
+        along_x, along_y = fft.rfft2(slopes, size)
+        across, down = _frequencies(*size)
         square = across**2 + down**2
         square[0, 0] = 1
-        surface = -1j * (across * slopes[0] + down * slopes[1]) / square
-        extended = fft.irfft2(surface, size)
-        rest = np.median(np.concatenate([extended[high:].ravel(), extended[:high, wide:].ravel()]))
-        return Heights(np.asarray(extended[:high, :wide] - rest, np.float32), mixtures)
+        extended = fft.irfft2(-1j * (across * along_x + down * along_y) / square, size)
+        rest = np.median(np.concatenate([extended[high], extended[-1]]))
+        return Heights(np.asarray(extended[:high, :wide] - rest, np.float32), self._slopes)
 
-    def _learn(self, spectrum: NDArray[np.complex64], across: Floats32, down: Floats32) -> None:
-        """Add the power of a change, and what of it would be missing in a surface.
+    def _learn(self, change: Floats32) -> None:
+        """Add the power of a change, and what of it would be missing in a surface, if that tells more.
 
         Of slopes (p, q) at the frequency (u, v), (v p - u q) / |(u, v)| is no slope of a surface, nor is
         their mean.
         """
-        weight = np.full(spectrum.shape[1:], np.sqrt(2), np.float32)
-        weight[:, 0] = 1
-        weighed = spectrum * weight
-        length = np.maximum(np.hypot(across, down), 1e-9)
-        curl = np.concatenate([weighed * (-down / length), weighed * (across / length)]).reshape(6, -1)
-        flat, mean = weighed.reshape(3, -1), spectrum[:, 0, 0].real.astype(np.float64)
-        self._power += (flat @ flat.conj().T).real
-        self._missing += (curl @ curl.conj().T).real
-        self._missing[:3, :3] += np.outer(mean, mean)
-        self._missing[3:, 3:] += np.outer(mean, mean)
+        flat = change.reshape(3, -1)
+        power = np.asarray(flat @ flat.T, np.float64)
+        if not power.trace() > MORE * self._power.trace():
+            return
+        size = _extended(*change.shape[1:])
+        spectrum = np.asarray(fft.rfft2(change, size), np.complex64)
+        across, down = _frequencies(*size)
+        length = np.maximum(np.hypot(across, down), np.float32(1e-9))
+        curl = np.concatenate([spectrum * (-down / length), spectrum * (across / length)])
+        # All but the first column stand for two frequencies.
+        curl[:, :, 1:] *= np.float32(2**0.5)
+        both, mean = curl.reshape(6, -1), flat.sum(axis=1, dtype=np.float64)
+        missing = (both @ both.conj().T).real.astype(np.float64)
+        missing[:3, :3] += np.outer(mean, mean)
+        missing[3:, 3:] += np.outer(mean, mean)
+        self._power += power
+        self._missing += missing / (size[0] * size[1])
+        self._slopes = self._integrable()
+        if self._slopes is not None:
+            # Up to the sign, which stays as it was.
+            self._slopes *= np.float32(1 if (self._slopes * self._before).sum() >= 0 else -1)
+            self._before = self._slopes
 
-    def _slopes(self) -> Floats32 | None:
+    def _integrable(self) -> Floats32 | None:
         """Mixtures (2, 3) of the channels that are slopes along x and y; None where none are of a surface."""
         powers, directions = np.linalg.eigh(self._power)
-        directions = directions[:, powers >= WEAKEST * powers[-1]]
-        if directions.shape[1] < 2 or not powers[-1] > 0:
+        basis = np.kron(np.eye(2), directions[:, powers >= WEAKEST * powers[-1]])
+        if basis.shape[1] < 4:
             return None
-        basis = linalg.block_diag(directions, directions)
-        power = linalg.block_diag(self._power, self._power)
-        missing, found = linalg.eigh(basis.T @ self._missing @ basis, basis.T @ power @ basis)
-        if missing[0] > INTEGRABLE:
-            return None
+        power = basis.T @ np.kron(np.eye(2), self._power) @ basis
+        missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
         mixtures = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
-        mixtures /= np.linalg.norm(mixtures)
-        # Up to the sign, which stays as it was.
-        self._mixtures = mixtures if (mixtures * self._mixtures).sum() >= 0 else -mixtures
-        return self._mixtures
+        return None if missing[0] > INTEGRABLE else mixtures / np.linalg.norm(mixtures)
+
+
+@lru_cache(maxsize=4)
+def _extended(high: int, wide: int) -> tuple[int, int]:
+    """Size of a picture of cells that is extended by gel at rest, and that transforms quickly."""
+    margin = max(round(MARGIN * max(high, wide)), 1)
+    rows, columns = (int(fft.next_fast_len(side + 2 * margin, real=True)) for side in (high, wide))
+    return rows, columns
+
+
+@lru_cache(maxsize=4)
+def _frequencies(rows: int, columns: int) -> tuple[Floats32, Floats32]:
+    """Along x, (1, columns // 2 + 1), and along y, (rows, 1), of a picture of that size."""
+    across, down = fft.rfftfreq(columns)[None], fft.fftfreq(rows)[:, None]
+    return np.asarray(across, np.float32), np.asarray(down, np.float32)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Flags, Floats32, Mask
 from tactflow.vision.contact.heights import Heights
 
-LEVELS: Final = 24
-"""Levels at which lines are drawn: the steepest one lies within a fiftieth of the height."""
+LEVELS: Final = 16
+"""Levels at which lines are drawn: the steepest one lies within a thirtieth of the height."""
 FLATTER: Final = 0.5
 """Part of the steepest line's mean slope that a line around it has at least where the gel still climbs to the
 object."""
@@ -34,6 +34,8 @@ OPEN: Final = 0.5
 LENGTH: Final = 0.25
 """Power of its length with which a line's slope counts: of two lines of the same slope, the longer one is the
 less likely chance. 0 and 0.5 overlap as well with real outlines within 0.02."""
+DECIDED: Final = 30.0
+"""How many times the salience of a frame's contact decides for good between a bump and a dent."""
 LESSER: Final = 0.5
 """Part of the first contact's salience that a further one has at least: less is gel that wrinkles, or light
 that has changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap as well within 0.01)."""
@@ -64,30 +66,30 @@ def level_lines(heights: Floats32) -> list[Line]:
     across = cv2.Scharr(heights, cv2.CV_32F, 1, 0, scale=1 / 32)
     down = cv2.Scharr(heights, cv2.CV_32F, 0, 1, scale=1 / 32)
     slope = np.asarray(cv2.magnitude(across, down), np.float32)
+    # Along the border of the picture, a line is none.
+    slope[[0, -1]] = slope[:, [0, -1]] = 0
     least, most = float(heights.min()), float(heights.max())
     lines: list[Line] = []
-    around = np.full(heights.shape, -1, np.int32)
+    below: list[tuple[int, cv2.typing.MatLike]] = []
     for level in np.linspace(least, most, LEVELS + 2)[1:-1].tolist():
-        inside = np.full(heights.shape, -1, np.int32)
         outlines, _ = cv2.findContours(
             (heights > level).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
         )
+        here: list[tuple[int, cv2.typing.MatLike]] = []
         for outline in outlines:
             if len(outline) < SHORTEST:
                 continue
             x, y = outline[:, 0].T
-            free = (x > 0) & (y > 0) & (x < heights.shape[1] - 1) & (y < heights.shape[0] - 1)
-            if (
-                np.count_nonzero(free) < (1 - OPEN) * len(outline)
-                or cv2.contourArea(outline) > WIDEST * heights.size
-            ):
-                cv2.drawContours(inside, [outline], -1, -1.0, cv2.FILLED)
+            along = slope[y, x]
+            length = np.count_nonzero(along)
+            if length < (1 - OPEN) * len(outline) or cv2.contourArea(outline) > WIDEST * heights.size:
                 continue
-            cv2.drawContours(inside, [outline], -1, float(len(lines)), cv2.FILLED)
-            mean = float(slope[y[free], x[free]].mean())
-            cells = np.asarray(outline, np.int32)
-            lines.append(Line(level, cells, int(np.count_nonzero(free)), mean, int(around[y[0], x[0]])))
-        around = inside
+            here.append((len(lines), outline))
+            place = outline[0, 0].tolist()
+            outer = next((i for i, around in below if cv2.pointPolygonTest(around, place, False) >= 0), -1)
+            mean = float(along.sum()) / length
+            lines.append(Line(level, np.asarray(outline, np.int32), int(length), mean, outer))
+        below = here
     return lines
 
 
@@ -119,14 +121,16 @@ class ContactFinder:
 
         heights : of the gel's cells. changed : (h, w) bool, cells of which each contact encloses some.
         """
-        lines = level_lines(heights.values)
+        values = heights.values if self._bumps >= 0 or heights.slopes is None else -heights.values
+        lines = level_lines(values)
         contacts = _contacts(lines, changed)
-        if heights.slopes is not None:
-            others = level_lines(-heights.values)
+        if heights.slopes is not None and abs(self._bumps) <= DECIDED * _salience(lines, contacts):
+            others = level_lines(-values)
             dents = _contacts(others, changed)
-            self._bumps += _salience(lines, contacts) - _salience(others, dents)
-            if self._bumps < 0:
+            more = _salience(lines, contacts) - _salience(others, dents)
+            if abs(self._bumps) + more < 0:
                 lines, contacts = others, dents
+            self._bumps += more if values is heights.values else -more
         return [_region(lines[_outermost(lines, index)], lines[index], changed.shape) for index in contacts]
 
 
