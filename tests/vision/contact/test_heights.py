@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -49,13 +49,13 @@ def test_whatever_colours_answer_to_slopes_the_surface_is_found_up_to_a_factor(s
     draw = np.random.default_rng(seed)
     lamps = draw.normal(0, 1, (3, 2))
     lamps[:2] += 1.5 * np.eye(2)
+    # A slope that shows less than a tenth as strongly as the other one is taken for noise.
+    assume(np.linalg.cond(lamps) < 1 / 0.15)
     surface = bump(*draw.uniform(25, 35, 2), draw.uniform(6, 12)) + bump(55, 35, 5, 0.4)
     heights = HeightModel()(seen(surface, lamps))
-    if np.linalg.cond(lamps) > 20:
-        return
     assert heights.slopes is not None
-    # Measured: 0.995 at least.
-    assert abs(np.corrcoef(heights.values.ravel(), surface.ravel())[0, 1]) > 0.98
+    # Measured: 0.9994 at least.
+    assert abs(np.corrcoef(heights.values.ravel(), surface.ravel())[0, 1]) > 0.99
 
 
 def test_a_cylinder_shows_one_slope_and_is_found_after_a_ball() -> None:
@@ -80,8 +80,7 @@ def test_in_gray_pictures_of_coloured_light_the_size_of_the_change_is_the_shape(
     uneven = steep * np.where(np.mgrid[:60, :80][0] > 30, -1, 1)
     heights = HeightModel()(np.asarray([uneven] * 3, np.float32))
     assert heights.slopes is None
-    (region,) = regions(heights)
-    assert core(region)[24:36, 32:48].all() or core(region)[30, 32] or core(region)[24, 40]
+    assert heights.values.argmax() == np.abs(uneven).argmax()
 
 
 def test_a_change_of_nothing_has_no_lines() -> None:
