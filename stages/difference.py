@@ -9,7 +9,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
-from tactflow.ports import ContactMask, Deviations, MarkerMask, Touching, Unmarked, Valid
+from tactflow.ports import ContactMask, Deviations, Touching, Unmarked, Valid
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.reference import ReferenceCheck
 
@@ -100,13 +100,9 @@ class Difference(Stage):
         self,
         unmarked: Unmarked,
         frame: Frame,
-        marker_mask: MarkerMask | None = None,
         valid: Valid | None = None,
     ) -> ContactPorts:
-        """The contact mask of this frame; below markers its outline runs straight.
-
-        Nothing outside of `valid` counts.
-        """
+        """The contact mask of this frame; nothing outside of `valid` counts."""
         if frame.reference or not self._detector.has_reference:
             self._detector.add_reference(unmarked, valid)
             self._check = self._check or ReferenceCheck(unmarked)
