@@ -235,8 +235,8 @@ def test_a_stage_that_compares_with_a_reference_takes_pictures() -> None:
     difference = tactflow.stage("difference")
     touching = [difference.process(scene.frame(index)).touching for index in (0, 1, 48)]
     assert touching == [False, False, True]
-    nowhere = np.zeros((600, 800), np.uint8)
-    assert difference.process(scene.frame(49), marker_mask=nowhere).touching
+    everywhere = np.full((600, 800), 255, np.uint8)
+    assert difference.process(scene.frame(49), valid=everywhere).touching
     small = tactflow.stage("preprocess", rotate=90, downsample=2).process(scene.frame(0)).image
     assert small.shape == (400, 300, 3)
 
