@@ -263,8 +263,8 @@ class BackgroundModel:
         smooth = cv2.sepFilter2D(
             scaled, cv2.CV_32F, np.ones(1, np.float32), np.array([BESIDE, MIDDLE, BESIDE])
         )
-        counts = inside.repeat(2, axis=0).repeat(2, axis=1)
-        return np.asarray(smooth.reshape(high, wide, 3) * counts[..., None], np.float32)
+        smooth *= inside.repeat(2, axis=0).repeat(6, axis=1)
+        return np.asarray(smooth.reshape(high, wide, 3), np.float32)
 
     def _derived(self) -> Derived:
         if self._known is not None:

@@ -74,7 +74,9 @@ def contact_level(change: Floats32, core: Mask) -> Floats32:
 
 def _what_shows(change: Floats32) -> tuple[Floats32, float]:
     """What tells of the contact, (h, w), and the part of its largest value at which the contact ends."""
-    brightness, strength = change.mean(axis=2), np.sqrt(np.square(change).sum(axis=2))
+    blue, green, red = cv2.split(change)
+    brightness = np.asarray((blue + green + red) * np.float32(1 / 3), np.float32)
+    strength = np.asarray(cv2.magnitude(cv2.magnitude(blue, green), red), np.float32)
     whole = cv2.norm(strength, cv2.NORM_L2SQR)
     if COLOURED * cv2.norm(brightness, cv2.NORM_L2SQR) <= whole or _sidedness(brightness) >= TWO_SIDED:
         return strength, OUTER
