@@ -7,8 +7,8 @@ from typing import NamedTuple
 from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
-from tactflow.ports import ContactMask, Touching
-from tactflow.vision.contact.fusion import fuse_contact
+from tactflow.ports import ContactMask, Deviations, Touching
+from tactflow.vision.contact.fusion import changed_mask, fuse_contact
 from tactflow.vision.flow.motion import MotionTest
 from tactflow.vision.types import Evidence, Markers
 
@@ -69,7 +69,11 @@ class Fusion(Stage):
         self._changed = 0
 
     def process(
-        self, contact_mask: ContactMask, touching: Touching, markers: Markers | None = None
+        self,
+        contact_mask: ContactMask,
+        touching: Touching,
+        markers: Markers | None = None,
+        deviations: Deviations | None = None,
     ) -> FusedPorts:
         """What touches the gel, by both."""
         if markers is None:
@@ -82,7 +86,8 @@ class Fusion(Stage):
                 steadiness=params.steadiness,
                 relaxation=params.relaxation,
             )
-        fused = fuse_contact(contact_mask, markers, self._motion)
+        changed = None if deviations is None else changed_mask(deviations, contact_mask.shape)
+        fused = fuse_contact(contact_mask, markers, self._motion, changed)
         self._changed = self._changed + 1 if fused.light_changed else 0
         if self._changed == self.params.patience > 0:
             self.wants_reference = "light_changed"

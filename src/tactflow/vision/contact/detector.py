@@ -72,8 +72,8 @@ class ContactResult:
 
     mask : (H, W) uint8, 255 in contact, else 0. touching : whether any pixel is in contact.
     strength : largest change anywhere, in standard deviations of the untouched gel (`noise` only; else 0).
-    deviations : (2, h, w) float32, squared changes of each cell, of its light and of its colour alone, in
-        variances of the untouched gel (`noise` only; else None).
+    deviations : (2, h, w) float32, squared changes of each cell that belongs to a contact, of its light and
+        of its colour alone, in variances of the untouched gel; 0 elsewhere (`noise` only; else None).
     """
 
     mask: NDArray[np.uint8]
@@ -250,7 +250,7 @@ class ContactDetector:
             self._mask = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
         self._before = union(found, change.squared.shape)
-        deviations = np.stack([change.squared, change.colour])
+        deviations = np.stack([change.squared, change.colour]) * self._before
         if faint and change.remaining < 1 - self._creep and self._mask is not None:
             return ContactResult(self._mask.copy(), True, strength, deviations)
         self._mask = self._outlined(change, image.shape[:2])

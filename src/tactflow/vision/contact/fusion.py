@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Mask
+from tactflow.vision.arrays import Floats32, Mask
+from tactflow.vision.contact.background import CELL
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
 from tactflow.vision.geometry.region import Region, measure_region
@@ -49,12 +50,15 @@ class FusedContact(NamedTuple):
         return self.evidence is not None
 
 
-def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContact:
+def fuse_contact(
+    light: Mask, markers: Markers, test: MotionTest, changed: Mask | None = None
+) -> FusedContact:
     """Join the contact that the light shows and the one that the markers show.
 
     Parameters
     ----------
     light : (H, W) uint8, 255 where the light shows contact; returned as it is where it shows the contact.
+    changed : (H, W) uint8, not 0 where the light has changed; None: as `light`.
     markers : of the same frame. test : of the motion of these markers, given every frame in order.
 
     Returns
@@ -79,10 +83,18 @@ def fuse_contact(light: Mask, markers: Markers, test: MotionTest) -> FusedContac
         return FusedContact(_hull_of(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
         return FusedContact(light, "both")
-    if _rests(light, markers, motion):
+    if _rests(light if changed is None else changed, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
+    if changed is not None and not _without_rims(changed, measure_region(changed), markers, CELL).any():
+        return FusedContact(np.zeros_like(light), None)
     mask = _without_rims(light, region, markers)
     return FusedContact(mask, "light" if cv2.countNonZero(mask) else None)
+
+
+def changed_mask(deviations: Floats32, shape: tuple[int, ...]) -> Mask:
+    """(H, W) uint8, 255 in the cells that have changed; deviations : (2, h, w), 0 in all others."""
+    cells = (deviations.max(axis=0) > 0).view(np.uint8) * np.uint8(255)
+    return np.ascontiguousarray(cells.repeat(CELL, axis=0).repeat(CELL, axis=1)[: shape[0], : shape[1]])
 
 
 def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
@@ -93,10 +105,10 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= UNMOVED and bool(resting.all())
 
 
-def _without_rims(light: Mask, region: Region, markers: Markers) -> Mask:
+def _without_rims(light: Mask, region: Region, markers: Markers, coarse: int = 0) -> Mask:
     """The regions that are more than what removing a marker leaves at its rim; the same array if all are.
 
-    region : all of them.
+    region : all of them. coarse : side of the regions' cells, px.
     A marker that has moved by a part of a pixel is not quite where it is painted over.
     """
     radius = markers.radius
@@ -106,7 +118,7 @@ def _without_rims(light: Mask, region: Region, markers: Markers) -> Mask:
     left, top, width, height = region[:4]
     window = light[top : top + height, left : left + width]
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(window)
-    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + SPREAD) ** 2)
+    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + SPREAD + coarse) ** 2)
     places = centers[small] + (left, top)
     away = np.hypot(*(places[:, None] - markers.position).transpose(2, 0, 1)).min(axis=1)
     rims = small[(away <= radius + SPREAD) & (small > 0)]
