@@ -8,7 +8,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import ContactMask, Deviations, Touching
-from tactflow.vision.contact.fusion import changed_mask, fuse_contact
+from tactflow.vision.contact.fusion import fuse_contact
 from tactflow.vision.flow.motion import MotionTest
 from tactflow.vision.types import Evidence, Markers
 
@@ -86,8 +86,7 @@ class Fusion(Stage):
                 steadiness=params.steadiness,
                 relaxation=params.relaxation,
             )
-        changed = None if deviations is None else changed_mask(deviations, contact_mask.shape)
-        fused = fuse_contact(contact_mask, markers, self._motion, changed)
+        fused = fuse_contact(contact_mask, markers, self._motion, deviations)
         self._changed = self._changed + 1 if fused.light_changed else 0
         if self._changed == self.params.patience > 0:
             self.wants_reference = "light_changed"

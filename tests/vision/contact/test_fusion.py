@@ -85,13 +85,17 @@ def test_what_the_removal_of_a_marker_leaves_at_its_rim_is_no_contact() -> None:
 
 
 def test_what_has_changed_tells_of_rests_and_rims_not_how_it_is_outlined() -> None:
-    outline, everywhere, sliver = light(10, 10, 40, 40), light(0, 0, 320, 240), light(20, 12, 32, 28)
-    assert fuse_contact(outline, markers(), MotionTest(ORIGIN)).touching
-    assert fuse_contact(outline, markers(), MotionTest(ORIGIN), everywhere).light_changed
-    assert not fuse_contact(outline, markers(), MotionTest(ORIGIN), sliver).touching
+    outline, everywhere, sliver = (
+        light(10, 10, 40, 40),
+        np.ones((2, 60, 80), np.float32),
+        light(20, 12, 32, 28),
+    )
     cells = np.zeros((2, 60, 80), np.float32)
     cells[1, 3:7, 5:8] = 20
     assert np.array_equal(changed_mask(cells, (240, 320)), sliver)
+    assert fuse_contact(outline, markers(), MotionTest(ORIGIN)).touching
+    assert fuse_contact(outline, markers(), MotionTest(ORIGIN), everywhere).light_changed
+    assert not fuse_contact(outline, markers(), MotionTest(ORIGIN), cells).touching
 
 
 def test_beside_markers_of_unknown_size_nothing_is_taken_for_a_rim() -> None:

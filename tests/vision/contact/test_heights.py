@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tactflow.vision.contact.heights import HeightModel, Heights
-from tactflow.vision.contact.level_lines import ContactFinder, Region, level_lines
+from tactflow.vision.contact.level_lines import ContactFinder, ContactRegion, level_lines
 
 Float = NDArray[np.float32]
 SHAPE = 60, 80
@@ -33,11 +33,11 @@ def seen(surface: Float, lamps: NDArray[np.float64]) -> Float:
     return np.asarray(np.tensordot(lamps, slopes(surface), 1) + noise, np.float32)
 
 
-def regions(heights: Heights, changed: NDArray[np.bool_] | None = None) -> list[Region]:
+def regions(heights: Heights, changed: NDArray[np.bool_] | None = None) -> list[ContactRegion]:
     return ContactFinder()(heights, np.ones(heights.values.shape, np.bool_) if changed is None else changed)
 
 
-def core(region: Region, shape: tuple[int, int] = SHAPE) -> NDArray[np.bool_]:
+def core(region: ContactRegion, shape: tuple[int, int] = SHAPE) -> NDArray[np.bool_]:
     cells = np.zeros(shape, np.bool_)
     cells[region.rows, region.columns] = region.core > 0
     return cells

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import MAD_TO_SIGMA, Floats32
+from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED, Floats32
 from tactflow.vision.contact.background_kernels import (
     BESIDE,
     MIDDLE,
@@ -22,7 +22,7 @@ from tactflow.vision.contact.background_kernels import (
     smooth_cells,
     weigh_change,
 )
-from tactflow.vision.contact.illumination import SATURATED, IlluminationModel, positions, under_illumination
+from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 

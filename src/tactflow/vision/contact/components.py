@@ -22,7 +22,7 @@ contacts of their own: wrinkles, reflections, what is left of a marker that was 
 whose stray reflections hold 0.01 to 0.03, and franka_mini, where the faint second edge of an object holds
 0.045 and more; the lesser of two simulated contacts holds 0.55 and more."""
 MAX_COMPONENTS: Final = 12
-"""At most so many contacts are outlined. Chosen by hand."""
+"""At most so many changes are contacts. Chosen by hand."""
 MIN_CELLS: Final = 8
 """Cells that must change together. Chosen by hand: 128 px^2 is the halo of a ball's first touch."""
 WIDE_DEVIATION: Final = 12.0

@@ -51,15 +51,15 @@ class FusedContact(NamedTuple):
 
 
 def fuse_contact(
-    light: Mask, markers: Markers, test: MotionTest, changed: Mask | None = None
+    light: Mask, markers: Markers, test: MotionTest, deviations: Floats32 | None = None
 ) -> FusedContact:
     """Join the contact that the light shows and the one that the markers show.
 
     Parameters
     ----------
     light : (H, W) uint8, 255 where the light shows contact; returned as it is where it shows the contact.
-    changed : (H, W) uint8, not 0 where the light has changed; None: as `light`.
     markers : of the same frame. test : of the motion of these markers, given every frame in order.
+    deviations : (2, h, w) float32, not 0 in the cells that have changed; None: what the light shows.
 
     Returns
     -------
@@ -83,9 +83,10 @@ def fuse_contact(
         return FusedContact(_hull_of(test.stretched(markers), test.pitch, light), "dots")
     if motion.moving:
         return FusedContact(light, "both")
-    if _rests(light if changed is None else changed, markers, motion):
+    changed = light if deviations is None else changed_mask(deviations, light.shape)
+    if _rests(changed, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
-    if changed is not None and not _without_rims(changed, measure_region(changed), markers, CELL).any():
+    if deviations is not None and not _without_rims(changed, measure_region(changed), markers, CELL).any():
         return FusedContact(np.zeros_like(light), None)
     mask = _without_rims(light, region, markers)
     return FusedContact(mask, "light" if cv2.countNonZero(mask) else None)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import SATURATED, Floats32
 from tactflow.vision.compiled import kernel
 
 BLOCK: Final = 8
@@ -28,8 +28,6 @@ RIDGE: Final = (0.0, 0.05, 0.05, 0.1)
 """Weights, relative to the data, that draw slopes and offset towards zero: an offset is nearly the same as
 a gain on a gel of one brightness, and slopes follow wide, faint contacts. Chosen on wedge_grasp, where slopes
 of 0.01 miss 8 of 324 frames more than of 0.1, and seu_a, whose light smaller ones follow better."""
-SATURATED: Final = 250.0
-"""Mean of a block, grey levels, from which on it tells nothing of the light: parts are clipped. By hand."""
 WHITE: Final = np.float32(255)
 """Grey levels at which a camera saturates: more light looks the same."""
 DARK: Final = 0.25

@@ -93,7 +93,7 @@ def level_lines(heights: Floats32) -> list[Line]:
     return lines
 
 
-class Region(NamedTuple):
+class ContactRegion(NamedTuple):
     """Where the outline of a contact lies.
 
     rows, columns : window of cells. inside : (h, w) bool, which of them may belong to the contact. core :
@@ -116,29 +116,27 @@ class ContactFinder:
     def __init__(self) -> None:
         self._bumps = 0.0
 
-    def __call__(self, heights: Heights, changed: Flags) -> list[Region]:
+    def __call__(self, heights: Heights, changed: Flags) -> list[ContactRegion]:
         """Regions that do not overlap, the most salient one first.
 
         heights : of the gel's cells. changed : (h, w) bool, cells of which each contact encloses some.
         """
         values = heights.values if self._bumps >= 0 or heights.slopes is None else -heights.values
-        lines = level_lines(values)
-        contacts = _contacts(lines, changed)
-        if heights.slopes is not None and abs(self._bumps) <= DECIDED * _salience(lines, contacts):
-            others = level_lines(-values)
-            dents = _contacts(others, changed)
-            more = _salience(lines, contacts) - _salience(others, dents)
+        contacts = _contacts(level_lines(values), changed)
+        if heights.slopes is not None and abs(self._bumps) <= DECIDED * _salience(contacts):
+            others = _contacts(level_lines(-values), changed)
+            more = _salience(contacts) - _salience(others)
             if abs(self._bumps) + more < 0:
-                lines, contacts = others, dents
+                contacts = others
             self._bumps += more if values is heights.values else -more
-        return [_region(lines[_outermost(lines, index)], lines[index], changed.shape) for index in contacts]
+        return [_region(*contact, changed.shape) for contact in contacts]
 
 
-def _salience(lines: Sequence[Line], contacts: Sequence[int]) -> float:
-    return lines[contacts[0]].salience if contacts else 0.0
+def _salience(contacts: Sequence[tuple[Line, Line]]) -> float:
+    return contacts[0][0].salience if contacts else 0.0
 
 
-def _region(wide: Line, steepest: Line, shape: tuple[int, ...]) -> Region:
+def _region(steepest: Line, wide: Line, shape: tuple[int, ...]) -> ContactRegion:
     """The cells inside the steepest line; and those inside a wider one, and beside it."""
     core, near = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     cv2.drawContours(core, [steepest.cells], -1, 1.0, cv2.FILLED)
@@ -146,7 +144,7 @@ def _region(wide: Line, steepest: Line, shape: tuple[int, ...]) -> Region:
     near = np.asarray(cv2.dilate(near, np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8)), np.uint8)
     left, top, across, down = cv2.boundingRect(near)
     rows, columns = slice(max(top - 1, 0), top + down + 1), slice(max(left - 1, 0), left + across + 1)
-    return Region(
+    return ContactRegion(
         slice(rows.start, min(rows.stop, shape[0])),
         slice(columns.start, min(columns.stop, shape[1])),
         np.ascontiguousarray(near[rows, columns]).view(np.bool_),
@@ -154,18 +152,21 @@ def _region(wide: Line, steepest: Line, shape: tuple[int, ...]) -> Region:
     )
 
 
-def _contacts(lines: Sequence[Line], changed: Flags) -> list[int]:
-    """The steepest line of each contact, the most salient one first; lines inside each other are of one."""
-    contacts: list[int] = []
+def _contacts(lines: Sequence[Line], changed: Flags) -> list[tuple[Line, Line]]:
+    """The steepest line of each contact, and a wider one around it; the most salient contact first.
+
+    Lines inside each other are of one contact.
+    """
+    contacts: list[tuple[Line, Line]] = []
     related: set[int] = set()
     for index in sorted(range(len(lines)), key=lambda index: -lines[index].salience):
-        if contacts and lines[index].salience < LESSER * lines[contacts[0]].salience:
+        if lines[index].salience < LESSER * _salience(contacts):
             break
         if index in related or lines[index].level <= 0:
             continue
         wide = _outermost(lines, index)
         if _encloses(lines[wide], changed):
-            contacts.append(index)
+            contacts.append((lines[index], lines[wide]))
             related |= _related(lines, wide)
     return contacts
 

@@ -54,13 +54,12 @@ class Motion(NamedTuple):
     left: Floats
     bound: Floats
 
-    def still(self, dragged: float = 0.0) -> Flags:
+    def still(self) -> Flags:
         """Markers (N,) bool that are at rest: their motion is below half the threshold.
 
-        dragged : part of the largest motion up to which a marker rests as well. One whose standard error is
-        unknown, as of those that are not tracked, does not rest.
+        One whose standard error is unknown, as of those that are not tracked, does not rest.
         """
-        return np.asarray(self.left <= np.maximum(STILL * self.bound, dragged * self.largest))
+        return np.asarray(self.left <= STILL * self.bound)
 
 
 class MotionTest:

@@ -51,11 +51,6 @@ class Region(NamedTuple):
     pixels: int
     window: Mask
 
-    @property
-    def in_one_piece(self) -> bool:
-        """Whether it is connected (8-connected)."""
-        return len(self.contours()) == 1
-
     def contours(self) -> Contours:
         """Outlines of its components (8-connected), without those of holes."""
         if not self.pixels:
@@ -87,8 +82,8 @@ def measure_region(mask: Mask) -> Region:
     >>> mask = np.zeros((20, 20), np.uint8)
     >>> mask[5:7, 5:8] = 255
     >>> region = measure_region(mask)
-    >>> region.width, region.height, region.pixels, region.in_one_piece
-    (3, 2, 6, True)
+    >>> region.width, region.height, region.pixels
+    (3, 2, 6)
     >>> region.moments().x
     6.0
     """
