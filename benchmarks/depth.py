@@ -25,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tactflow
+from tactflow.calibration import KINDS
 from tactflow.calibration.file import Calibration, PhotometricEntry
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press, Session
 from tactflow.calibration.refine import refine_photometry
 from tactflow.calibration.samples import press_errors
 from tactflow.calibration.scale import centre
-from tactflow.calibration.stored import KINDS
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Scale

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.calibration.stored import with_recorded_calibration
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
+from tactflow.config.recorded import with_recorded_calibration
 from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
 from tactflow.config.validation import validated

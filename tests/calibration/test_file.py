@@ -13,8 +13,8 @@ import pytest
 import yaml
 
 import tactflow
+from tactflow.calibration import KINDS, kinds
 from tactflow.calibration.file import Calibration, ScaleEntry, raw_corners, small_picture
-from tactflow.calibration.stored import KINDS, kinds
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale

@@ -103,8 +103,14 @@ def test_a_printed_target_gives_the_scale(
     board[60:420, 60:540] -= np.uint8(150) * squares[60:420, 60:540, None].astype(np.uint8)
     cv2.imwrite("board.png", board)
     words = ["--from", "sim:idle?frames=3", "--target", "board.png", "--pitch", "3"]
-    assert calibrate(*words, "--grid", "9x6") == 2
-    assert "board.png does not show 9 x 6 inner corners" in capsys.readouterr().err
+    for grid, message in (
+        (["--grid", "9x6"], "board.png does not show 9 x 6 inner corners"),
+        (["--grid", "seven"], "required COLUMNSxROWS"),
+        (["--grid", "2x5"], "3 columns and rows or more"),
+        ([], "needs --grid COLUMNSxROWS and --pitch MM"),
+    ):
+        assert calibrate(*words, *grid) == 2
+        assert message in capsys.readouterr().err
     assert calibrate(*words, "--grid", "5x7") == 0
     stored = yaml.safe_load(Path("calibration/main.yaml").read_text())["scale"]
     # 60 raw pixels are 30 processed ones.

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveFloat, ValidationError
 
 from tactflow import __version__
-from tactflow.calibration.stored import MAX_ARRAYS, stored_arrays, stored_text
 from tactflow.engine.errors import ConfigError
+from tactflow.recording.calibration import MAX_ARRAYS, stored_arrays, stored_text
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import ending_held_back

@@ -75,8 +75,7 @@ class PressFinder:
     Attributes
     ----------
     presses : so far; one that is over may be taken out. frames : how many results were added.
-    lasts : whether the last press is not over. renewed : how often the presses so far were dropped, because a
-    new reference showed another look of the gel.
+    lasts : whether the last press is not over.
     """
 
     def __init__(self, pictures: bool = False) -> None:
@@ -84,7 +83,6 @@ class PressFinder:
         self.presses: list[Press] = []
         self.frames = 0
         self.lasts = False
-        self.renewed = 0
         self._reference: list[Picture] = []
         self._before: Picture | None = None
         self._epoch = 0
@@ -129,7 +127,6 @@ class PressFinder:
                 len(self.presses),
             )
             self.presses.clear()
-            self.renewed += 1
 
     def _add(self, press: Press) -> None:
         """A press of its own, or another moment of the last one."""

@@ -1,16 +1,10 @@
-"""Lens, perspective and scale from pictures of a printed target: a checkerboard, or a grid of dots.
+"""Scale from a picture of a printed target, a checkerboard or a grid of dots, which OpenCV finds.
 
-The target is seen where the gel's surface is: through a clear gel, or before the gel is put on. OpenCV finds
-it and fits the lens.
-
-References
-----------
-Z. Zhang, "A flexible new technique for camera calibration", PAMI 22 (2000), as `cv2.calibrateCamera` has it.
+The target lies where the gel's surface is: seen through a clear gel, or before the gel is put on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,12 +14,8 @@ from numpy.typing import NDArray
 
 from tactflow.calibration.scale import centre
 from tactflow.vision.arrays import Points
-from tactflow.vision.geometry.homography import find_homography, project
-from tactflow.vision.geometry.lens import Lens
 from tactflow.vision.types import Scale
 
-FEWEST_VIEWS: Final = 6
-"""Pictures in different poses that a lens needs at least; 10 or more are better. Chosen by hand."""
 FEWEST_POINTS: Final = 3
 """Columns and rows of a target at least: OpenCV finds none with fewer."""
 BENT: Final = 0.01
@@ -103,60 +93,3 @@ def scale_from_target(points: Points, target: Target, size: tuple[int, int]) -> 
     spread = np.sqrt(variance * np.diag(np.linalg.inv(matrix.T @ matrix)))
     bent = float(np.sqrt(np.mean((left**2).sum(axis=1)))) / target.pitch
     return Scale(float(along[0]), float(along[1]), (float(spread[0]), float(spread[1])), centre(size)), bent
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class LensFit:
-    """A lens. rms : distance of the points from where it puts them, px. stderr : (4,) float64 of fx, fy, cx,
-    cy, px. corners, places, size : the homography of the first picture, see `preprocess`."""
-
-    lens: Lens
-    rms: float
-    stderr: Points
-    corners: Points
-    places: Points
-    size: tuple[int, int]
-
-
-def fit_lens(views: Sequence[Points], target: Target, size: tuple[int, int]) -> LensFit:
-    """The lens from a target in several poses, and the homography that rectifies the first of them.
-
-    views : (N, 2) each, raw px, as `find_target` gives them; the first lies in the plane of the gel. size :
-    (width, height) of the raw frame.
-
-    Raises
-    ------
-    ValueError : too few views.
-    """
-    if len(views) < FEWEST_VIEWS:
-        raise ValueError(
-            f"lens: required {FEWEST_VIEWS} pictures with the whole target or more, tilted to all sides, "
-            f"found {len(views)}"
-        )
-    solid = np.column_stack([target.places, np.zeros(len(target.places))]).astype(np.float32)
-    pixels = [view.astype(np.float32) for view in views]
-    # The sixth power of the radius is told apart from the fourth only by lenses that see very wide.
-    rms, matrix, distortion, _, _, spread, _, _ = cv2.calibrateCameraExtended(
-        [solid] * len(pixels), pixels, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
-    )
-    lens = Lens(np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).ravel())
-    corners, places, rectified = _rectified(lens.undistort(views[0]), target, size)
-    stderr = np.asarray(spread, np.float64).ravel()[:4]
-    return LensFit(lens, float(rms), stderr, corners, places, rectified)
-
-
-def _rectified(
-    points: Points, target: Target, size: tuple[int, int]
-) -> tuple[Points, Points, tuple[int, int]]:
-    """Four corners of the target (4, 2), where they go (4, 2), and the size that holds the frame, px."""
-    last = target.columns * target.rows - 1
-    outer = [0, target.columns - 1, last, last - target.columns + 1]
-    corners, flat = points[outer], target.places[outer]
-    steps = np.linalg.norm(np.diff(points.reshape(target.rows, target.columns, 2), axis=1), axis=2)
-    places = flat * float(np.median(steps)) / target.pitch
-    matrix = find_homography(corners.tolist(), places.tolist())
-    width, height = size
-    frame = np.array([[0.0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]])
-    moved = project(matrix, frame)
-    low, high = moved.min(axis=0), moved.max(axis=0)
-    return corners, places - low, (int(np.ceil(high[0] - low[0])) + 1, int(np.ceil(high[1] - low[1])) + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
-import yaml
 
 from tactflow.api import Settings, ended_by_signals, load, make_runner
 from tactflow.calibration import force, presses, target
@@ -28,7 +27,6 @@ from tactflow.calibration.file import (
     small_picture,
 )
 from tactflow.calibration.judgement import doubt
-from tactflow.calibration.keeping import KeptPresses
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
@@ -71,10 +69,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(
         "what",
         nargs="*",
-        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE] | lens PICTURES",
+        metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE]",
         help="PIPELINE: calibrate the sensor of this pipeline (default: ./pipeline.yaml, else the packaged "
         "one). check: test how well a calibration still fits. force: fit the force, and add it to a "
-        "calibration. lens: print undistort and homography for preprocess, from pictures of a printed target",
+        "calibration",
     )
     option(
         "--source",
@@ -88,7 +86,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_sensor(parser)
     option("--out", type=Path, metavar="FILE", help="default: calibration/SENSOR.yaml")
     option("--realtime", action="store_true", help="play a recording at its own pace, like a camera")
-    option("--fresh", action="store_true", help="discard the presses of an interrupted session")
     add_overwrite(parser)
     option(
         "--pitch",
@@ -184,10 +181,8 @@ def run(args: argparse.Namespace) -> int:
     TactflowError
         If options are wrong, or the recording gives no calibration.
     """
-    verb, *words = args.what if args.what[:1] in (["check"], ["force"], ["lens"]) else ["make", *args.what]
+    verb, *words = args.what if args.what[:1] in (["check"], ["force"]) else ["make", *args.what]
     with notes():
-        if verb == "lens":
-            return _print_lens(args, words)
         if verb == "make":
             if len(words) > 1:
                 raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
@@ -210,30 +205,11 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
     refuse_output("--out", out, overwrite=args.overwrite, suffixes=(".yaml",))
-    _instruct(args, args.ball_radius, "; finished presses are kept")
-    kept = KeptPresses(out.with_suffix(".presses"))
-    if args.fresh:
-        kept.clear()
+    _instruct(args, args.ball_radius)
     guide = Guide(args.presses, say)
     page = _page(args, pipeline, guide) if args.view else {}
-    if args.ball_radius is None:
-        session = _find_presses(loaded, None, page=page)
-    else:
-        session = _find_presses(loaded, guide, kept, page)
-    try:
-        calibration = _learned(args, loaded, session, base)
-    except ConfigError as error:
-        if not kept.presses:
-            raise
-        raise ConfigError(
-            f"{error}. {len(kept.presses)} presses are kept in {kept.folder}: run the command again to "
-            "continue, or with --fresh to start over"
-        ) from None
-    calibration.save(out)
-    if args.ball_radius is not None and len(kept.presses) >= args.presses:
-        kept.clear()
-    elif kept.presses:
-        say(f"to continue to {args.presses} presses, run the command again with --overwrite")
+    session = _find_presses(loaded, None if args.ball_radius is None else guide, page)
+    _learned(args, loaded, session, base).save(out)
     say(
         f"{out} is written. To use it, add to the pipeline file: calibration: {out}\n"
         f"or to the command: {typed('--set', f'calibration={out}')}"
@@ -479,40 +455,6 @@ def _quality(part: LinearForceEntry, left_out: str) -> str:
     )
 
 
-def _print_lens(args: argparse.Namespace, words: Sequence[str]) -> int:
-    """Print `undistort` and `homography` for a pipeline file."""
-    if len(words) != 1:
-        raise ConfigError("calibrate lens: required one folder, pattern or video with pictures of the target")
-    printed = _target(args)
-    reader = open_source(words[0])
-    try:
-        views, size = [], (0, 0)
-        for image, *_ in iter(reader.read, None):
-            size = (image.shape[1], image.shape[0])
-            if (points := target.find_target(image, printed)) is not None:
-                views.append(points)
-        if not views:
-            raise ConfigError(_not_shown(printed, words[0]))
-        fit = target.fit_lens(views, printed, size)
-    except ValueError as problem:
-        raise ConfigError(f"calibrate {problem}") from None
-    finally:
-        reader.close()
-    say(
-        f"{len(views)} pictures: {fit.rms:.2f} px RMS; focal lengths to {fit.stderr[0]:.1f} and "
-        f"{fit.stderr[1]:.1f} px, centre to {fit.stderr[2]:.1f} and {fit.stderr[3]:.1f} px. For the "
-        "parameters of preprocess:"
-    )
-    undistort = {
-        "camera_matrix": np.round(fit.lens.camera_matrix, 3).tolist(),
-        "distortion": np.round(fit.lens.distortion, 6).tolist(),
-    }
-    corners, places = (np.round(part, 2).tolist() for part in (fit.corners, fit.places))
-    homography = {"from": corners, "to": places, "size": list(fit.size)}
-    print(yaml.safe_dump({"undistort": undistort, "homography": homography}, default_flow_style=None), end="")
-    return 0
-
-
 def _scale(args: argparse.Namespace, session: Session, base: Calibration | None) -> tuple[Scale, str]:
     """Millimetres per pixel, and how they were found. base : to take it from where no option tells it."""
     width, height = session.mapping.size
@@ -564,7 +506,7 @@ def _target_scale(args: argparse.Namespace, mapping: PixelMapping) -> Scale:
     if bent > target.BENT:
         say(
             f"the target is off a plane grid by {100 * bent:.1f} % of its pitch: one scale is not right for "
-            "all of the picture; give preprocess the undistort and homography of `tactflow calibrate lens`"
+            "all of the picture; set undistort and homography of preprocess by the distortion of the lens"
         )
     return scale
 
@@ -617,12 +559,11 @@ def _watch(pipeline: Pipeline, calibration: Path) -> force.Watched:
 def _find_presses(
     pipeline: Pipeline,
     guide: Guide | None,
-    kept: KeptPresses | None = None,
     page: Mapping[str, Node] = MappingProxyType({}),
 ) -> Session:
     """The presses that a source shows; of a live one until there are enough.
 
-    guide : None if the untouched gel is enough. kept : has the presses so far of a live session.
+    guide : None if the untouched gel is enough. page : sinks that show the session.
     """
     finder = PressFinder()
     enough = guide is None
@@ -631,12 +572,8 @@ def _find_presses(
         nonlocal enough
         live = runner.source is not None and runner.source.live
         finder.pictures = runner.source is not None and runner.source.pictures
-        if live and kept is not None and not finder.frames:
-            finder.presses[:] = kept.presses
         finder.add(result)
         enough = (guide is not None and guide(finder)) or enough
-        if live and kept is not None:
-            kept.update(finder)
         # All frames of the reference count, however many presses there are.
         if enough and live and not result.frame.reference:
             runner.stop()
@@ -650,15 +587,15 @@ def _read(file: Path, offset: float) -> Reference:
     return reference if reference.by_frame else replace(reference, time=reference.time + offset)
 
 
-def _instruct(args: argparse.Namespace, ball_radius: float | None, ended: str = "") -> None:
-    """Print instructions. ball_radius : mm; None without a ball. ended : what Ctrl-C does."""
+def _instruct(args: argparse.Namespace, ball_radius: float | None) -> None:
+    """Print instructions. ball_radius : mm; None without a ball."""
     if ball_radius is None:
         say("Leave the gel untouched.")
         return
     number = "One press" if args.presses == 1 else f"{args.presses} presses"
     say(
         "Leave the gel untouched at first. Then press the ball, lift it, and press it somewhere else, all "
-        f"over the gel and to several depths. {number} are enough; Ctrl-C ends earlier{ended}."
+        f"over the gel and to several depths. {number} are enough; Ctrl-C ends earlier."
     )
 
 

@@ -21,7 +21,7 @@ class Guide:
     def __init__(self, wanted: int, say: Callable[[str], None]) -> None:
         self._wanted = wanted
         self._say = say
-        self._reported: int | None = None
+        self._reported = 0
         self._undos: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._shown = (0, False)
         self.state: Mapping[str, Any] = progress([], False, wanted)
@@ -34,10 +34,6 @@ class Guide:
         """Report new presses; returns whether there are enough."""
         presses = finder.presses
         over = len(presses) - finder.lasts
-        if self._reported is None:
-            self._reported = over
-            if over:
-                self._say(f"saved presses so far: {over}")
         for number in range(self._reported, over):
             self._report(finder, number)
         self._reported = over

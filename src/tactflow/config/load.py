@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from tactflow.calibration.stored import KINDS, kinds
+from tactflow.calibration import KINDS, kinds
 from tactflow.config import sensors, wiring
 from tactflow.config.document import Document, described, dotted, read_document
 from tactflow.config.files_used import file_id, files_named, files_written
