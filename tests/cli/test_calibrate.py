@@ -94,30 +94,6 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert "no presses today: to check the depth" in capsys.readouterr().out
 
 
-def test_a_printed_target_gives_the_scale(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    squares = np.add.outer(np.arange(600) // 60, np.arange(800) // 60) % 2
-    board = np.full((600, 800, 3), 200, np.uint8)
-    board[60:420, 60:540] -= np.uint8(150) * squares[60:420, 60:540, None].astype(np.uint8)
-    cv2.imwrite("board.png", board)
-    words = ["--from", "sim:idle?frames=3", "--target", "board.png", "--pitch", "3"]
-    for grid, message in (
-        (["--grid", "9x6"], "board.png does not show 9 x 6 inner corners"),
-        (["--grid", "seven"], "required COLUMNSxROWS"),
-        (["--grid", "2x5"], "3 columns and rows or more"),
-        ([], "needs --grid COLUMNSxROWS and --pitch MM"),
-    ):
-        assert calibrate(*words, *grid) == 2
-        assert message in capsys.readouterr().err
-    assert calibrate(*words, "--grid", "5x7") == 0
-    stored = yaml.safe_load(Path("calibration/main.yaml").read_text())["scale"]
-    # 60 raw pixels are 30 processed ones.
-    assert stored["mm_per_pixel"] == pytest.approx([0.1, 0.1], rel=2e-3)
-    assert stored["found_by"] == "target of 5x7, pitch of 3 mm"
-
-
 @pytest.mark.parametrize(("rows_apart", "warned"), [(30, False), (28, True)])
 def test_a_scale_from_dots_in_no_square_grid_is_told(
     rows_apart: int,

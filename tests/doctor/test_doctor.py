@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -136,32 +135,4 @@ def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
     (focus,) = [check for check in report["checks"] if check["name"] == "focus"]
     assert (focus["verdict"], focus["unit"]) == ("fault", "px")
     assert focus["says"] in table
-
-
-def test_the_file_for_a_bug_report_has_a_picture_only_if_asked_and_no_secrets(tmp_path: Path) -> None:
-    pipeline, report = tmp_path / "mine.yaml", tmp_path / "report.json"
-    pipeline.write_text(
-        "stages: {capture: {source: rtsp://me:password@camera/1}}\nsinks: {view: {token: abcdefgh}}"
-    )
-    command = [
-        "doctor",
-        "--source",
-        "sim:press?frames=4",
-        "--pipeline",
-        str(pipeline),
-        "--report",
-        str(report),
-    ]
-    main(command)
-    written = json.loads(report.read_text())
-    assert written["frames"]["count"] == 4
-    assert {check["name"] for check in written["checks"]} >= {"rate", "focus", "dots"}
-    assert written["versions"]["python"]
-    assert "rtsp://camera/..." in written["pipeline"]
-    assert not any(secret in report.read_text() for secret in ("password", "abcdefgh"))
-    assert written["picture"] is None
-    main([*command, "--picture"])
-    png = np.frombuffer(base64.b64decode(json.loads(report.read_text())["picture"]), np.uint8)
-    first = cv2.imdecode(png, cv2.IMREAD_COLOR)
-    assert first is not None
-    assert np.array_equal(first, open_scene("press").frame(0))
+    assert report["versions"]["python"]

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactflow.api import Settings, ended_by_signals, load, make_runner
-from tactflow.calibration import force, presses, target
+from tactflow.calibration import force, presses
 from tactflow.calibration.darkness import darkness_error, fit_darkness
 from tactflow.calibration.file import (
     UNLIKE,
@@ -40,12 +40,10 @@ from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.run import Runner
 from tactflow.message.result import Result
-from tactflow.sources import open_source
 from tactflow.system.arguments import number, positive
 from tactflow.system.signals import INTERRUPTED, Interrupted
 from tactflow.system.terminal import notes, say, show, typed
 from tactflow.view.guided import Guiding
-from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
@@ -91,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pitch",
         type=_millimetres,
         metavar="MM",
-        help="spacing of the gel's dots, which form a square grid, or of the target's",
+        help="spacing of the gel's dots, which form a square grid",
     )
     option(
         "--area",
@@ -115,7 +113,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     option("--view", action="store_true", help="show the live page, which says where to press next")
     _add_kind(parser)
-    _add_target_and_force(parser)
+    _add_force_options(parser)
 
 
 def _add_kind(parser: argparse.ArgumentParser) -> None:
@@ -125,8 +123,8 @@ def _add_kind(parser: argparse.ArgumentParser) -> None:
         "--refine",
         action="store_true",
         help="start from the pipeline's calibration, such as the default of a kind of sensor, and adapt it "
-        "to this sensor by one or more presses of the ball; the scale is kept unless --pitch, --area or "
-        "--target is given",
+        "to this sensor by one or more presses of the ball; the scale is kept unless --pitch or --area is "
+        "given",
     )
     option(
         "--darkness",
@@ -142,21 +140,9 @@ def _add_kind(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_target_and_force(parser: argparse.ArgumentParser) -> None:
-    """Declare the options about a printed target, and those of `calibrate force`."""
+def _add_force_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `calibrate force`."""
     option = parser.add_argument
-    option(
-        "--target",
-        metavar="PICTURE",
-        help="take the scale from this raw picture of a printed target in the plane of the gel; it has the "
-        "size of --grid and --pitch",
-    )
-    option(
-        "--grid",
-        metavar="COLUMNSxROWS",
-        help="size of the target: inner corners of the checkerboard, or dots with --dots",
-    )
-    option("--dots", action="store_true", help="the target is a grid of dots")
     option(
         "--csv",
         type=Path,
@@ -252,11 +238,11 @@ def _learned(
         f"{scale.y:.5f} +- {scale.stderr[1]:.5f} in y"
     )
     error = max(scale.stderr[0] / scale.x, scale.stderr[1] / scale.y)
-    if args.pitch is not None and args.target is None and error > LOOSE:
+    if args.pitch is not None and error > LOOSE:
         say(
             f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid, and either "
             "these form none or the picture is stretched. Use --area WIDTH HEIGHT, the size of the whole "
-            "processed picture, or --target, a printed grid"
+            "processed picture"
         )
     learned: dict[str, Any] = {}
     if args.ball_radius is not None:
@@ -461,8 +447,6 @@ def _scale(args: argparse.Namespace, session: Session, base: Calibration | None)
     try:
         if base is not None and args.pitch is None and args.area is None:
             return base.scale_at((width, height)), base.scale_entry.found_by
-        if args.target is not None:
-            return _target_scale(args, session.mapping), f"target of {args.grid}, pitch of {args.pitch:g} mm"
         if args.pitch is not None:
             scale = scale_from_pitch(session.dots, args.pitch, (width, height))
             return scale, f"pitch of {args.pitch:g} mm"
@@ -470,54 +454,6 @@ def _scale(args: argparse.Namespace, session: Session, base: Calibration | None)
         return scale, f"area of {args.area[0]:g} x {args.area[1]:g} mm"
     except ValueError as problem:
         raise ConfigError(f"calibrate: {problem}") from None
-
-
-def _target(args: argparse.Namespace) -> target.Target:
-    """The target that the options describe."""
-    if args.grid is None or args.pitch is None:
-        raise ConfigError("calibrate: a target needs --grid COLUMNSxROWS and --pitch MM")
-    columns, _, rows = str(args.grid).lower().partition("x")
-    if not (columns.isdecimal() and rows.isdecimal()):
-        raise ConfigError(f"--grid: required COLUMNSxROWS, as in 9x6, got {args.grid}")
-    return target.Target(int(columns), int(rows), args.pitch, args.dots)
-
-
-def _target_scale(args: argparse.Namespace, mapping: PixelMapping) -> Scale:
-    """Scale from `--target`. mapping : from raw to processed pixels, by the pipeline's preprocess."""
-    printed = _target(args)
-    reader = open_source(args.target)
-    try:
-        shown = reader.read()
-    finally:
-        reader.close()
-    if shown is None:
-        raise ConfigError(_not_shown(printed, args.target))
-    image, *_ = shown
-    size = (image.shape[1], image.shape[0])
-    if size != mapping.raw_size:
-        raise ConfigError(
-            f"calibrate: {args.target} has {size[0]} x {size[1]} px, required "
-            f"{mapping.raw_size[0]} x {mapping.raw_size[1]} as the frames of the sensor"
-        )
-    points = target.find_target(image, printed)
-    if points is None:
-        raise ConfigError(_not_shown(printed, args.target))
-    scale, bent = target.scale_from_target(mapping.to_processed(points), printed, mapping.size)
-    if bent > target.BENT:
-        say(
-            f"the target is off a plane grid by {100 * bent:.1f} % of its pitch: one scale is not right for "
-            "all of the picture; set undistort and homography of preprocess by the distortion of the lens"
-        )
-    return scale
-
-
-def _not_shown(printed: target.Target, source: str) -> str:
-    kind = "dots" if printed.dots else "inner corners of a checkerboard"
-    counted = "dots" if printed.dots else "corners between four squares"
-    return (
-        f"calibrate: {source} does not show {printed.columns} x {printed.rows} {kind}; all of the target "
-        f"must be in the picture, and --grid counts {counted}"
-    )
 
 
 def _run(
