@@ -123,6 +123,9 @@ def test_the_command_learns_it_and_the_pipeline_has_depth(
     assert np.corrcoef(measured, true)[0, 1] > 0.97
     check = ["calibrate", "check", "calibration/main.yaml", "markerless", "--source", f"sim:{spec}"]
     assert main(check) == 0
-    assert "mm fits\nit still fits" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "mm RMS off" in output
+    assert output.endswith("it still fits\n")
     dimmer = ["--source", "sim:ball?frames=40&light=bright&markers=none"]
     assert main([*check[:-2], *dimmer]) == 3
+    assert "mm RMS fit; few presses, a ball whose radius is not 2.375 mm" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -10,11 +11,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-import numpy as np
-
 from tactflow.api import Settings, ended_by_signals, load, make_runner
 from tactflow.calibration import force, presses
-from tactflow.calibration.darkness import darkness_error, fit_darkness
+from tactflow.calibration.darkness import Darkness, darkness_error, fit_darkness
 from tactflow.calibration.file import (
     UNLIKE,
     Calibration,
@@ -26,14 +25,14 @@ from tactflow.calibration.file import (
     raw_corners,
     small_picture,
 )
+from tactflow.calibration.guide import Guide
 from tactflow.calibration.judgement import doubt
-from tactflow.calibration.photometric import fit_photometry
+from tactflow.calibration.photometric import Photometry, fit_photometry
 from tactflow.calibration.presses import PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
 from tactflow.calibration.refine import apparent_radius, refine_photometry
 from tactflow.calibration.samples import press_errors, summary
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
-from tactflow.cli.guide import Guide
 from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
 from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError, TactflowError
@@ -51,12 +50,10 @@ WORSE: Final = 1.5
 LOOSE: Final = 0.02
 """Relative error of a scale by pitch above which a better method is advised: grids of the simulator have less
 than 0.01, the rings of a TacTip 0.1 to 0.15."""
-ENOUGH: Final = 30
-"""Presses after which a live session ends by itself."""
-ENOUGH_TO_REFINE: Final = 9
-"""The same with --refine: the errors on two Minis are then those of a calibration of their own."""
-ENOUGH_OF_DARKNESS: Final = 1
-"""The same with --darkness: one curve holds all over the gel."""
+ENOUGH: Final = {"slopes": 30, "refine": 9, "darkness": 1}
+"""Presses after which a live session ends by itself, by what is learned from them. With 9, the errors of a
+refined default on two Minis are those of a calibration of their own; one curve of darkness holds all over the
+gel."""
 # Gels and balls have 1 to 100.
 _millimetres = number(float, 1e-3, 1e4, "millimetres from 0.001 to 10000")
 
@@ -108,8 +105,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--presses",
         type=positive,
         metavar="N",
-        help=f"end a live session after N presses ({ENOUGH}; with --refine {ENOUGH_TO_REFINE}, "
-        f"with --darkness, or to check such a file, {ENOUGH_OF_DARKNESS})",
+        help=f"end a live session after N presses ({ENOUGH['slopes']}; with --refine {ENOUGH['refine']}, "
+        f"with --darkness, or to check such a file, {ENOUGH['darkness']})",
     )
     option("--view", action="store_true", help="show the live page, which says where to press next")
     _add_kind(parser)
@@ -185,8 +182,7 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
     if args.darkness and (args.refine or args.kind or args.ball_radius is None):
         raise ConfigError("calibrate --darkness: required --ball-radius MM, and neither --refine nor --kind")
-    enough = ENOUGH_OF_DARKNESS if args.darkness else ENOUGH_TO_REFINE if args.refine else ENOUGH
-    args.presses = args.presses or enough
+    args.presses = args.presses or ENOUGH[_way(args)]
     base = _base(args, pipeline)
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
@@ -201,6 +197,11 @@ def _make(args: argparse.Namespace, pipeline: str | None) -> int:
         f"or to the command: {typed('--set', f'calibration={out}')}"
     )
     return 0
+
+
+def _way(args: argparse.Namespace) -> str:
+    """How depth is learned, a key of `ENOUGH`."""
+    return "darkness" if args.darkness else "refine" if args.refine else "slopes"
 
 
 def _base(args: argparse.Namespace, pipeline: str | None) -> Calibration | None:
@@ -247,8 +248,7 @@ def _learned(
     learned: dict[str, Any] = {}
     if args.ball_radius is not None:
         say(f"{len(session.presses)} presses; learning from them ...")
-        learn = _darkness if args.darkness else _slopes
-        learned = learn(args, session, scale, base)
+        learned = _depth(args, session, scale, base)
     calibration = Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
@@ -262,49 +262,38 @@ def _learned(
     return calibration if args.kind is None else calibration.for_kind(args.kind)
 
 
-def _slopes(
+def _depth(
     args: argparse.Namespace, session: Session, scale: Scale, base: Calibration | None
 ) -> dict[str, Any]:
-    """The fit of the slopes, as fields of `Calibration`."""
-    apparent = None
-    if base is not None and base.slopes is not None:
-        apparent = apparent_radius(session, scale, args.ball_radius, base)
-    if args.refine:
-        assert base is not None
-        fitted = refine_photometry(session, scale, args.ball_radius, base)
+    """The fit of the depth, as fields of `Calibration`. base : of the pipeline, or None."""
+    radius, apparent = args.ball_radius, None
+    fitted: Darkness | Photometry
+    if args.darkness:
+        fitted = fit_darkness(session, scale, radius)
+        fields: dict[str, Any] = {"darkness": fitted.found}
+        words, rejected = _darkness_words(fitted.found), "too small, or larger than the ball"
     else:
-        fitted = fit_photometry(session, scale, args.ball_radius)
-    if (question := doubt(session, scale, args.ball_radius, apparent)) is not None:
+        if base is not None and base.slopes is not None:
+            apparent = apparent_radius(session, scale, radius, base)
+        if args.refine and base is not None:
+            fitted = refine_photometry(session, scale, radius, base)
+        else:
+            fitted = fit_photometry(session, scale, radius)
+        fields = {"photometric": fitted.found, "slopes": fitted.model, "information": fitted.information}
+        words, rejected = _photometric_words(fitted.found.model_dump()), "{:.0f} degrees off a ball's surface"
+    if (question := doubt(session, scale, radius, apparent)) is not None:
         say(question)
     for press, kept, misfit in zip(session.presses, fitted.kept, fitted.misfit, strict=True):
         if not kept:
-            say(f"the press of frame {press.seq} is left out: {misfit:.0f} degrees off the surface of a ball")
-    say(_photometric_words(fitted.found.model_dump()))
-    return {"photometric": fitted.found, "slopes": fitted.model, "information": fitted.information}
-
-
-def _darkness(
-    args: argparse.Namespace, session: Session, scale: Scale, _: Calibration | None
-) -> dict[str, Any]:
-    """The fit of the darkening, as fields of `Calibration`."""
-    fitted = fit_darkness(session, scale, args.ball_radius)
-    if (question := doubt(session, scale, args.ball_radius)) is not None:
-        say(question)
-    for press, kept in zip(session.presses, fitted.kept, strict=True):
-        if not kept:
-            say(f"the press of frame {press.seq} is left out: too small, or larger than the ball")
-    found = fitted.found
-    say(
-        f"depth up to {found.depth[-1]:.2f} mm, where the gel is {100 * found.darkening[-1]:.0f} % darker; "
-        f"standard error {found.stderr:.3f} mm"
-    )
-    return {"darkness": found}
+            say(f"the press of frame {press.seq} is left out: {rejected.format(misfit)}")
+    say(words)
+    return fields
 
 
 def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     calibration = Calibration.load(path)
-    then, pressed = calibration.photometric, calibration.photometric or calibration.darkness
-    args.presses = args.presses or (ENOUGH if then is not None else ENOUGH_OF_DARKNESS)
+    pressed = calibration.photometric or calibration.darkness
+    args.presses = args.presses or ENOUGH["slopes" if calibration.darkness is None else "darkness"]
     _instruct(args, None if pressed is None else pressed.ball_radius)
     guide = None if pressed is None else Guide(args.presses, say)
     session = _find_presses(_load(args, pipeline), guide)
@@ -318,10 +307,8 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     fits = [unlike <= UNLIKE]
     if unlike > UNLIKE:
         show(["another sensor or light, or an object on the gel at the start, also make it differ"])
-    if then is not None:
-        fits.append(_check_presses(calibration, then, session))
-    elif calibration.darkness is not None:
-        fits.append(_check_darkness(calibration, calibration.darkness, session))
+    if pressed is not None:
+        fits.append(_check_depth(calibration, pressed, session))
     if args.csv is not None:
         fits.append(_check_force(args, path, calibration.force, pipeline))
     show(
@@ -330,37 +317,26 @@ def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
     return 0 if all(fits) else 3
 
 
-def _check_presses(calibration: Calibration, then: PhotometricEntry, session: Session) -> bool:
+def _check_depth(calibration: Calibration, then: PhotometricEntry | DarknessEntry, session: Session) -> bool:
     """Print how well a calibration fits the presses of today; True where there are none."""
-    count, radius = len(session.presses), f"{then.ball_radius:g} mm"
-    if calibration.slopes is None or not count:
-        show(
-            [f"no presses today: to check the depth, show the untouched gel, then a ball of radius {radius}"]
-        )
-        return True
-    now = summary(press_errors(session, calibration.slopes, calibration.scale, then.ball_radius))
-    limit = WORSE * then.normal_error
-    show([f"presses today, {count}: {_photometric_words(now)}"])
-    show([f"when it was made: {_photometric_words(then.model_dump())}"])
-    if now["normal_error"] > limit:
-        others = f"few presses, a ball whose radius is not {radius}, or no untouched gel at first"
-        show([f"normals up to {limit:.1f} degrees off fit; {others} also give larger errors"])
-    return now["normal_error"] <= limit
-
-
-def _check_darkness(calibration: Calibration, then: DarknessEntry, session: Session) -> bool:
-    """Print how well the depth by darkening fits the presses of today; True where there are none."""
-    radius = f"{then.ball_radius:g} mm"
+    radius, scale = f"{then.ball_radius:g} mm", calibration.scale
     if not session.presses:
-        show([f"no presses today: to check the depth, press a ball of radius {radius} on the gel"])
+        show([f"no presses today: to check the depth, press a ball of radius {radius} on the untouched gel"])
         return True
-    now, limit = darkness_error(session, then, calibration.scale), WORSE * then.stderr
-    if not np.isfinite(now):
-        count = len(session.presses)
-        show([f"none of the {count} presses today can be used: press a ball of radius {radius}"])
-        return False
-    show([f"presses today, {len(session.presses)}: depth {now:.3f} mm RMS off; up to {limit:.3f} mm fits"])
-    return now <= limit
+    if isinstance(then, DarknessEntry):
+        error, limit, unit = darkness_error(session, then, scale), WORSE * then.stderr, "mm RMS"
+        now_words = f"depth {error:.3f} mm RMS off" if math.isfinite(error) else "none can be used"
+        words = now_words, _darkness_words(then)
+    else:
+        assert calibration.slopes is not None
+        now = summary(press_errors(session, calibration.slopes, scale, then.ball_radius))
+        error, limit, unit = now["normal_error"], WORSE * then.normal_error, "degrees"
+        words = _photometric_words(now), _photometric_words(then.model_dump())
+    show([f"presses today, {len(session.presses)}: {words[0]}", f"when it was made: {words[1]}"])
+    if error > limit:
+        others = f"few presses, a ball whose radius is not {radius}, or no untouched gel at first"
+        show([f"up to {limit:.2g} {unit} fit; {others} also give larger errors"])
+    return error <= limit
 
 
 def _check_force(
@@ -555,6 +531,13 @@ def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[
             component = replace(node.component, cls=node.component.cls.through(guide))
             return {node.id: replace(node, component=component)}
     raise AssertionError("the sink view guides")
+
+
+def _darkness_words(found: DarknessEntry) -> str:
+    return (
+        f"depth up to {found.depth[-1]:.2f} mm, where the gel is {100 * found.darkening[-1]:.0f} % darker; "
+        f"standard error {found.stderr:.3f} mm"
+    )
 
 
 def _photometric_words(errors: dict[str, float]) -> str:
