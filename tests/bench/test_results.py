@@ -1,12 +1,7 @@
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
-
 from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.results import BenchResult, load_errors, regressions
-from tactflow.engine.errors import ConfigError
+from tactflow.bench.results import BenchResult, regressions
 
 
 def run(scene: str = "press", quick: bool = True, **errors: float) -> BenchResult:
@@ -35,11 +30,3 @@ def test_a_quantity_that_is_no_longer_measured_is_a_regression_unless_its_scene_
     assert line.endswith("no longer measured")
     assert len(worse(run(scene="cable", displacement_rms=0.02), stored)) == 1
     assert worse(run(scene="cable", displacement_rms=0.02), stored, {"cable"}) == []
-
-
-@pytest.mark.parametrize("text", ["", "[1]", '{"schema": "other/1"}', '{"schema": "tactflow.bench/3"}'])
-def test_a_file_that_is_not_a_result_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "x.json"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=r"x\.json"):
-        load_errors(path, quick=True)

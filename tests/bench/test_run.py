@@ -62,6 +62,8 @@ def test_a_gel_without_markers_is_measured_without_a_tracker(case: Case, tmp_pat
     ("arguments", "message"),
     [
         (["--against", "nothing.json"], "cannot be read"),
+        (["--against", "other.json"], "not a result of `tactflow bench`"),
+        (["--against", __file__], "not JSON"),
         (["--json", f"{__file__}/x.json"], "test_run.py is not a folder"),
         (["nothing.yaml"], "no such pipeline"),
         (["--scene", "nowhere"], "nowhere"),
@@ -75,6 +77,7 @@ def test_mistakes_are_refused_before_anything_is_measured(
     tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("other.json").write_text('{"schema": "other/1"}')
     assert main(["bench", "--quick", *arguments]) == 2
     assert message in capsys.readouterr().err
 
