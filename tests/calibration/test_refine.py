@@ -95,7 +95,7 @@ def test_stated_errors_after_one_press_hold_on_the_others(base: Calibration, oth
 
 def test_presses_that_are_no_ball_are_refused(base: Calibration, other: Session) -> None:
     swapped = [replace(p, image=np.ascontiguousarray(p.image[..., ::-1])) for p in other.presses]
-    with pytest.raises(ConfigError, match="what presses is no ball, nothing touches the gel"):
+    with pytest.raises(ConfigError, match="the object is not a ball, nothing touches the gel"):
         refine_photometry(replace(other, presses=swapped[:3]), SCALE, BALL, base)
     noise = np.random.default_rng(0)
     idle = [
@@ -178,5 +178,5 @@ def test_edges_of_a_cube_are_refused_as_presses_of_a_ball(
     words = ["calibrate", "mini_plain", "--from", str(source), "--ball-radius", "3"]
     for how in (["--refine"], ["--area", "20.3", "15.2"]):
         assert main([*words, *how]) == 2
-        assert "what presses is no ball" in capsys.readouterr().err
+        assert "the object is not a ball" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.yaml"))

@@ -217,7 +217,7 @@ def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_picture
     assert found["photometric"]["depth_stderr"] < 0.8 * kind["photometric"]["depth_stderr"]
 
     assert calibrate(*refine, "--ball-radius", "4.75", "--overwrite") == 0
-    assert "is 4.75 mm the radius of the ball, and not its diameter" in capsys.readouterr().err
+    assert "is 4.75 mm the radius of this ball, and not its diameter" in capsys.readouterr().err
     Path("left.yaml").write_text(REFINED.replace("rotate: 90", "rotate: 270"))
     assert calibrate(*refine, *ball, "--overwrite") == 2
     assert "does not fit: the frames are turned" in capsys.readouterr().err

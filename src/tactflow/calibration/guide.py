@@ -15,13 +15,13 @@ ROUND: Final = 1.7
 """Longer over shorter axis of a contact above which it is not a ball's. Chosen by hand: presses of a ball on
 a real gel (mini_ball) reach 1.57."""
 PARTS: Final = 3
-"""Columns and rows of parts of the gel that should each have presses. Chosen by hand."""
+"""The gel is divided into so many columns and rows of parts, each of which needs presses. Chosen by hand."""
 _ROWS: Final = ("upper", "middle", "lower")
 _COLUMNS: Final = ("left", "centre", "right")
 _FIRST: Final = ((1, 1), (0, 0), (2, 2), (0, 2), (2, 0), (0, 1), (2, 1), (1, 0), (1, 2))
 """The parts in the order in which they are asked for."""
 _DEPTHS: Final = ("firmly", "lightly", "half as deep")
-"""How to press after zero, one, two presses at a place: a calibration wants several depths."""
+"""How to press after zero, one, two presses in a part: a calibration needs several depths."""
 
 
 def fault(press: Press, usual: float) -> str | None:
@@ -55,7 +55,7 @@ def part(press: Press) -> tuple[int, int]:
 
 
 def part_name(row: int, column: int) -> str:
-    """What a part of the gel is called.
+    """The name of a part of the gel.
 
     >>> part_name(0, 2)
     'upper right'

@@ -241,9 +241,8 @@ def _learned(
     error = max(scale.stderr[0] / scale.x, scale.stderr[1] / scale.y)
     if args.pitch is not None and error > LOOSE:
         say(
-            f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid, and either "
-            "these form none or the picture is stretched. Use --area WIDTH HEIGHT, the size of the whole "
-            "processed picture"
+            f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid; either these are "
+            "in none, or the picture is stretched. Use --area WIDTH HEIGHT, the size of the whole picture"
         )
     learned: dict[str, Any] = {}
     if args.ball_radius is not None:
@@ -342,7 +341,7 @@ def _check_depth(calibration: Calibration, then: PhotometricEntry | DarknessEntr
 def _check_force(
     args: argparse.Namespace, path: Path, entry: ForceEntry | None, pipeline: str | None
 ) -> bool:
-    """Print the error of a calibration's force today; whether it is still small enough."""
+    """Print today's error of the force; returns whether it is still small enough."""
     if entry is None:
         raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
     watched = _watch(_load(args, pipeline), path)
@@ -418,7 +417,8 @@ def _quality(part: LinearForceEntry, left_out: str) -> str:
 
 
 def _scale(args: argparse.Namespace, session: Session, base: Calibration | None) -> tuple[Scale, str]:
-    """Millimetres per pixel, and how they were found. base : to take it from where no option tells it."""
+    """Millimetres per pixel, and how they were found. base : its scale is kept unless an
+    option gives another."""
     width, height = session.mapping.size
     try:
         if base is not None and args.pitch is None and args.area is None:

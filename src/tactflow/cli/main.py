@@ -31,7 +31,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "warmup": ("pipelines", "compile what `run` would compile on its first use"),
     "batch": ("batch", "run a pipeline over many recordings; a second call does what is missing"),
     "record": ("run", "run a pipeline and record its frames and results"),
-    "export": ("recordings", "make a dataset from recordings: LeRobot, Diffusion Policy"),
+    "export": ("recordings", "make a dataset from recordings: HDF5, Zarr, LeRobot and others"),
     "repair": ("recordings", "copy what is intact in a damaged or unfinished recording, with an index"),
     "calibrate": ("calibrate", "make a sensor's calibration file, or check whether it still fits"),
     "detect": ("detect", "find the dots of a gel, and show what was found and why in one picture"),

@@ -1,4 +1,4 @@
-"""Options that several commands share, the types of their values, and how they are read."""
+"""Options that several commands share, and how they are read."""
 
 from __future__ import annotations
 
