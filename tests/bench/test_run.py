@@ -16,6 +16,7 @@ from tactflow.bench.timing import CopyUnit
 from tactflow.cli.bench import packaged_files
 from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
+from tests.terminal import Terminal
 
 # The run takes a minute on a quiet machine, twenty on one with a lot of other work.
 pytestmark = pytest.mark.timeout(3600)
@@ -70,32 +71,24 @@ def test_a_gel_without_markers_is_measured_without_a_tracker(case: Case, tmp_pat
     ],
 )
 def test_mistakes_are_refused_before_anything_is_measured(
-    arguments: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    arguments: list[str], message: str, terminal: Terminal
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     Path("other.json").write_text('{"schema": "other/1"}')
-    assert main(["bench", "--quick", *arguments]) == 2
-    assert message in capsys.readouterr().err
+    assert terminal("bench", "--quick", *arguments) == 2
+    assert message in terminal.err
 
 
-def test_the_command_fails_when_an_error_grew(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_command_fails_when_an_error_grew(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     def measured(*_: Any, **__: Any) -> BenchResult:
         result = BenchResult(quick=True, copy_ms=0.1)
         result.add("pipeline", "default", "press", {"displacement_rms": next(errors)}, frames=1)
         return result
 
     errors = iter((0.01, 0.01, 0.1))
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tactflow.cli.bench.run_bench", measured)
-    assert main(["bench", "--quick", "--json", "b.json"]) == 0
-    assert "### Whole pipelines" in capsys.readouterr().out
-    assert main(["bench", "--quick", "--json", "c.json", "--against", "b.json"]) == 0
-    assert "no error has increased" in capsys.readouterr().err
-    assert main(["bench", "--quick", "--json", "c.json", "--against", "b.json"]) == 3
-    assert "pipeline/default/press: marker displacement error" in capsys.readouterr().err
+    assert terminal("bench", "--quick", "--json", "b.json") == 0
+    assert "### Whole pipelines" in terminal.out
+    assert terminal("bench", "--quick", "--json", "c.json", "--against", "b.json") == 0
+    assert "no error has increased" in terminal.err
+    assert terminal("bench", "--quick", "--json", "c.json", "--against", "b.json") == 3
+    assert "pipeline/default/press: marker displacement error" in terminal.err

@@ -17,12 +17,12 @@ from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Session
 from tactflow.calibration.refine import apparent_radius, refine_photometry
 from tactflow.calibration.samples import press_errors, summary
-from tactflow.cli.main import main
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 from tactflow.sim.light import LIGHTS
 from tactflow.vision.depth.slopes import SlopeModel
 from tests.calibration.ball_presses import BALL, scale, session_of
+from tests.terminal import Terminal
 
 SCALE = scale()
 
@@ -169,14 +169,13 @@ def test_another_mini_has_depth_by_the_default_and_says_once_that_it_is_one(
 
 
 def test_edges_of_a_cube_are_refused_as_presses_of_a_ball(
-    shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    shared_data: Path, tmp_path: Path, terminal: Terminal
 ) -> None:
     folder = shared_data / "gels" / "mini_box"
     names = sorted(path.name for path in folder.glob("*.png"))
     source = pictures_of(folder, names[0], names[1:], tmp_path / "presses")
-    monkeypatch.chdir(tmp_path)
     words = ["calibrate", "mini_plain", "--from", str(source), "--ball-radius", "3"]
     for how in (["--refine"], ["--area", "20.3", "15.2"]):
-        assert main([*words, *how]) == 2
-        assert "the object is not a ball" in capsys.readouterr().err
+        assert terminal(*words, *how) == 2
+        assert "the object is not a ball" in terminal.err
     assert not list(tmp_path.rglob("*.yaml"))

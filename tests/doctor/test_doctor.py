@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.cli.main import main
 from tactflow.doctor import examine, observe
 from tactflow.sim import open_scene
 from tactflow.sources import FrameReader
+from tests.terminal import Terminal
 from tests.vision.dots import grid, render
 
 Image = NDArray[np.uint8]
@@ -120,17 +120,17 @@ def test_missing_and_repeated_frames_of_a_camera_are_counted(
 
 
 def test_the_table_and_json_say_the_same_and_a_fault_has_exit_code_3(
-    clean: list[Image], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    clean: list[Image], tmp_path: Path, terminal: Terminal
 ) -> None:
     for index, image in enumerate(clean[:4]):
         cv2.imwrite(str(tmp_path / f"{index}.png"), cv2.GaussianBlur(image, (0, 0), 6.0))
-    assert main(["doctor", "--source", str(tmp_path)]) == 3
-    table = capsys.readouterr().out
+    assert terminal("doctor", "--source", str(tmp_path)) == 3
+    table = terminal.out
     assert "FAULT  focus" in table
     assert "change: focus the lens" in table
     assert "?      rate         single pictures have no times" in table
-    assert main(["doctor", "--source", str(tmp_path), "--json"]) == 3
-    report = json.loads(capsys.readouterr().out)
+    assert terminal("doctor", "--source", str(tmp_path), "--json") == 3
+    report = json.loads(terminal.out)
     assert report["verdict"] == "fault"
     (focus,) = [check for check in report["checks"] if check["name"] == "focus"]
     assert (focus["verdict"], focus["unit"]) == ("fault", "px")

@@ -241,8 +241,8 @@ def _learned(
     error = max(scale.stderr[0] / scale.x, scale.stderr[1] / scale.y)
     if args.pitch is not None and error > LOOSE:
         say(
-            f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid; either these are "
-            "in none, or the picture is stretched. Use --area WIDTH HEIGHT, the size of the whole picture"
+            f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid; these are "
+            "not, or the picture is stretched. Use --area WIDTH HEIGHT, the size of the whole picture"
         )
     learned: dict[str, Any] = {}
     if args.ball_radius is not None:
