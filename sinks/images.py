@@ -12,9 +12,9 @@ from pydantic import Field
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
+from tactflow.engine.output_files import cannot_write
 from tactflow.ports import Picture
 from tactflow.system.files import expanded, make_folder, next_name
-from tactflow.system.outputs import cannot_write
 
 UNFINISHED = ".unfinished"
 """Name of a picture until all of it is written, so that nobody reads half of one."""

@@ -8,10 +8,10 @@ from pydantic import Field, model_validator
 
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
+from tactflow.engine.output_files import refuse_existing
+from tactflow.message.lines import LineFile, LineStream
 from tactflow.message.result import Result, encode_message
 from tactflow.system.files import expanded, is_device
-from tactflow.system.lines import LineFile, LineStream
-from tactflow.system.outputs import refuse_existing
 
 
 class Jsonl(Sink):

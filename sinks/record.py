@@ -257,9 +257,16 @@ class Record(Recorder):
         self._references = [reference for reference in self._references if reference.epoch >= oldest]
 
     def _open_file(self, path: Path, overwrite: bool = False) -> RecordingWriter:
+        from tactflow.provenance import facts, kept_files
         from tactflow.recording.writer import RecordingWriter
 
-        self._file = RecordingWriter(path, self._sensor, self._control, overwrite=overwrite)
+        self._file = RecordingWriter(
+            path,
+            self._sensor,
+            facts=facts(self._sensor, self._control),
+            files=kept_files(self._control),
+            overwrite=overwrite,
+        )
         self.description = str(path)
         return self._file
 

@@ -15,13 +15,13 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
+from tactflow.engine.output_files import cannot_write
 from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
 from tactflow.message.encoding import SCHEMA
 from tactflow.message.result import Result, encode_message
-from tactflow.recording.provenance import facts, kept_files
+from tactflow.provenance import facts, kept_files
 from tactflow.system.extras import missing
 from tactflow.system.files import completed, expanded, make_folder
-from tactflow.system.outputs import cannot_write
 
 if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]
