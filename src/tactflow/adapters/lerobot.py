@@ -10,8 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,8 +36,6 @@ VERSION = "v3.0"
 """Of the layout, as LeRobot compares it."""
 PICTURES = "observation.images."
 TACTILE = "observation.tactile"
-WINDOW = "window"
-"""Key under which a row keeps the numbers of all results since the row before."""
 NAMES = {
     "contact": ["touching", "x", "y", "area", "angle"],
     "flow": ["known", "dx", "dy"],
@@ -109,8 +106,6 @@ class DatasetWriter:
         self._features: dict[str, dict[str, Any]] = {}
         self._moments: dict[str, Moments] = {}
         self._order = MarkerOrder()
-        self._window = 0
-        self._recent: deque[tuple[float, list[float]]] = deque()
         self._pixels: list[NDArray[np.float64]] = []
 
     def add(self, results: Iterable[Result]) -> int:
@@ -128,8 +123,7 @@ class DatasetWriter:
         rows: list[dict[str, Any]] = []
         encode: Callable[[NDArray[np.uint8] | None], None] | None = None
         with ExitStack() as stack:
-            self._recent.clear()
-            for index, result in enumerate(at_rate(self._remembered(results), self._fps)):
+            for index, result in enumerate(at_rate(results, self._fps)):
                 image = self._check(result)
                 if self._is_video and encode is None:
                     path = self._folder / "videos" / self._camera / f"{file}.mp4"
@@ -182,22 +176,9 @@ class DatasetWriter:
             raise StageError(f"pictures of {size}: a video needs even numbers; give --pictures png")
         return image
 
-    def _remembered(self, results: Iterable[Result]) -> Iterator[Result]:
-        """The same results; the numbers of each are kept until the next frame of the dataset."""
-        for result in results:
-            self._recent.append(
-                (result.t, [number for values in _values(result).values() for number in values])
-            )
-            yield result
-
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
         row: dict[str, Any] = {f"{TACTILE}.{name}": values for name, values in _values(result).items()}
         row |= self._marker_rows(result)
-        window = []
-        while self._recent and self._recent[0][0] <= result.t:
-            t, numbers = self._recent.popleft()
-            window.append([1.0, t - result.t, *numbers])
-        row[WINDOW] = window
         if index % SAMPLED == 0:
             # Mean, mean square, minimum and maximum of red, green, blue.
             rgb = image.reshape(-1, 3)[:, ::-1] / 255.0
@@ -229,14 +210,6 @@ class DatasetWriter:
         if self._order.origin is not None:
             lost = self._lost_markers(sensor)
             rows[:] = [lost | row for row in rows]
-        windows = [row.pop(WINDOW) for row in rows]
-        if not self._features:
-            self._window = max(map(len, windows))
-        if self._window > 1:
-            nothing = [0.0] * len(windows[0][0])
-            for row, window in zip(rows, windows, strict=True):
-                newest = window[-self._window :]
-                row[f"{TACTILE}.{sensor}.window"] = [nothing] * (self._window - len(newest)) + newest
         values = [
             {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE)} for row in rows
         ]
@@ -378,13 +351,11 @@ def _feature(name: str, value: NDArray[Any], calibrated: bool) -> dict[str, Any]
     ending = name.removeprefix(f"{TACTILE}.")
     if ending in NAMES:
         return {"dtype": dtype, "shape": [len(value)], "names": NAMES[ending]}
-    parts = list(NAMES) if calibrated else ["contact", "flow"]
     components = {
         "marker_offset": ["dx_px", "dy_px"],
         "marker_status": ["0 tracked, 1 inferred, 2 lost"],
         "points": [*(["dx_mm", "dy_mm"] if calibrated else ["dx_px", "dy_px"]), "dz_mm", *FORCES],
         "points_mask": ["known"],
-        "window": ["known", "t_s", *(f"{part}.{number}" for part in parts for number in NAMES[part])],
     }[ending.rpartition(".")[2]]
     return {"dtype": dtype, "shape": list(value.shape), "names": {"components": components}}
 
