@@ -287,10 +287,7 @@ def test_a_subscriber_that_asks_for_more_is_told_why_it_receives_nothing(pair: P
     ("parameters", "state", "words"),
     [
         ({"reliability": "perhaps"}, "configured", "required best_effort or reliable, got 'perhaps'"),
-        ({"parent_frame": "finger"}, "configured", "parent_frame needs tf2_msgs"),
         ({"object_frame": "object"}, "configured", "object_frame needs tf2_msgs"),
-        ({"parent_frame": "finger", "rotation": [0.0] * 4}, "configured", "required a quaternion x, y, z, w"),
-        ({"parent_frame": "finger", "translation": [1.0]}, "configured", "required 3 finite numbers"),
         ({"endpoint": "nowhere"}, "activated", "required an address such as tcp://127.0.0.1:5556"),
         ({"keys": "/nowhere"}, "activated", "tactflow keys new creates such a folder"),
     ],
@@ -326,16 +323,6 @@ def test_a_bridge_that_is_stopped_while_it_starts_ends_without_a_traceback() -> 
         command, env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-
-
-@needs_rclpy
-def test_the_transform_says_where_the_sensor_is(pair: Pair) -> None:
-    pair.listener.order(do="transform", place=[[0.1, 0.2, 0.3], [0.0, 0.0, 3.0, 4.0]])
-    told = pair.listener.told(lambda told: "transform" in told)["transform"]
-    assert told["header"] == {"stamp": {"sec": 1_700_000_000, "nanosec": 125_000_000}, "frame_id": "finger"}
-    assert told["child_frame_id"] == "gel"
-    assert told["transform"]["translation"] == {"x": 0.1, "y": 0.2, "z": 0.3}
-    assert told["transform"]["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
 
 
 @needs_rclpy
