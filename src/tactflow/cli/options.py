@@ -12,8 +12,8 @@ from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
-from tactflow.engine.output_files import cannot_write
 from tactflow.engine.plan import Plan, make_plan
+from tactflow.outputs import cannot_write
 from tactflow.system.terminal import say
 
 

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.engine.output_files import cannot_write, refuse_interference
+from tactflow.outputs import cannot_write, refuse_interference
 from tactflow.system.files import discard_output, expanded, make_folder
 
 log = logging.getLogger("tactflow")

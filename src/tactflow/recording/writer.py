@@ -12,8 +12,8 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from tactflow.engine.output_files import cannot_write, create, refuse_interference
 from tactflow.message.schema import message_schema
+from tactflow.outputs import cannot_write, create, refuse_interference
 from tactflow.recording.frames import RawFrame
 from tactflow.recording.schemas import channel_type, channel_types
 
