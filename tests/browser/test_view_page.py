@@ -242,43 +242,6 @@ def settled(page: Any) -> None:
         page.wait_for_timeout(300)
 
 
-def test_a_recording_is_paused_stepped_resumed_and_stopped(
-    run: Callable[..., Run], open_page: Callable[..., Any], tmp_path: Path
-) -> None:
-    # At full speed it would take all processors while the page is clicked.
-    (tmp_path / "slow.py").write_text(
-        "import time\n"
-        "from tactflow import Frame, Sink\n"
-        "class Slow(Sink):\n"
-        "    def write(self, frame: Frame) -> None:\n"
-        "        time.sleep(0.02)\n"
-    )
-    slow = ("--set", f"sinks.slow={{use: {tmp_path}/slow.py:Slow}}")
-    started = run("--source", ENDLESS, *slow, pipeline="pipelines/markerless.yaml")
-    page = open_page(started.url, lost=True)
-    watch(page)
-    page.click("#pause")
-    status(page, "paused")
-    assert page.inner_text("#pause .label") == "Resume"
-    # A fast recording has gone on since the frame that is shown; the first step catches up with it.
-    first = seq(page)
-    page.click("#step")
-    until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", first)
-    settled(page)
-    first = seq(page)
-    page.keyboard.press("s")
-    until(page, "seq => Number(document.getElementById('picture').dataset.seq) === seq", first + 1)
-    page.evaluate("document.activeElement.blur()")
-    page.keyboard.press(" ")
-    status(page, "live")
-    advance(page, 2)
-    page.click("#stop")
-    assert started.exit_code() == 0
-    status(page, "ended")
-    assert "The run was stopped." in page.inner_text("#empty-text")
-    assert page.is_disabled("#stop")
-
-
 def test_a_page_finds_the_run_again_after_a_restart(
     run: Callable[..., Run], open_page: Callable[..., Any], screenshots: Path
 ) -> None:

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 from unittest.mock import Mock, call
 from urllib.parse import urlsplit
@@ -571,20 +570,6 @@ def test_at_the_end_pages_learn_how_it_ended(view: Views, page: Pages) -> None:
     assert browser.until("state", lambda state: state["end"] is not None)["end"] == "eos"
     assert browser.close_code() == 1001
     assert sink.description is None
-
-
-def test_views_of_several_sensors_know_of_each_other(stack: ExitStack, page: Pages, tmp_path: Path) -> None:
-    views = {}
-    for sensor in ("left", "right"):
-        views[sensor] = View(View.Params(port=0, neighbours=str(tmp_path)), sensor, control=fake_run())
-        stack.callback(views[sensor].close)
-        views[sensor].open()
-    address = views["right"].description
-    assert address is not None
-    browser = page(views["left"])
-    assert browser.next("state")["neighbours"] == {"right": int(address.rstrip("/").rpartition(":")[2])}
-    views["right"].close()
-    browser.until("state", lambda state: state["neighbours"] == {})
 
 
 def test_too_many_pages_are_turned_away(view: Views, page: Pages) -> None:
