@@ -20,6 +20,8 @@ Points = NDArray[np.float64]
 
 SIZE = (800, 600)
 """Width and height of every scene's frames, px."""
+FPS = 60.0
+"""Frames per second of every scene."""
 CENTER = ((SIZE[0] - 1) / 2.0, (SIZE[1] - 1) / 2.0)
 HALF_DIAGONAL = math.hypot(*SIZE) / 2.0
 """Centre of a frame, (x, y), and distance of its corners from it, px."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim import gel, markers, motion, shapes
-from tactflow.sim.camera import SIZE, Camera
+from tactflow.sim.camera import FPS, SIZE, Camera
 from tactflow.sim.picture import Painter
 from tactflow.sim.recipes import SCENES
 from tactflow.sim.settings import Settings, parse_query
@@ -14,8 +14,6 @@ from tactflow.sim.truth import Truth
 from tactflow.system.spelling import did_you_mean
 from tactflow.vision.geometry import PixelMapping, Preprocessor
 
-FPS = 60.0
-"""Frames per second of every scene."""
 _STALE_FRAMES = 300
 """Number of frames searched for the deepest contact, which stale frames show; enough for a few contacts."""
 
