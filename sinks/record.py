@@ -254,7 +254,7 @@ class Record(Recorder):
         self._references = [reference for reference in self._references if reference.epoch >= oldest]
 
     def _open_file(self, path: Path, overwrite: bool = False) -> RecordingWriter:
-        from tactflow.provenance import facts, kept_files
+        from tactflow.recording.provenance import facts, kept_files
         from tactflow.recording.writer import RecordingWriter
 
         self._file = RecordingWriter(

@@ -19,7 +19,7 @@ from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, fr
 from tactflow.message.encoding import SCHEMA
 from tactflow.message.result import Result, encode_message
 from tactflow.outputs import AppendParams, cannot_write
-from tactflow.provenance import facts, kept_files
+from tactflow.recording.provenance import facts, kept_files
 from tactflow.system.extras import missing
 from tactflow.system.files import completed, expanded, make_folder
 
