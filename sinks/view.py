@@ -117,9 +117,7 @@ class View(Guiding):
         from tactflow.view.hub import Hub
         from tactflow.view.server import Server
 
-        session = self.session
-        answers = {} if session is None else {"undo": lambda _: session.undo()}
-        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, answers)
+        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send)
         self._server = Server(self._hub, listener, p.host, p.token)
         self._server.start()
         self.description = address(p.host, port)

@@ -632,9 +632,7 @@ def test_buttons_and_keys_send_commands_or_say_why_not(
     assert why in page.text_content("#note")
 
 
-def test_a_session_of_presses_is_guided_and_the_last_one_can_be_undone(
-    staged: Callable[..., Stage], open_page: Callable[..., Any]
-) -> None:
+def test_a_session_of_presses_is_guided(staged: Callable[..., Stage], open_page: Callable[..., Any]) -> None:
     def guided(number: int, **changes: Any) -> bytes:
         good = {"center": [10.0, 10.0], "radius": 5.0, "fault": None}
         light = {"center": [40.0, 20.0], "radius": 2.0, "fault": "light; press harder"}
@@ -656,12 +654,8 @@ def test_a_session_of_presses_is_guided_and_the_last_one_can_be_undone(
     assert page.evaluate("document.getElementById('guide-progress').value") == 0.5
     until(page, "() => document.querySelector('#stop .label').textContent === 'Finish'")
     assert shows(page, "picture", lambda seen: seen != plain)
-    page.keyboard.press("Backspace")
-    page.click("#undo")
-    until_heard(page, stage, {"do": "undo", "value": None}, times=2)
     stage.send(guided(3, lasts=True, now="Lift the ball.", presses=[]))
     until(page, "() => document.getElementById('guide-now').textContent === 'Lift the ball.'")
-    assert page.is_disabled("#undo")
     stage.send(state("main", end="signal"))
     until(page, "() => document.getElementById('empty-title').textContent === 'All presses are recorded'")
 

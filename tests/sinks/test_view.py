@@ -393,23 +393,16 @@ def test_a_record_sink_is_started_and_stopped_and_its_failure_ends_nothing(
     browser.next("stats")
 
 
-def test_a_page_that_guides_is_told_what_to_do_and_can_undo(stack: ExitStack, page: Pages) -> None:
+def test_a_page_that_guides_is_told_what_to_do(stack: ExitStack, page: Pages) -> None:
     class Session:
         state: Mapping[str, Any] = {"now": "Press the ball"}
-        undone = 0
 
-        def undo(self) -> None:
-            self.undone += 1
-
-    session = Session()
-    sink = View.through(session)(View.Params(port=0, max_fps=240.0), "main", control=fake_run())
+    sink = View.through(Session())(View.Params(port=0, max_fps=240.0), "main", control=fake_run())
     stack.callback(sink.close)
     sink.open()
     browser = page(sink)
     write(sink, 1)
     assert browser.next("frame")[0]["guide"] == {"now": "Press the ball"}
-    browser.say(do="undo")
-    until(lambda: session.undone == 1)
     assert View.session is None
 
 

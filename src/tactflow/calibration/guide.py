@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -107,44 +106,34 @@ class Guide:
 
     wanted : number of presses that are enough. say : shows a line.
 
-    `state` (see `progress`) may be read, and `undo` called, from any thread: that is what the live page does.
+    `state` (see `progress`) may be read from any thread: that is what the live page does.
     """
 
     def __init__(self, wanted: int, say: Callable[[str], None]) -> None:
         self._wanted = wanted
         self._say = say
         self._reported = 0
-        self._undos: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._shown = (0, False)
         self.state: Mapping[str, Any] = progress([], False, wanted)
 
-    def undo(self) -> None:
-        """Undo the last press."""
-        self._undos.put(None)
-
     def __call__(self, finder: PressFinder) -> bool:
         """Report new presses; returns whether there are enough."""
-        presses = finder.presses
-        over = len(presses) - finder.lasts
-        for number in range(self._reported, over):
-            self._report(finder, number)
-        self._reported = over
-        for _ in range(self._undos.qsize()):
-            self._undos.get()
-            if self._reported:
-                self._reported -= 1
-                del presses[self._reported]
-                self._say(f"press {self._reported + 1} is undone; press again")
-        if self._shown != (len(presses), finder.lasts):
-            self._shown = (len(presses), finder.lasts)
+        presses, shown = finder.presses, (len(finder.presses), finder.lasts)
+        # A new reference may have dropped some.
+        self._reported = min(self._reported, len(presses))
+        for number in range(self._reported, len(presses) - finder.lasts):
+            self._report(presses[: number + 1])
+            self._reported += 1
+        if self._shown != shown:
+            self._shown = shown
             self.state = progress(presses, finder.lasts, self._wanted)
         return self._reported >= self._wanted
 
-    def _report(self, finder: PressFinder, number: int) -> None:
-        """Report whether a press was good, and what to do next."""
-        state = progress(finder.presses[: number + 1], False, self._wanted)
-        press = state["presses"][number]
+    def _report(self, presses: Sequence[Press]) -> None:
+        """Report whether the last press was good, and what to do next."""
+        state, number = progress(presses, False, self._wanted), len(presses)
+        press = state["presses"][-1]
         verdict = press["fault"] or f"good, radius {press['radius']:.0f} px"
         # A recording may show more than are wanted.
-        of = f" of {self._wanted}" if number < self._wanted else ""
-        self._say(f"press {number + 1}{of}: {verdict}. {state['now']}")
+        of = f" of {self._wanted}" if number <= self._wanted else ""
+        self._say(f"press {number}{of}: {verdict}. {state['now']}")
