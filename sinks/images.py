@@ -24,25 +24,19 @@ class Images(Sink):
     """Writes pictures to `folder/frame-000036.png`, numbered by the frame's `seq`.
 
     The picture comes from the port `annotated`; `in: {annotated: inpaint.unmarked}` selects another colour
-    image.
+    image. `max_rate` writes fewer frames.
     """
 
     threaded = True
 
     class Params(StageParams):
-        """Destination, format and selection of frames."""
+        """Destination and format."""
 
         folder: str = Field(
             "images", min_length=1, description="folder, relative to the current directory; created"
         )
         format: Literal["png", "jpg"] = Field("png", description="png is lossless, jpg is small and fast")
         quality: int = Field(95, ge=1, le=100, description="of a jpg; 100 is the best and largest")
-        every: int = Field(
-            1,
-            ge=1,
-            description="write frames with multiples of this as seq (or the next one after a drop). Skipped "
-            "frames are drawn nevertheless; max_rate avoids that",
-        )
         overwrite: bool = Field(
             False, description="write into a folder that already holds frame-*.png or .jpg"
         )
@@ -52,7 +46,6 @@ class Images(Sink):
         super().__init__(params)
         self._folder = expanded(params.folder)
         self.description = str(self._folder)
-        self._next = 0
         self._files = 0
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
 
@@ -87,15 +80,8 @@ class Images(Sink):
         return {"files": self._files}
 
     def write(self, tick: Tick, annotated: Picture) -> None:
-        """Write a file, if the frame is selected.
-
-        Raises StageError if it cannot be written.
-        """
-        seq, every = tick.frame.seq, self.params.every
-        if seq < self._next:
-            return
-        self._next = seq - seq % every + every
-        path = self._folder / f"frame-{seq:06d}.{self.params.format}"
+        """Write one file. Raises StageError if it cannot be written."""
+        path = self._folder / f"frame-{tick.frame.seq:06d}.{self.params.format}"
         _, data = cv2.imencode(path.suffix, annotated, self._options)
         unfinished = self._folder / UNFINISHED
         try:
