@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from tactflow.sim import open_scene
-from tactflow.sim.gel import displacement, partial_slip
-
-
+from tactflow.sim.gel import displacement
 
 
 def test_the_true_stick_ratio_falls_to_nothing_before_the_ball_slides() -> None:
