@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -18,7 +16,6 @@ import tactflow
 from tactflow.cli import start
 from tactflow.cli.main import main, make_parser
 from tactflow.engine.errors import SourceError
-from tests.clock import PATIENCE
 
 Recorded = Callable[[str], str]
 """Name and settings of a simulated scene -> a recording of it with few pixels."""
@@ -113,24 +110,6 @@ def test_without_a_camera_it_is_said_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "video1").write_text("not a device")
     with pytest.raises(tactflow.ConfigError, match="2 cameras are plugged in; name the sensor"):
         start.run(args)
-
-
-def test_ctrl_c_before_the_end_leaves_no_file(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tactflow", "start", "sim:press?frames=60"],
-        cwd=tmp_path,
-        stdin=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stderr is not None
-    for line in process.stderr:
-        if line.startswith("Which sensor"):
-            process.send_signal(signal.SIGINT)
-    assert process.wait(PATIENCE) == 130
-    assert list(tmp_path.iterdir()) == []
-    process.stdin.close()
-    process.stderr.close()
 
 
 class Scripted:
