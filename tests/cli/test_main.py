@@ -154,12 +154,13 @@ def test_statistics_replace_no_results(terminal: Terminal) -> None:
     assert '"frames"' not in Path("a.jsonl").read_text()
 
 
-def test_a_limit_on_which_opencv_would_abort_is_refused(
-    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("limit", ["many", "64MB"])
+def test_a_limit_that_is_not_a_number_is_refused(
+    limit: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", "many")
+    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", limit)
     assert terminal("check", "default") == 2
-    assert "OPENCV_IO_MAX_IMAGE_PIXELS is 'many'; required: a number" in terminal.err
+    assert f"OPENCV_IO_MAX_IMAGE_PIXELS is '{limit}'; required: a number" in terminal.err
 
 
 def test_no_name_of_a_file_forges_a_line_of_the_messages(terminal: Terminal) -> None:
