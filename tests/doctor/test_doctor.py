@@ -43,11 +43,6 @@ def banded(image: Image, index: int) -> Image:
     return np.asarray(np.rint(image * gain[:, None, None]), np.uint8)
 
 
-def compressed(image: Image, _: int) -> Image:
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 10])[1]
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
-
-
 def drifted(image: Image, index: int) -> Image:
     move = np.array([[1, 0, 1.5 * index / FRAMES], [0, 1, 0]])
     return np.asarray(cv2.warpAffine(image, move, (400, 300), borderMode=cv2.BORDER_REPLICATE), np.uint8)
@@ -73,7 +68,6 @@ def written(path: Path, frames: list[Image], fps: float) -> Path:
         (blurred, 60.0, "focus"),
         (clipped, 60.0, "clipping"),
         (banded, 60.0, "banding"),
-        (compressed, 60.0, "compression"),
         (untouched, 8.0, "rate"),
         (drifted, 60.0, "drift"),
     ],
