@@ -524,7 +524,7 @@ def _load(
 
 
 def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[str, Node]:
-    """The live page as the pipeline sets it, or as it is by itself, made to guide."""
+    """The live page of the pipeline, or else one with defaults, showing the guided session."""
     own, added = _load(args, pipeline), _load(args, pipeline, {"sinks.view": {}})
     for node in (*own.sinks, *added.sinks):
         if issubclass(node.component.cls, Guiding):
