@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from tactflow.vision.arrays import Floats, Floats32, Indices
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.pose.imprint import BLOCKS, PATCH, Imprint, Template
 from tactflow.vision.pose.rigid import rigid, vector
 
@@ -201,12 +201,7 @@ def compare_points(
         row = (moved_y + motion[1, 3] - first[1]) / cell[1]
         if not (0 <= column < planes.shape[1] - 1 and 0 <= row < planes.shape[0] - 1):
             continue
-        left, top = int(column), int(row)
-        right, low = column - left, row - top
-        for k in range(4):
-            above = (1 - right) * planes[top, left, k] + right * planes[top, left + 1, k]
-            below = (1 - right) * planes[top + 1, left, k] + right * planes[top + 1, left + 1, k]
-            seen[k] = (1 - low) * above + low * below
+        _interpolate(planes, column, row, seen)
         share = points[n, 5] * seen[3]
         if share <= 0:
             continue
@@ -228,6 +223,17 @@ def compare_points(
         weight[n] = share
         totals[0] += 1
         totals[1] += share
+
+
+@helper
+def _interpolate(planes: Floats32, column: float, row: float, values: Floats) -> None:
+    """Fill values (4,) with those of the planes between four cells, bilinearly."""
+    left, top = int(column), int(row)
+    right, low = column - left, row - top
+    for k in range(4):
+        above = (1 - right) * planes[top, left, k] + right * planes[top, left + 1, k]
+        below = (1 - right) * planes[top + 1, left, k] + right * planes[top + 1, left + 1, k]
+        values[k] = (1 - low) * above + low * below
 
 
 def _height_part(mean: Floats, relative: float) -> _Part:
