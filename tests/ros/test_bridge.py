@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,10 +16,10 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.network.keys import make_keys
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Pose, Scale, Slip
-from tests.clock import PATIENCE, until
+from tests.clock import until
 from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
-from tests.ros.programs import PYTHON, Program, environment, needs_rclpy
+from tests.ros.programs import Program, needs_rclpy
 from tests.sinks.test_view import fake_run
 
 IMAGE = np.full((40, 60, 3), 90, np.uint8)
@@ -298,31 +297,6 @@ def test_parameters_that_cannot_be_are_refused_with_what_to_do(
     pair.listener.order(do="configure", parameters=parameters)
     assert pair.listener.told(lambda told: "configured" in told)[state] == "FAILURE"
     until(lambda: any(words in line for line in pair.listener.complaints))
-
-
-STOPPED_EARLY = """
-import os, signal, sys
-from tactflow_ros import bridge
-
-class Early(bridge.Bridge):
-    def on_configure(self, state):
-        os.kill(os.getpid(), signal.SIGTERM)
-        while bridge.rclpy.ok():
-            pass
-        return super().on_configure(state)
-
-bridge.Bridge = Early
-sys.exit(bridge.main())
-"""
-
-
-@needs_rclpy
-def test_a_bridge_that_is_stopped_while_it_starts_ends_without_a_traceback() -> None:
-    command = [str(PYTHON), "-c", STOPPED_EARLY]
-    done = subprocess.run(
-        command, env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 @needs_rclpy
