@@ -86,7 +86,7 @@ def load(
 
 
 _MEMORY = "frames in memory"
-"""What stands in place of the source where the frames came from Python."""
+"""Name of the source in messages if the frames came from Python."""
 
 
 def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:

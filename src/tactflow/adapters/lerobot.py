@@ -58,7 +58,7 @@ QUALITY = {"crf": "18", "g": "2", "preset": "veryfast"}
 """Options of the encoder: hardly any visible loss, and every other picture is a key frame, for random access.
 Chosen by hand."""
 SAMPLED = 10
-"""Statistics of pictures use one of so many. Chosen by hand."""
+"""Every 10th picture counts for the statistics. Chosen by hand."""
 
 
 def export(

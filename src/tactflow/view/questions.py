@@ -1,4 +1,4 @@
-"""Questions that are answered in the terminal or on the live page, beside the picture that they are about."""
+"""Questions that are answered in the terminal or on the live page, next to their picture."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Questions:
             self.show(self._shown)
 
     def poll(self) -> str | None:
-        """The answer to the question, or None as long as there is none.
+        """The answer to the question; None before there is one.
 
         Raises ConfigError if there is neither a page nor a terminal.
         """
