@@ -16,6 +16,7 @@ from tactflow.system.files import is_device, make_folder
 class AppendParams(StageParams):
     """Parameters of a sink that can replace or continue its output."""
 
+    path: str = Field(min_length=1, description="relative to the current directory")
     overwrite: bool = Field(False, description="replace existing output")
     append: bool = Field(False, description="continue existing output")
 
