@@ -5,8 +5,8 @@ tells which of them are marks by the `lattice` that they form and by how much th
 
 In each frame, `mask` tells where markers cover the gel, and `inpaint` fills these places. `tracking` follows
 the markers: `template` aligns each one from where it was last. Where a marker is missing or does not move
-like its neighbours, `spots` finds spots of the markers' size, `matching` chooses one for each marker, and
-`interpolation` places those that are not seen.
+like its neighbours, `spots` finds spots of the markers' size, `matching` grows the smooth part of the field
+over them, and `interpolation` places those that are not seen.
 """
 
 from tactflow.vision.markers.detection import Candidate, Detection, NoMarkersError, detect_markers

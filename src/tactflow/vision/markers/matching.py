@@ -18,6 +18,10 @@ REACH: Final = 0.4
 """Distance, pitches, of a spot from where the marks around predict a mark, at most: with 0.3 three times as
 many marks of wedge_roll are not seen, with 0.5 some take a shadow half a pitch away (measured)."""
 
+STEPS: Final = 2
+"""Steps in which this distance is reached: with one, strong shear between two frames costs identities."""
+
+
 LEAST_SHARE: Final = 0.15
 """Share, by weight, of the marks around that are known where they predict a mark: one alone is not enough.
 With 0.2, jumps of 0.9 pitches cost identities; with 0.1, marks of sts_torque160, 3 px apart, take the spots
@@ -118,7 +122,7 @@ def grow(
     position, known = last.copy(), known.copy()
     choice, free = np.full(len(last), -1, np.int64), np.arange(len(spots))
 
-    def take(asked: Indices) -> bool:
+    def take(asked: Indices, reach: Floats) -> bool:
         nonlocal free
         away, nearest = map(np.asarray, KDTree(spots[free]).query(position[asked]))
         order = np.argsort(away, kind="stable")
@@ -130,12 +134,14 @@ def grow(
         free = np.delete(free, taken)
         return len(first) > 0
 
-    while len(free) and len(asked := interpolator.place(position, known, LEAST_SHARE)) and take(asked):
-        pass
+    step = 1
+    while len(free) and step <= STEPS and len(asked := interpolator.place(position, known, LEAST_SHARE)):
+        # Sure choices come first: those nearest to the prediction.
+        step = 1 if take(asked, reach * step / STEPS) else step + 1
     left = np.flatnonzero(~known)
     position[left] = last[left]
     if len(free) and len(left):
-        take(left)
+        take(left, reach)
     marks = np.flatnonzero(choice >= 0)
     return marks, choice[marks]
 

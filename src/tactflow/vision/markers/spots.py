@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats, Floats32
 from tactflow.vision.markers.detection import Detection
-from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, blurred, find_peaks, shrunk
+from tactflow.vision.markers.scale_space import LEAST_SIGMA, RADIUS_PER_SIGMA, blurred, find_peaks, shrunk
 
 LARGEST_RADIUS: Final = 2.3
 """Radius of a mark, px, from which the frame is halved: less is needed to find it than to measure it. Chosen
 by hand."""
-
-LEAST_SIGMA: Final = 0.8
-"""Width of the narrower Gaussian, px, at least: below it is no filter of its own. Chosen by hand."""
 
 PEAK_REACH: Final = 0.7
 """Half the side of the square in which a peak is the highest, in radii of a mark. Chosen by hand."""
