@@ -13,8 +13,8 @@ from scipy.ndimage import map_coordinates
 
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.lattice import LONGEST_LINK, corners, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 from tactflow.vision.markers.selection import Group, Sign, evidence, groups, links, marks_of, probability
+from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
 
