@@ -27,7 +27,7 @@ SIGMA_STEP: Final = 1.2
 LARGEST_MARK: Final = 1 / 16
 """Largest scale that is looked at, over the shorter side of the image. Chosen by hand."""
 
-FULL_SIZE_SIGMA: Final = 2.0
+FULL_SIZE_SIGMA: Final = 4.0
 """Scales from here on are looked at in a smaller picture, px: it gives the same peaks at a cost that does not
 grow."""
 
