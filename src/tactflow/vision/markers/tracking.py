@@ -297,18 +297,22 @@ class MarkerTracker:
         jumped = self._position.copy()
         for grid in self._graph.grids:
             jumped[grid] += common_displacement(jumped[grid], spots, self._pitch, self._farthest)
-        best = Alignment(*(values.copy() for values in found))
         for start in (self._origin, jumped):
             other = self._templates.align(image, start)
             other.gain[self._left] = 0
             seen = trusted(other.gain, other.r_squared)
             there = self._graph.largest_component(seen, self._graph.strain(other.position))
+            better = np.zeros(self._count, np.bool_)
             for grid in self._graph.grids:
-                if np.count_nonzero(there[grid]) > np.count_nonzero(inliers[grid]):
-                    inliers[grid] = there[grid]
-                    for kept, values in zip(best, other, strict=True):
-                        kept[grid] = values[grid]
-        return best, inliers
+                better[grid] = np.count_nonzero(there[grid]) > np.count_nonzero(inliers[grid])
+            inliers = np.where(better, there, inliers)
+            found = Alignment(
+                np.where(better[:, None], other.position, found.position),
+                np.where(better, other.gain, found.gain),
+                np.where(better, other.r_squared, found.r_squared),
+                np.where(better, other.stderr, found.stderr),
+            )
+        return found, inliers
 
     def _infer(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that were not found, in place, and return those; others stay where they were."""
