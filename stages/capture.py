@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from tactflow.engine.check import read_only
 from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
@@ -184,8 +185,7 @@ class Capture(Source):
         else:
             arrivals = self._references.arranged(self._unskipped(source), source, self._reference_image)
         for arrival in paced(arrivals, p.source, p.realtime and not source.live, self._stop):
-            image = arrival.image.view()
-            image.setflags(write=False)
+            image = read_only(arrival.image)
             captured = arrival.captured or time.perf_counter()
             yield Frame(
                 self._sensor, arrival.seq, arrival.t, image, captured, arrival.reference, arrival.epoch
