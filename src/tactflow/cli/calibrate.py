@@ -58,10 +58,67 @@ gel."""
 _millimetres = number(float, 1e-3, 1e4, "millimetres from 0.001 to 10000")
 
 
+OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "--out": {"type": Path, "metavar": "FILE", "help": "default: calibration/SENSOR.yaml"},
+    "--realtime": {"action": "store_true", "help": "play a recording at its own pace, like a camera"},
+    "--pitch": {
+        "type": _millimetres,
+        "metavar": "MM",
+        "help": "spacing of the gel's dots, which form a square grid",
+    },
+    "--area": {
+        "type": _millimetres,
+        "nargs": 2,
+        "metavar": ("WIDTH", "HEIGHT"),
+        "help": "size of the whole processed picture, mm, if the gel has no dots of known pitch",
+    },
+    "--ball-radius": {
+        "type": _millimetres,
+        "metavar": "MM",
+        "help": "radius of the ball; without it, only the scale is calibrated",
+    },
+    "--presses": {
+        "type": positive,
+        "metavar": "N",
+        "help": f"end a live session after N presses ({ENOUGH['slopes']}; with --refine {ENOUGH['refine']}, "
+        f"with --darkness, or to check such a file, {ENOUGH['darkness']})",
+    },
+    "--view": {"action": "store_true", "help": "show the live page, which says where to press next"},
+    "--refine": {
+        "action": "store_true",
+        "help": "start from the pipeline's calibration, such as the default of a kind of sensor, and adapt "
+        "it to this sensor by one or more presses of the ball; the scale is kept unless --pitch or --area is "
+        "given",
+    },
+    "--darkness": {
+        "action": "store_true",
+        "help": "fit depth to the darkening of the gel, for sensors in white light such as 9DTact; one press "
+        "of the ball is enough",
+    },
+    "--kind": {
+        "metavar": "NAME",
+        "help": "make a default for all sensors of a kind, such as 'GelSight Mini'; its stated errors are "
+        "those on other sensors",
+    },
+    "--csv": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "for force and check: readings of the gauge, if not beside the recording; columns t (s) or "
+        "frame, fz (N), and optionally fx and fy",
+    },
+    "--offset": {
+        "type": float,
+        "default": 0.0,
+        "metavar": "S",
+        "help": "for force: add this to the times of the CSV; up to 2 s more are estimated",
+    },
+}
+"""Option -> its settings for argparse."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `calibrate`."""
-    option = parser.add_argument
-    option(
+    parser.add_argument(
         "what",
         nargs="*",
         metavar="PIPELINE | check FILE [PIPELINE] | force FILE [PIPELINE]",
@@ -69,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "one). check: test how well a calibration still fits. force: fit the force, and add it to a "
         "calibration",
     )
-    option(
+    parser.add_argument(
         "--source",
         "--from",
         dest="source",
@@ -79,81 +136,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "a folder of them",
     )
     add_sensor(parser)
-    option("--out", type=Path, metavar="FILE", help="default: calibration/SENSOR.yaml")
-    option("--realtime", action="store_true", help="play a recording at its own pace, like a camera")
     add_overwrite(parser)
-    option(
-        "--pitch",
-        type=_millimetres,
-        metavar="MM",
-        help="spacing of the gel's dots, which form a square grid",
-    )
-    option(
-        "--area",
-        type=_millimetres,
-        nargs=2,
-        metavar=("WIDTH", "HEIGHT"),
-        help="size of the whole processed picture, mm, if the gel has no dots of known pitch",
-    )
-    option(
-        "--ball-radius",
-        type=_millimetres,
-        metavar="MM",
-        help="radius of the ball; without it, only the scale is calibrated",
-    )
-    option(
-        "--presses",
-        type=positive,
-        metavar="N",
-        help=f"end a live session after N presses ({ENOUGH['slopes']}; with --refine {ENOUGH['refine']}, "
-        f"with --darkness, or to check such a file, {ENOUGH['darkness']})",
-    )
-    option("--view", action="store_true", help="show the live page, which says where to press next")
-    _add_kind(parser)
-    _add_force_options(parser)
-
-
-def _add_kind(parser: argparse.ArgumentParser) -> None:
-    """Declare the options about calibrations of a kind of sensor."""
-    option = parser.add_argument
-    option(
-        "--refine",
-        action="store_true",
-        help="start from the pipeline's calibration, such as the default of a kind of sensor, and adapt it "
-        "to this sensor by one or more presses of the ball; the scale is kept unless --pitch or --area is "
-        "given",
-    )
-    option(
-        "--darkness",
-        action="store_true",
-        help="fit depth to the darkening of the gel, for sensors in white light such as 9DTact; one press of "
-        "the ball is enough",
-    )
-    option(
-        "--kind",
-        metavar="NAME",
-        help="make a default for all sensors of a kind, such as 'GelSight Mini'; its stated errors are those "
-        "on other sensors",
-    )
-
-
-def _add_force_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `calibrate force`."""
-    option = parser.add_argument
-    option(
-        "--csv",
-        type=Path,
-        metavar="FILE",
-        help="for force and check: readings of the gauge, if not beside the recording; columns t (s) or "
-        "frame, fz (N), and optionally fx and fy",
-    )
-    option(
-        "--offset",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="for force: add this to the times of the CSV; up to 2 s more are estimated",
-    )
+    for name, settings in OPTIONS.items():
+        parser.add_argument(name, **settings)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -169,14 +154,14 @@ def run(args: argparse.Namespace) -> int:
         if verb == "make":
             if len(words) > 1:
                 raise ConfigError(f"calibrate: required one pipeline, got {', '.join(words)}")
-            return _make(args, words[0] if words else None)
+            return _make(args, *words)
         if len(words) not in (1, 2):
             raise ConfigError(f"calibrate {verb}: required a calibration file, and a pipeline if wanted")
         command = _check if verb == "check" else _add_force
-        return command(args, Path(words[0]), words[1] if len(words) > 1 else None)
+        return command(args, Path(words[0]), *words[1:])
 
 
-def _make(args: argparse.Namespace, pipeline: str | None) -> int:
+def _make(args: argparse.Namespace, pipeline: str | None = None) -> int:
     ways = [args.pitch, args.area].count(None)
     if ways == 0 or (ways == 2 and not args.refine):
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
@@ -289,7 +274,7 @@ def _depth(
     return fields
 
 
-def _check(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
+def _check(args: argparse.Namespace, path: Path, pipeline: str | None = None) -> int:
     calibration = Calibration.load(path)
     pressed = calibration.photometric or calibration.darkness
     args.presses = args.presses or ENOUGH["slopes" if calibration.darkness is None else "darkness"]
@@ -350,7 +335,7 @@ def _check_force(
     return now <= WORSE * entry.press.rmse
 
 
-def _add_force(args: argparse.Namespace, path: Path, pipeline: str | None) -> int:
+def _add_force(args: argparse.Namespace, path: Path, pipeline: str | None = None) -> int:
     """Fit the force and write it into the calibration file."""
     calibration = Calibration.load(path)
     if calibration.force is not None and not args.overwrite:
