@@ -107,8 +107,7 @@ class PhotometricEntry(_Entry):
 
     def errors(self) -> SurfaceErrors:
         """The basis of the standard errors of heights."""
-        own = math.sqrt(max(self.depth_stderr**2 - self.between**2, 0))
-        return SurfaceErrors(own, self.volume_stderr, self.steepest, self.between)
+        return SurfaceErrors(self.steepest, self.between)
 
 
 class DarknessEntry(_Entry):
