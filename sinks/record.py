@@ -1,4 +1,4 @@
-"""Record: lossless frames and their results in an MCAP file, which is also a source."""
+"""Record: every accepted frame without loss, and its results, in an MCAP file that can be played again."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 BACKLOG_SHARE = 4
-"""Frames of the ring written per new frame, so that saving them does not delay the run."""
+"""Frames from memory that are written per new frame, so that saving them never holds up the run."""
 
 
 class Record(Recorder):
-    """Records from the start, on command, or during contacts.
+    """Records to a file from the start, when told to, or when something touches the gel.
 
     With `ring`, the last seconds are kept in memory, compressed, and become the beginning of the file. A
-    recording always includes the reference frames of its frames.
+    recording always holds the reference frames that its frames are compared with.
 
-    A recording from the start is written to `path`, all others to numbered files, `press-001.mcap`, which
-    never replace a file. With `rotate_size` or `rotate_after`, a long recording continues in further numbered
-    files, each of which can be played by itself.
+    A recording from the start goes to `path` itself and all others to `path` with a number, `press-001.mcap`;
+    those never replace a file. With `rotate_size` or `rotate_after`, a long recording goes on in further
+    numbered files, each of which can be played by itself.
     """
 
     threaded = True
@@ -46,7 +46,7 @@ class Record(Recorder):
     queue_capacity = 32
 
     class Params(StageParams):
-        """Destination, and start of a recording."""
+        """Where to record to, and what begins a recording."""
 
         path: str = Field(
             "recording.mcap", pattern=r"\.mcap$", description="file, relative to the current directory"
@@ -54,51 +54,54 @@ class Record(Recorder):
         overwrite: bool = Field(False, description="replace an existing file")
         trigger: Literal["start", "button", "contact"] | None = Field(
             None,
-            description="what starts a recording: the start of the run, the button of the view, or a contact "
-            "(a file for each); null: the button if there is a ring, else the start",
+            description="what begins a recording: the start of the run, the button of the view, or a contact "
+            "(each contact its own file); null: the button if there is a ring, else the start",
         )
         ring: float | None = Field(
             None,
             gt=0,
             le=3600,
-            description="seconds kept in memory; the button saves them, and each recording of a contact "
-            "begins with them",
+            description="seconds kept in memory; the button saves them, and a contact's "
+            "recording begins with them",
         )
         memory: int = Field(
             2048,
             ge=16,
-            description="memory limit of the ring, MB (30 s of 800 x 600 at 60 Hz take 1300); older frames "
-            "are dropped with a warning",
+            description="memory limit of the ring, MB (30 s of 800 x 600 at 60 Hz take 1300); what does "
+            "not fit is left out, with a warning",
         )
         after: float = Field(1.0, ge=0, description="seconds recorded after a contact has ended")
         rotate_size: int | None = Field(
-            None, ge=1, description="size at which another numbered file begins, MB"
+            None, ge=1, description="size at which another, numbered file continues, MB"
         )
         rotate_after: float | None = Field(
-            None, gt=0, description="time after which another numbered file begins, s"
+            None, gt=0, description="time after which another, numbered file continues, s"
         )
-        preview: float = Field(10.0, ge=0, le=240, description="rate of JPEG previews, Hz; 0: none")
-        quality: int = Field(80, ge=1, le=100, description="of the previews; higher is sharper and larger")
+        preview: float = Field(
+            10.0, ge=0, le=240, description="rate of the JPEG pictures for people, Hz; 0 leaves them out"
+        )
+        quality: int = Field(80, ge=1, le=100, description="of those; higher is sharper and larger")
 
         @model_validator(mode="after")
         def _ring_needs_a_moment(self) -> Record.Params:
             if self.ring is not None and self.trigger == "start":
-                raise ValueError("ring keeps the time before a trigger: set trigger to button or contact")
+                raise ValueError("ring keeps what came before a trigger: set trigger to button or contact")
             return self
 
         @property
         def begins(self) -> Literal["start", "button", "contact"]:
-            """The trigger, with the default resolved."""
+            """The trigger that is meant."""
             return self.trigger or ("start" if self.ring is None else "button")
 
         def needed_inputs(self) -> Mapping[str, str]:
-            """The trigger `contact` requires the port `contact`."""
+            """A contact must be seen to begin a recording."""
             return {"contact": "trigger"} if self.trigger == "contact" else {}
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is written yet.
 
-        sensor : names the channels of the file. control : the run, whose settings are attached; or None.
+        sensor : names the channels of the file. control : the run, whose settings are written beside the
+        frames; or None.
         """
         super().__init__(params)
         self.description = params.path
@@ -118,17 +121,17 @@ class Record(Recorder):
 
     @classmethod
     def outputs(cls, params: Record.Params) -> Sequence[Output]:
-        """The file; numbered files have its name and a number."""
+        """The file, or the one whose name the numbered files carry."""
         refuses = params.begins == "start" and not params.overwrite
         return (Output(expanded(params.path), "file", "path", refuses_existing=refuses),)
 
     @classmethod
     def on_restart(cls, params: Record.Params) -> Record.Params:
-        """Continue in another file."""
+        """It goes on in another file, beside the one that it has begun."""
         return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
-        """Create the file, if recording starts with the run.
+        """Begin the file, if recording starts with the run.
 
         Raises StageError if the file exists and `overwrite` is not set, it cannot be written, or a package is
         missing.
@@ -141,11 +144,11 @@ class Record(Recorder):
 
     @property
     def recording(self) -> bool:
-        """Whether a file is being written. With a ring, this ends by itself."""
+        """Whether a file is being written. In ring mode it ends by itself."""
         return self._file is not None
 
     def start_recording(self) -> None:
-        """Start a numbered file. With a ring, save the ring and finish. Does nothing if recording.
+        """Begin a new, numbered file with what the ring holds, which then is all of it. Nothing if recording.
 
         Raises StageError if it cannot be written.
         """
@@ -155,12 +158,12 @@ class Record(Recorder):
             self._open_next()
             self._backlog = deque(self._ring)
             self._ends = self._backlog[-1].time if self._backlog else None
-            # While the run is paused, no frame would trigger the writing of the ring.
+            # While the run is paused, no frame comes that would take the ring along.
             if self._backlog and self._control is not None and self._control.paused:
                 self.stop_recording()
 
     def stop_recording(self) -> None:
-        """Finish the file, including pending frames. Does nothing if not recording.
+        """Finish the file, with all that belongs to it. Nothing if not recording.
 
         Raises StageError if it cannot be written.
         """
@@ -170,17 +173,17 @@ class Record(Recorder):
             self._finish()
 
     def wants(self) -> bool:
-        """Whether frames are written or kept in memory."""
+        """Whether frames are written or kept."""
         return self.recording or self.params.ring is not None or self.params.trigger == "contact"
 
     def counters(self) -> dict[str, int]:
-        """frames, files : written so far. bytes : of finished files. ring_frames, ring_bytes : in memory."""
+        """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
         return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
     def write(self, result: Result) -> None:
-        """Record one frame, or keep it in memory.
+        """Record one frame, or keep it for later.
 
-        Raises StageError if it cannot be written. The file then ends with the previous frame, and plays.
+        Raises StageError if it cannot be written. The file then ends with the frame before and can be played.
         """
         with self._lock:
             if not self.wants() and not result.frame.reference:
@@ -198,7 +201,7 @@ class Record(Recorder):
             self._keep(entry)
 
     def close(self) -> None:
-        """Write pending frames, and finish the file."""
+        """Write what is left, and finish the file."""
         self.stop_recording()
 
     def _entry(self, result: Result) -> Entry:
@@ -220,7 +223,7 @@ class Record(Recorder):
         return Entry(time, frame.seq, frame.reference, frame.epoch, data)
 
     def _follow(self, touching: bool, time: int) -> None:
-        """Start a file when a contact begins; it ends some time after the contact."""
+        """Begin a file when a contact begins; it ends some time after the contact."""
         if touching and not self._touching:
             self.start_recording()
         if touching:
@@ -232,7 +235,7 @@ class Record(Recorder):
         return bool(self._backlog) and (self._ends is None or self._backlog[0].time <= self._ends)
 
     def _keep(self, entry: Entry) -> None:
-        """Keep the entry in the ring, and references while frames of their epoch may follow."""
+        """Remember the entry in the ring, and references for as long as frames of their epoch may follow."""
         ring = self._ring
         if self.params.ring is not None:
             ring.append(entry)
@@ -254,16 +257,9 @@ class Record(Recorder):
         self._references = [reference for reference in self._references if reference.epoch >= oldest]
 
     def _open_file(self, path: Path, overwrite: bool = False) -> RecordingWriter:
-        from tactflow.recording.provenance import facts, kept_files
         from tactflow.recording.writer import RecordingWriter
 
-        self._file = RecordingWriter(
-            path,
-            self._sensor,
-            facts=facts(self._sensor, self._control),
-            files=kept_files(self._control),
-            overwrite=overwrite,
-        )
+        self._file = RecordingWriter(path, self._sensor, self._control, overwrite=overwrite)
         self.description = str(path)
         return self._file
 
@@ -273,18 +269,18 @@ class Record(Recorder):
         return file
 
     def _write_entry(self, entry: Entry) -> None:
-        """Write one entry, to a further file if the current one is full."""
+        """Write one entry, where the file is large or long enough to a further one."""
         file = self._file
         assert file is not None
         try:
             if file.frames and self._is_full(file, entry):
-                # `recording` must stay True meanwhile, so that the run does not skip the next frame.
+                # `recording` stays True meanwhile, or the run would leave out the next frame.
                 self._finish_file(file)
                 file = self._open_next()
             if file.frames == 0:
                 for reference in self._references:
                     if reference.epoch == entry.epoch and reference.seq < entry.seq:
-                        # At the beginning of the time line, without their earlier results.
+                        # At the beginning of the file's time line, without results of that time.
                         file.write(replace(reference, data={"frames": reference.data["frames"]}), entry.time)
             file.write(entry)
         except BaseException:

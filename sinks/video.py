@@ -1,4 +1,4 @@
-"""Video: annotated frames as a video file."""
+"""Video: annotated frames as a file to watch."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from tactflow.system.files import expanded, next_name
 class Video(Sink):
     """Writes annotated frames to a video file; its extension chooses the codec.
 
-    The file plays at the rate of capture: without `fps`, that is the median rate of the first frames. Players
-    show frames at a constant rate, so frames dropped by a live run shorten the film.
+    The file plays at the pace at which the frames were captured: without `fps`, the rate is the median of
+    the first frames' time differences. Players show frames at a constant rate, so frames that a live run
+    dropped shorten the film.
     """
 
     threaded = True
 
     class Params(StageParams):
-        """Destination and rate."""
+        """Where to write, and how."""
 
         path: str = Field(
             "annotated.avi",
@@ -56,7 +57,7 @@ class Video(Sink):
 
     @classmethod
     def on_restart(cls, params: Video.Params) -> Video.Params:
-        """Continue in another file, `annotated-001.avi`."""
+        """It goes on in another file, `annotated-001.avi`, beside the one that it has begun."""
         return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
@@ -83,8 +84,8 @@ class Video(Sink):
     def close(self) -> None:
         """Finish the file.
 
-        Raises StageError if frames are missing, because of a full disk, a limit on the size of files, or
-        another program that removed the file.
+        Raises StageError if not all frames are in it: the disk, or a limit on the size of files, ended it
+        early, or another program has taken it away.
         """
         if self._film is not None:
             self._film.close()

@@ -1,1 +1,1 @@
-"""Connections of other programs over ZeroMQ: results, commands, keys."""
+"""What other programs connect to, and with what: results, commands, keys."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from tactflow.vision.contact.heights import HeightModel, Heights
 from tactflow.vision.contact.level_lines import ContactFinder, ContactRegion, level_lines
+from tactflow.vision.contact.level_tree import grow_level_lines
 
 Float = NDArray[np.float32]
 SHAPE = 60, 80
@@ -37,10 +40,66 @@ def regions(heights: Heights, changed: NDArray[np.bool_] | None = None) -> list[
     return ContactFinder()(heights, np.ones(heights.values.shape, np.bool_) if changed is None else changed)
 
 
+def plain_lines(heights: Float, levels: Float, least: int) -> list[tuple[float, ...]]:
+    """Of each line: level, cells inside, sides along it and along the border, and the sum of its slopes."""
+    lines = []
+    for index, level in enumerate(levels):
+        holes = np.ones((3, 3), np.bool_)
+        filled = ndimage.binary_fill_holes(np.pad(heights > level, 1), holes)[1:-1, 1:-1]
+        labels, count = ndimage.label(filled)
+        for label in range(1, count + 1):
+            inside = np.pad(labels == label, 1)
+            if inside.sum() < least:
+                continue
+            sides, border, drop = 0, 0, 0.0
+            z = np.pad(heights, 1, constant_values=np.nan)
+            for shift in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                outside, beside = np.roll(inside, shift, (0, 1)), np.roll(z, shift, (0, 1))
+                fall = (z - beside)[inside & ~outside]
+                sides += np.isfinite(fall).sum()
+                border += np.isnan(fall).sum()
+                drop += float(np.nansum(fall))
+            lines.append((index, inside.sum(), sides, border, round(drop, 2)))
+    return sorted(lines)
+
+
 def core(region: ContactRegion, shape: tuple[int, int] = SHAPE) -> NDArray[np.bool_]:
     cells = np.zeros(shape, np.bool_)
     cells[region.rows, region.columns] = region.core > 0
     return cells
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**16), st.integers(1, 24), st.integers(1, 24))
+def test_each_level_line_is_measured(seed: int, high: int, wide: int) -> None:
+    noise = np.random.default_rng(seed).normal(0, 9, (high, wide)).astype(np.float32)
+    heights = np.asarray(cv2.blur(noise, (3, 3)), np.float32)
+    levels = np.linspace(heights.min() - 1, heights.max(), 6, dtype=np.float32)[1:-1]
+    above, drops = np.empty((high, wide), np.int32), np.empty(high * wide * 4, np.float32)
+    marked, lines = (heights > 1).astype(np.uint8), np.empty((len(drops), 7), np.int32)
+    count = grow_level_lines(heights, marked, levels, 2, above, drops, lines)
+    level, _, cells, _, sides, border, _ = lines[:count].T
+    found = zip(level, cells, sides, border, drops[:count].astype(float), strict=True)
+    expected = plain_lines(heights, levels, 2)
+    for one, other in zip(sorted(found), expected, strict=True):
+        assert one[:4] == other[:4]
+        assert abs(one[4] - other[4]) < 0.05
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**16))
+def test_lines_lie_within_one_another_and_count_the_marked_cells(seed: int) -> None:
+    heights = np.asarray(cv2.blur(np.random.default_rng(seed).normal(0, 9, (20, 30)), (3, 3)), np.float32)
+    changed = heights > heights.mean()
+    lines = level_lines(heights, changed)
+    for index, outer in enumerate(lines.outer):
+        labels = ndimage.label(lines.above > lines.level[index])[0]
+        inside = labels == labels.flat[lines.inside[index]]
+        assert lines.encloses[index] == (inside & changed).any()
+        if outer >= 0:
+            labels = ndimage.label(lines.above > lines.level[outer])[0]
+            assert lines.level[outer] == lines.level[index] - 1
+            assert (labels == labels.flat[lines.inside[outer]])[inside].all()
 
 
 @settings(max_examples=40, deadline=None)
@@ -85,7 +144,7 @@ def test_in_gray_pictures_of_coloured_light_the_size_of_the_change_is_the_shape(
 
 def test_a_change_of_nothing_has_no_lines() -> None:
     heights = HeightModel()(np.zeros((3, *SHAPE), np.float32))
-    assert level_lines(heights.values) == []
+    assert not level_lines(heights.values, np.ones(SHAPE, np.bool_)).salience.size
     assert regions(heights) == []
 
 

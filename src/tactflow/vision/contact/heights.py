@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft, linalg
 
 from tactflow.vision.arrays import Floats32
@@ -75,12 +76,11 @@ class HeightModel:
         if self._slopes is None:
             return Heights(cv2.magnitude(cv2.magnitude(change[0], change[1]), change[2]), None)
         high, wide = change.shape[1:]
-        slopes, size = np.tensordot(self._slopes, change, 1), _extended(high, wide)
+        slopes = (self._slopes @ change.reshape(3, -1)).reshape(2, high, wide)
+        size = _extended(high, wide)
         along_x, along_y = fft.rfft2(slopes, size)
-        across, down = _frequencies(*size)
-        square = across**2 + down**2
-        square[0, 0] = 1
-        extended = fft.irfft2(-1j * (across * along_x + down * along_y) / square, size)
+        from_x, from_y = _integrals(*size)
+        extended = fft.irfft2(from_x * along_x + from_y * along_y, size)
         rest = np.median(np.concatenate([extended[high], extended[-1]]))
         return Heights(np.asarray(extended[:high, :wide] - rest, np.float32), self._slopes)
 
@@ -131,6 +131,15 @@ def _extended(high: int, wide: int) -> tuple[int, int]:
     margin = max(round(MARGIN * max(high, wide)), 1)
     rows, columns = (int(fft.next_fast_len(side + 2 * margin, real=True)) for side in (high, wide))
     return rows, columns
+
+
+@lru_cache(maxsize=4)
+def _integrals(rows: int, columns: int) -> NDArray[np.complex64]:
+    """(2, rows, columns // 2 + 1): factors of the spectra of slopes along x and y in that of a surface."""
+    across, down = _frequencies(rows, columns)
+    square = across**2 + down**2
+    square[0, 0] = 1
+    return np.asarray(-1j * np.stack([across / square, down / square]), np.complex64)
 
 
 @lru_cache(maxsize=4)

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Flags, Floats, Floats32, Indices, Mask, Points
+from tactflow.vision.arrays import Flags, Floats, Indices, Mask, Points
 from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.types import MarkerStatus
 
@@ -207,7 +207,7 @@ def _remove(
 
 @kernel(
     "void(int32[:, ::1], int64, int64, float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1],"
-    " float64[:, ::1], float64[:, ::1], float64[::1])"
+    " float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1])"
 )
 def sum_region(
     covered: Sums,
@@ -219,9 +219,10 @@ def sum_region(
     between: Floats,
     inverse: Floats,
     removed: Floats,
+    shares: Floats,
     sums: Floats,
 ) -> None:
-    """Sums over the cells of a region.
+    """How much of each cell is in a region, and sums over these cells.
 
     covered : (h + 1, w + 1), sums over the pixels above and to the left in a part of a mask with 255 inside.
     They may overflow: differences are right. left, top : where that part begins, px.
@@ -230,24 +231,26 @@ def sum_region(
     planes, inverse, removed : of `weigh_markers`; of the last, the rows that are filled.
     to_markers : (R, C, N), kernel between cells and markers. between : (2 R - 1, 2 C - 1), kernel between two
     cells, by how many rows and columns they are apart.
-    sums : (26,) of 0, filled: how much of each cell is in the region; then, of cells weighted by their share
-    in the region: mean m (x, y); a a' (xx, xy, yy), a r' (xx, xy, yx, yy) and r r', where a is the way from
-    the middle to a cell and r what its motion is beyond the mean; of cells at the outline r^2 (x, y); over
-    pairs of cells, the kernel times 1, and times a a' of the two (xx, xy, yy); at the end those of
-    `_sum_markers`. All are 0 without a cell."""
+    shares : (R, C) of 0, filled: how much of each cell is in the region, 0 to 1.
+    sums : (26,) of 0, filled: the shares; then, of cells weighted by their share in the region: mean m (x,
+    y); a a' (xx, xy, yy), a r' (xx, xy, yx, yy) and r r', where a is the way from the middle to a cell and r
+    what its motion is beyond the mean; of cells at the outline r^2 (x, y); over pairs of cells, the kernel
+    times 1, and times a a' of the two (xx, xy, yy); at the end those of `_sum_markers`. All are 0 without a
+    cell."""
     # The cells whose gel may be in the part.
     least_x, most_x = _extent(planes[MOVED_X], place[3])
     least_y, most_y = _extent(planes[MOVED_Y], place[3])
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
-    row = _within((top - place[1] - most_y) / place[2], to_markers.shape[0])
-    column = _within((left - place[0] - most_x) / place[2], to_markers.shape[1])
-    rows = _within((top + height - place[1] - least_y) / place[2] + 2, to_markers.shape[0]) - row
-    columns = _within((left + width - place[0] - least_x) / place[2] + 2, to_markers.shape[1]) - column
+    row = _within((top - place[1] - most_y) / place[2], shares.shape[0])
+    column = _within((left - place[0] - most_x) / place[2], shares.shape[1])
+    rows = _within((top + height - place[1] - least_y) / place[2] + 2, shares.shape[0]) - row
+    columns = _within((left + width - place[0] - least_x) / place[2] + 2, shares.shape[1]) - column
     cells, begin = np.empty((6, rows, columns)), (row, column)
     x, y = place[0] + column * place[2] - left, place[1] + row * place[2] - top
     _sample_cells(covered, x, y, place[2], int(place[4]), planes, to_markers, begin, cells)
     for i in range(rows):
         for j in range(columns):
+            shares[row + i, column + j] = cells[SHARE, i, j]
             sums[0] += cells[SHARE, i, j]
     if sums[0] > 0:
         to_region = np.empty((3, planes.shape[1]))
@@ -443,57 +446,3 @@ def look_up(points: Points, mask: Mask, inside: Flags) -> None:
         x, y = np.rint(points[i, 0]), np.rint(points[i, 1])
         within = 0 <= x < mask.shape[1] and 0 <= y < mask.shape[0]
         inside[i] = within and mask[int(y), int(x)] != 0
-
-
-@kernel(
-    "int64(float32[:, :, ::1], float64[::1], float64, float32[:, ::1], float32[:, ::1], float32[:, :, ::1],"
-    " int64[::1], float32[:, ::1], float64[::1])"
-)
-def compare_light(
-    change: Floats32,
-    warp: Floats,
-    gain: float,
-    away: Floats32,
-    light: Floats32,
-    by: Floats32,
-    patches: Indices,
-    error: Floats32,
-    sums: Floats,
-) -> int:
-    """How the light of a picture differs from that of a template that has moved; returns how many cells are
-    seen, of which neither the border nor a marker hides a part.
-
-    change : (h, w, 4), of `light_change`. warp : (4,): scale times cosine and sine of the turn, and where the
-    centre is, cells. gain : factor of the light. away, light, by, patches : of a template.
-    error : (N, 3), filled: picture less template, 0 where it is not seen. sums : (10,), filled: `by` times
-    the error; its square; the squares of its sums over patches; the error of each channel.
-    """
-    count, patch = 0, np.zeros(3)
-    sums[:] = 0
-    for i in range(len(away)):
-        if i > 0 and patches[i] != patches[i - 1]:
-            sums[6] += patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2
-            patch[:] = 0
-        error[i] = 0
-        x = warp[0] * away[i, 0] - warp[1] * away[i, 1] + warp[2]
-        y = warp[1] * away[i, 0] + warp[0] * away[i, 1] + warp[3]
-        if not (0 <= x < change.shape[1] - 1 and 0 <= y < change.shape[0] - 1):
-            continue
-        column, row = int(x), int(y)
-        upper, lower = change[row, column : column + 2], change[row + 1, column : column + 2]
-        if min(upper[0, 3], upper[1, 3], lower[0, 3], lower[1, 3]) < 1:
-            continue
-        count += 1
-        right, down = x - column, y - row
-        for channel in range(3):
-            above = upper[0, channel] + right * (upper[1, channel] - upper[0, channel])
-            below = lower[0, channel] + right * (lower[1, channel] - lower[0, channel])
-            left = above + down * (below - above) - gain * light[i, channel]
-            error[i, channel] = left
-            patch[channel] += left
-            sums[5] += left * left
-            sums[7 + channel] += left
-            for k in range(5):
-                sums[k] += by[i, channel, k] * left
-    sums[6] += patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2
-    return count
