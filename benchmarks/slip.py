@@ -28,8 +28,6 @@ import tactflow
 from tactflow.sim.recipes import SCENES
 from tactflow.vision.arrays import Floats
 
-FRAMES = 600
-"""Of each scene."""
 ROLLS = ("roll", "tumble")
 """Scenes in which the contact moves on without sliding: what it moves is not compared."""
 LATE = 0.1
@@ -49,9 +47,9 @@ class Row(NamedTuple):
     stated: Floats
 
 
-def simulated(name: str) -> Row:
+def simulated(name: str, frames: int) -> Row:
     """Measure a scene."""
-    spec = f"{name}?frames={FRAMES}"
+    spec = f"{name}?frames={frames}"
     scene = tactflow.open_scene(spec)
     counts, errors, stated = np.zeros((2, 2), np.int64), [], []
     start, slipped = np.zeros(3), -math.inf
@@ -76,18 +74,20 @@ def simulated(name: str) -> Row:
     return Row(missed + found, found, others + false, false, *parts)
 
 
-def report_simulated() -> None:
+def report_simulated(frames: int) -> None:
     """Print a line for each scene, and the sums."""
     print("| scene | told of those that slip | told of others | px | degrees | within one, two |")
     print("| --- | --- | --- | --- | --- | --- |")
     every = []
     for name, recipe in SCENES.items():
-        if recipe.programme is None or recipe.settings.get("markers") == "none":
+        if recipe.programme is None or recipe.settings.get("markers") == (0, 0):
             continue
-        row = simulated(name)
+        row = simulated(name, frames)
         every.append(row)
-        rms = np.sqrt(np.mean(row.errors**2, axis=0)) if len(row.errors) else np.full(3, np.nan)
-        known = "" if name in ROLLS else f"{math.hypot(*rms[:2]):.2f} | {rms[2]:.2f} | {within([row])}"
+        known = ""
+        if len(row.errors) and name not in ROLLS:
+            x, y, turn = np.sqrt(np.mean(row.errors**2, axis=0)).tolist()
+            known = f"{math.hypot(x, y):.2f} | {turn:.2f} | {within([row])}"
         print(f"| {name} | {row.found} of {row.slipping} | {row.false} of {row.others} | {known or '| |'} |")
     quiet = [row for row in every if not row.slipping]
     false, others = (sum(getattr(row, name) for row in quiet) for name in ("false", "others"))
@@ -148,8 +148,12 @@ def main() -> None:
     """Judge the simulator, or the recordings of a folder."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder of the recordings")
-    data = parser.parse_args().data
-    report_simulated() if data is None else report_real(data)
+    parser.add_argument("--frames", type=int, default=600, help="of each simulated scene")
+    arguments = parser.parse_args()
+    if arguments.data is None:
+        report_simulated(arguments.frames)
+    else:
+        report_real(arguments.data)
 
 
 if __name__ == "__main__":

@@ -443,6 +443,7 @@ def calibrated(number: int, *, slipping: bool = False, height: float = 0.5, in_r
     message["contact"] |= {"depth_mm_stderr": 0.01, "volume_mm3": 0.7}
     message["flow"] |= {"stderr": [0.3, 0.4], "mean_mm": [0.4, -0.2], "mean_mm_stderr": [0.03, 0.04]}
     message["slip"] = {"slipping": slipping, "stick_ratio": 0.0 if slipping else 0.8}
+    message["slip"] |= {"translation": [3.0, 4.0], "translation_mm": [0.3, 0.4], "rotation": 5.0}
     message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": in_range}
     message["pose"] = {
         "status": "tracked",
@@ -557,6 +558,7 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
     assert page.inner_text("#value-area") == "300"
     stage.send(calibrated(2))
     until(page, "() => document.getElementById('unit-area').textContent === 'mm² at 0.1, −0.2 mm'")
+    assert page.inner_text("#unit-slip") == "80\u202f% of the contact sticks, slid 0.50 mm, turned 5.0°"
     texts = {name: page.inner_text(f"#value-{name}") for name in ("area", "flow", "depth", "force", "slip")}
     assert texts == {"area": "3.00", "flow": "0.447", "depth": "0.500", "force": "2.50", "slip": "holds"}
     assert page.inner_text("#value-pose") == "0.50"

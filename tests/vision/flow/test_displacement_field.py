@@ -96,6 +96,15 @@ def test_a_marker_that_is_not_seen_is_as_if_it_had_never_been_there(unseen: Mark
     assert field.stderr[row, column] > 3 * everywhere.stderr[row, column]
 
 
+def test_it_is_known_at_any_place_and_beyond_its_grid_as_at_the_border() -> None:
+    field = field_of(markers(waves(GRID)))
+    points = field.grid.points.reshape(-1, 2)
+    np.testing.assert_allclose(field.at(points), field.displacement.reshape(-1, 2), atol=1e-3)
+    halfway = (points[:1] + points[1:2]) / 2
+    np.testing.assert_allclose(field.at(halfway)[0], field.displacement[0, :2].mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(field.at(points[:1] - 1000)[0], field.displacement[0, 0])
+
+
 def test_a_marker_that_is_seen_poorly_counts_less() -> None:
     moved = waves(GRID)
     off = 24
@@ -200,6 +209,13 @@ def test_stated_errors_are_those_of_simulated_contacts() -> None:
     # 80 errors: the binomial standard deviation of a share of 68 % is 5 %, of 95 % it is 2.4 %.
     assert within[0] > 0.68 - 2 * 0.05
     assert within[1] > 0.95 - 2 * 0.024
+
+
+def test_each_region_has_its_own_motion_whatever_was_asked_before() -> None:
+    first, second = disc((100, 100), 60), disc((200, 300), 40)
+    asked, other = field_of(markers(waves(GRID))), field_of(markers(waves(GRID)))
+    assert asked.motion(first) == asked.motion(first.copy()) != asked.motion(second)
+    assert asked.motion(second) == other.motion(second)
 
 
 def test_where_no_marker_is_near_the_mean_is_not_known() -> None:

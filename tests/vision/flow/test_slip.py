@@ -139,6 +139,18 @@ def test_the_picture_of_another_object_starts_the_measurement_anew() -> None:
     assert (slip.since, slip.slipping, slip.speed) == (1, False, None)
 
 
+def test_what_shows_another_side_within_a_frame_has_slipped() -> None:
+    tracker = SlipTracker()
+    for seq in range(8):
+        slip = step(tracker, seq, 60)
+        assert slip is not None
+        assert not slip.slipping
+    for seq, slipping in ((8, True), (9, False)):
+        slip = step(tracker, seq, 60, striped=True)
+        assert slip is not None
+        assert (slip.since, slip.slipping) == (8, slipping)
+
+
 @pytest.mark.parametrize("spec", ["slide?frames=140", "scrape?frames=140", "spin?frames=140"])
 def test_translation_and_rotation_are_right_and_their_errors_honest(spec: str) -> None:
     scene, start, misses = open_scene(spec), (np.zeros(2), 0.0), []

@@ -85,17 +85,17 @@ class Template(NamedTuple):
     contrast: float
 
     @property
-    def place(self) -> Floats:
-        """(2,), its centre, px."""
-        return self.center * CELL + (CELL - 1) / 2
+    def place(self) -> complex:
+        """Its centre, x + iy, px."""
+        return complex(*(self.center * CELL + (CELL - 1) / 2).tolist())
 
 
 class Registration(NamedTuple):
     """A motion from a template to a picture.
 
     motion : (5,), shift (x, y) of the centre, turn from +x to +y and growth, as far as they move the cells at
-    the RMS radius, cells; relative change of the contrast. covariance : (5, 5). residual : RMS difference,
-    over the standard deviation of the change of light. seen : share of the template's cells.
+    the RMS radius, cells; relative change of the contrast. covariance : (5, 5). residual : standard
+    deviation of the difference over that of the change of light. seen : share of the template's cells.
     fresh : part of the variance that the next frame does not share.
     """
 
@@ -162,7 +162,9 @@ def register(
         motion = motion + step
         if np.abs(step[:4]).max() < CONVERGED:
             break
-    residual = math.sqrt(power) / max(template.contrast * (1 + float(motion[4])), 1e-3)
+    # Lamps that flicker change all of it alike.
+    unlike = math.sqrt(float(error[shown].var(axis=0).mean()))
+    residual = unlike / max(template.contrast * (1 + float(motion[4])), 1e-3)
     if residual > UNLIKE:
         return None
     seen = template.by.reshape(-1, 3, 5)[shown].reshape(-1, 5)

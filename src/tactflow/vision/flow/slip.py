@@ -15,7 +15,7 @@ from tactflow.vision.arrays import Flags, Floats, Floats32, Mask
 from tactflow.vision.flow.displacement_field import CELL, DisplacementField
 from tactflow.vision.flow.in_mask import OUTLINE, UNKNOWN
 from tactflow.vision.flow.registration import CELL as PX
-from tactflow.vision.flow.registration import Registration, Template, register, template_of
+from tactflow.vision.flow.registration import UNLIKE, Registration, Template, register, template_of
 from tactflow.vision.types import Slip
 
 WINDOW: Final = 0.1
@@ -124,7 +124,7 @@ class SlipTracker:
     def reset(self) -> None:
         """Nothing touches the gel: what comes is another contact."""
         self._key: _Key | None = None
-        self._since = 0
+        self._since, self._began = 0, 0.0
         self._last = self._before = np.zeros(5)
         self._grip: tuple[Floats, Floats] | None = None
         self._recent: deque[_Moment] = deque()
@@ -144,19 +144,21 @@ class SlipTracker:
         share, key, found = field.share(mask), self._key, None
         if key is not None and key.cells.shape == share.shape:  # else markers have joined
             found = self._registered(key, change, field)
+        torn = False
         if key is None or found is None:
-            self.reset()
             template = template_of(change, mask)
+            torn = template is not None and self._torn(key, template, time)
+            self.reset()
             if template is None:
                 return None
             key = _keyframe(template, field, share, np.zeros(3), np.zeros((3, 3)))
-            self._since, at_rest = seq, np.zeros(5)
+            self._since, self._began, at_rest = seq, time, np.zeros(5)
             found = Registration(at_rest, np.zeros((5, 5)), 0.0, 1.0, 1.0)
         now = _slid(key, found, field, time)
         self._recent.append(now)
         while len(self._recent) > 2 and time - self._recent[1].time > WINDOW - 1e-6:
             self._recent.popleft()
-        slip = self._slip(key, found.fresh, gel.stderr, math.hypot(*gel.outline_stderr))
+        slip = self._slip(key, found.fresh, gel.stderr, math.hypot(*gel.outline_stderr), torn)
         if slip.slipping:
             self._grip = None
         else:
@@ -171,7 +173,7 @@ class SlipTracker:
         """How the picture has moved since the keyframe: on as before, or else not since the last frame, or
         with the gel."""
         moved = _complex(field.displacement[key.cells]) - key.before
-        x, y, turn = _rigid(key.rest + key.before - _place(key), moved, key.share)[0].tolist()
+        x, y, turn = _rigid(key.rest + key.before - key.template.place, moved, key.share)[0].tolist()
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
         best: Registration | None = None
         for start in (2 * self._last - self._before, self._last, expected):
@@ -184,6 +186,13 @@ class SlipTracker:
             self._before, self._last = self._last, best.motion
         return best
 
+    def _torn(self, key: _Key | None, template: Template, time: float) -> bool:
+        """Whether a picture that has been followed for long enough has changed at once beyond any motion with
+        the gel, although the object presses on."""
+        if key is None or time - self._began < WINDOW:
+            return False
+        return template.contrast > UNLIKE * key.template.contrast
+
     def _sticking(self, field: DisplacementField, share: Floats) -> float:
         """The stick ratio, on the gel that was touched first, or that the contact has gone on to."""
         before, displacement = self._grip or (0 * share, field.displacement)
@@ -193,7 +202,7 @@ class SlipTracker:
             return 1.0
         return stick_ratio(before, share, field.grid.points, field.displacement - displacement, field.noise)
 
-    def _slip(self, key: _Key, fresh: float, gel_stderr: float, outline_stderr: float) -> Slip:
+    def _slip(self, key: _Key, fresh: float, gel_stderr: float, outline_stderr: float, torn: bool) -> Slip:
         """The slip up to now. fresh : part of the variance that is new in each frame. gel_stderr,
         outline_stderr : of the mean displacement of the gel, and what the outline does to it, px."""
         then, now = self._recent[0], self._recent[-1]
@@ -201,11 +210,14 @@ class SlipTracker:
         gel_variance = gel_stderr**2 * np.array([1.0, 1.0, 2 / radius**2])
         slid, stderr = now.slid.tolist(), np.sqrt(np.diag(now.covariance) + gel_variance).tolist()
         probability, speed, speed_stderr = 0.0, None, None
+        drag_stderr = math.hypot(gel_stderr, outline_stderr) + LEAST_MOVED
+        if torn:
+            probability = _normal((math.hypot(*now.gel[:2]) - SLID * radius) / drag_stderr)
         if now is not then:
             # At the RMS radius, where a turn moves the object as much as a shift.
             lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
             covariance = now.covariance + then.covariance - 2 * then.inherited
-            covariance *= fresh * np.outer(lever, lever)
+            covariance = (fresh * covariance + np.diag(gel_variance)) * np.outer(lever, lever)
             # What errors alone may make counts less: a smooth ball does not show how it turns.
             shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLID * radius) ** 2)
             moved = shrink @ ((now.slid - then.slid) * lever)
@@ -216,7 +228,7 @@ class SlipTracker:
             strained = OUTLINE * float(np.linalg.norm((now.gel - then.gel) * lever))
             slides = _normal((length - strained - SLID * radius) / error)
             dragged = float(way @ (now.gel * lever)) - SLID * radius
-            probability = slides * _normal(dragged / (math.hypot(gel_stderr, outline_stderr) + LEAST_MOVED))
+            probability = slides * _normal(dragged / drag_stderr)
             speed, speed_stderr = length / time, error / time
         return Slip(
             probability > 0.5,
@@ -235,6 +247,7 @@ class SlipTracker:
 def _keyframe(
     template: Template, field: DisplacementField, share: Floats, slid: Floats, covariance: Floats
 ) -> _Key:
+    """A frame that others are compared with. share : (rows, columns), of each cell in contact."""
     inside = _core(field.grid.points, share) & (share > 0)
     rest, before = _complex(field.grid.points[inside]), _complex(field.displacement[inside])
     count = float(share[inside].sum())
@@ -250,12 +263,12 @@ def _aged(key: _Key, found: Registration) -> bool:
 
 def _slid(key: _Key, found: Registration, field: DisplacementField, time: float) -> _Moment:
     """The slip up to a time."""
-    place, radius = _place(key), key.template.radius
+    place, radius = key.template.place, key.template.radius
     x, y, turn = found.motion[:3].tolist()
     now = (key.rest + key.before - place) * cmath.exp(1j * turn / radius) + complex(x, y) * PX
     under = key.rest - place
     for _ in range(ROUNDS):
-        moved = _complex(field.at(_pairs(under + place)))
+        moved = _complex(field.at((under + place).view(np.float64).reshape(-1, 2)))
         under = now - moved
     slid, left = _rigid(key.rest - place, under + place - key.rest, key.share)
     to_px = np.array([PX, PX, 1 / radius])
@@ -267,19 +280,9 @@ def _slid(key: _Key, found: Registration, field: DisplacementField, time: float)
     return _Moment(time, gel, key.slid + slid, covariance, key.covariance)
 
 
-def _place(key: _Key) -> complex:
-    """The centre of the keyframe's picture, px."""
-    return complex(*key.template.place.tolist())
-
-
 def _complex(pairs: Floats) -> Complexes:
     """Points or displacements (M, 2) as x + iy."""
     return np.ascontiguousarray(pairs).view(np.complex128)[:, 0]
-
-
-def _pairs(points: Complexes) -> Floats:
-    """(M, 2) of x + iy."""
-    return np.asarray(points.view(np.float64).reshape(-1, 2))
 
 
 def _similarity(places: Complexes, moved: Complexes, share: Floats) -> tuple[complex, complex, Complexes]:
