@@ -3,10 +3,17 @@
 What an object does to the light of the gel moves with the object: its outline, its shading, its texture. The
 markers are left out, since they move with the gel.
 
+The covariance of a motion is that of least squares with considered parameters: how the lamps differ from
+place to place is not estimated, but what it may do to the estimate counts. So the motion of a straight cable
+along itself, which only its shading could tell, stays as uncertain as it was beforehand.
+
 References
 ----------
+J. Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding 1996.
 S. Baker, I. Matthews, "Lucas-Kanade 20 years on: a unifying framework", IJCV 2004, for the gradients of the
 template.
+B. D. Tapley, B. E. Schutz, G. H. Born, "Statistical orbit determination", 2004, ch. 6, for considered
+parameters.
 """
 
 from __future__ import annotations
@@ -17,7 +24,8 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import ColorImage, Flags, Floats, Floats32, Mask
+from tactflow.vision.arrays import MAD_TO_SIGMA, ColorImage, Floats, Floats32, Indices, Mask
+from tactflow.vision.flow.loops import compare_light
 
 CELL: Final = 4
 """Processed px per side of a cell, over which the light is averaged."""
@@ -28,20 +36,20 @@ MOST: Final = 500
 FEWEST: Final = 30
 """Cells of a template at least."""
 PATCHES: Final = 25
-"""Independent errors of a template: those of neighbouring cells are common."""
-NOISE: Final = 1.0
-"""Standard deviation of what is common to a patch and no motion, grey levels, at least."""
-UNEVEN: Final = 0.05
-"""How unevenly the lamps light the gel around a contact, relative: what moves becomes brighter or darker."""
-ELSE: Final = 0.2
-"""Part of a growth or a change of contrast that the picture shows in other ways: a cable that is pressed
-harder grows across, but not along."""
+"""Patches of a template, about: errors of neighbouring cells are alike, those of patches independent."""
+ROUNDING: Final = 1 / 6
+"""Variance of the difference of two rounded grey levels."""
+SOBEL: Final = 3 / 16
+"""Variance of a gradient over that of the light."""
+LAMPS: Final = 0.05
+"""Standard deviation of what the place on the gel, and turning, do to the light of a contact, relative: how
+much brighter it is at the RMS radius, and how much of one channel shows in another."""
+LEAST: Final = 1e-6
+"""Information on a motion, at least, so that it has an inverse."""
 STEPS: Final = 12
 """Steps of Gauss-Newton at most."""
-CONVERGED: Final = 0.01
-"""Step after which it ends, cells."""
-KNOWN: Final = 0.999
-"""Weight of a picture from which on no marker has part in it."""
+CONVERGED: Final = 0.05
+"""Step after which it ends, cells: the next one is several times smaller."""
 SEEN: Final = 0.4
 """Share of a template's cells that the picture must show."""
 UNLIKE: Final = 0.6
@@ -71,18 +79,25 @@ def cells(picture: ColorImage | Mask) -> Floats32:
 class Template(NamedTuple):
     """The picture of a contact, with which later ones are compared; lengths in cells.
 
-    center : (2,), mean of its cells. radius : RMS distance from it. away : (N, 2) float32, from the centre.
-    light : (N, 3) float32, grey levels. by : (3 N, 5) float32, what a small motion, and a gain, change the
-    difference by. power : (5, 5), by.T @ by. contrast : standard deviation of the light.
+    center : (2,), mean of its cells. radius : RMS distance from it. moments : (2, 2), second moments of the
+    cells. away : (N, 2) float32, from the centre. patches : (N,) int64, to which each cell belongs, in order.
+    light : (N, 3) float32, grey levels. by : (N, 3, 5) float32, what a small motion, and a gain, change the
+    difference by. power : (5, 5), sum of the products of `by`. lamps : (5, 5), covariance of the sum of `by`
+    times what the lamps may do. contrast : standard deviation of the light. noise : variance of the
+    difference of the light of two pictures.
     """
 
     center: Floats
     radius: float
+    moments: Floats
     away: Floats32
+    patches: Indices
     light: Floats32
     by: Floats32
     power: Floats
+    lamps: Floats
     contrast: float
+    noise: float
 
     @property
     def place(self) -> complex:
@@ -94,16 +109,16 @@ class Registration(NamedTuple):
     """A motion from a template to a picture.
 
     motion : (5,), shift (x, y) of the centre, turn from +x to +y and growth, as far as they move the cells at
-    the RMS radius, cells; relative change of the contrast. covariance : (5, 5). residual : standard
-    deviation of the difference over that of the change of light. seen : share of the template's cells.
-    fresh : part of the variance that the next frame does not share.
+    the RMS radius, cells; relative change of the contrast. covariance : (5, 5). error : (N, 3) float32, how
+    the light differs then, grey levels, 0 where it is not seen. residual : standard deviation of the
+    difference over that of the change of light. seen : share of the template's cells.
     """
 
     motion: Floats
     covariance: Floats
+    error: Floats32
     residual: float
     seen: float
-    fresh: float
 
 
 def template_of(change: Floats32, mask: Mask) -> Template | None:
@@ -117,22 +132,40 @@ def template_of(change: Floats32, mask: Mask) -> Template | None:
     rows, columns = np.nonzero(inside > 127)
     if len(rows) < FEWEST:
         return None
+    side = max(round(math.sqrt(len(rows) / PATCHES)), 1)
     every = -(-len(rows) // MOST)
     rows, columns = rows[::every], columns[::every]
+    patches = np.unique(rows // side * len(change[0]) + columns // side, return_inverse=True)[1]
+    order = np.argsort(patches)
+    rows, columns, patches = rows[order], columns[order], patches[order]
     places = np.column_stack([columns, rows])
     center = places.mean(axis=0)
     away = (places - center).astype(np.float32)
-    radius = math.sqrt((away * away).sum(axis=1).mean())
+    moments = np.asarray(away.T @ away, np.float64) / len(away)
+    radius = math.sqrt(np.trace(moments))
     light = change[..., :3]
     dx, dy = (
         cv2.Sobel(light, cv2.CV_32F, *axis, ksize=3, scale=1 / 8)[rows, columns] for axis in ((1, 0), (0, 1))
     )
     x, y = (away / np.float32(radius)).T[:, :, None]
     values = light[rows, columns]
-    by = np.stack([dx, dy, x * dy - y * dx, x * dx + y * dy, -values], axis=-1).reshape(-1, 5)
-    power = np.asarray(by.T @ by, np.float64)
+    by = np.stack([dx, dy, x * dy - y * dx, x * dx + y * dy, -values], axis=-1)
+    power = np.einsum("nci,ncj->ij", by, by, dtype=np.float64)
+    # Of each channel, a slope over x and over y, and a part of every channel.
+    slopes = np.einsum("nci,knc->ikc", by, np.stack([x * values, y * values])).reshape(5, -1)
+    mixtures = np.einsum("nci,nd->icd", by, values).reshape(5, -1)
+    lamps = LAMPS * np.hstack([slopes, mixtures]).astype(np.float64)
     contrast = float(np.sqrt(values.var(axis=0).mean()))
-    return Template(center, radius, away, values, by, power, contrast)
+    lamps = lamps @ lamps.T
+    return Template(center, radius, moments, away, patches, values, by, power, lamps, contrast, _noise(light))
+
+
+def _noise(light: Floats32) -> float:
+    """Variance of the difference of two pictures like this one (h, w, 3), by Immerkaer's differences, which a
+    smooth picture does not have: most of the gel is untouched."""
+    line = np.array([1.0, -2.0, 1.0])
+    differences = np.abs(cv2.sepFilter2D(light, cv2.CV_32F, line, line)[1:-1, 1:-1])
+    return max(2 * (MAD_TO_SIGMA * float(np.median(differences))) ** 2 / 36, ROUNDING)
 
 
 def register(
@@ -144,46 +177,46 @@ def register(
     deviation of what is known beforehand; it decides where the picture tells nothing.
     """
     motion, prior = start, np.diag(spread**-2.0)
+    error, sums, turned = np.empty_like(template.light), np.empty(10), np.eye(5)
+    independent = 3 * (int(template.patches[-1]) + 1)
     for _ in range(STEPS):
-        error, shown = _difference(template, change, motion)
-        count = int(np.count_nonzero(shown))
-        if count < max(SEEN * len(shown), FEWEST):
-            return None
-        power = float(np.vdot(error, error)) / (3 * count)
-        shaded = UNEVEN + ELSE * (abs(float(motion[3])) / template.radius + abs(float(motion[4])))
-        shaded = (shaded * template.contrast) ** 2
-        # As many independent errors as there are patches.
-        weight = min(PATCHES / count, 1.0) / (power + NOISE**2 + shaded)
-        gradient = weight * (template.by.T @ error.ravel()) + prior @ (motion - expected)
-        step = -np.linalg.solve(weight * count / len(shown) * template.power + prior, gradient)
-        turn = motion[2] / template.radius
+        turn, growth = (motion[2:4] / template.radius).tolist()
         cos, sin = math.cos(turn), math.sin(turn)
-        step[:2] = cos * step[0] - sin * step[1], sin * step[0] + cos * step[1]
+        warp = np.array([*(math.exp(growth) * np.array([cos, sin])), *(template.center + motion[:2])])
+        count = compare_light(
+            change,
+            warp,
+            1 + motion[4],
+            template.away,
+            template.light,
+            template.by,
+            template.patches,
+            error,
+            sums,
+        )
+        if count < max(SEEN * len(error), FEWEST):
+            return None
+        power, alike = (sums[5:7] / (3 * count)).tolist()
+        variance = max(power, alike * independent / max(independent - 5, 1), template.noise)
+        information = template.power * (count / len(error) / variance)
+        # Gradients are those of the template, which has turned since.
+        turned[:2, :2] = [[cos, -sin], [sin, cos]]
+        gradient = sums[:5] / variance + turned.T @ prior @ (motion - expected)
+        step = -turned @ np.linalg.solve(information + prior, gradient)
         motion = motion + step
         if np.abs(step[:4]).max() < CONVERGED:
             break
     # Lamps that flicker change all of it alike.
-    unlike = math.sqrt(float(error[shown].var(axis=0).mean()))
+    unlike = math.sqrt(max(power - float(np.square(sums[7:] / count).mean()), 0.0))
     residual = unlike / max(template.contrast * (1 + float(motion[4])), 1e-3)
     if residual > UNLIKE:
         return None
-    seen = template.by.reshape(-1, 3, 5)[shown].reshape(-1, 5)
-    covariance = np.linalg.inv(weight * (seen.T @ seen) + prior)
-    fresh = 1 - shaded / (power + NOISE**2 + shaded)
-    return Registration(motion, np.asarray(covariance, np.float64), residual, count / len(shown), fresh)
-
-
-def _difference(template: Template, change: Floats32, motion: Floats) -> tuple[Floats32, Flags]:
-    """(N, 3) float32 and (N,): how the light where the template's cells are after a motion differs from its
-    own, 0 where it is not known; where it is."""
-    turn, growth = (motion[2:4] / template.radius).tolist()
-    scale = math.exp(growth)
-    cos, sin = scale * math.cos(turn), scale * math.sin(turn)
-    x, y = template.away.T
-    left, top = (template.center + motion[:2]).tolist()
-    columns, rows = (cos * x - sin * y + left)[:, None], (sin * x + cos * y + top)[:, None]
-    light = cv2.remap(change, columns, rows, cv2.INTER_LINEAR)[:, 0]
-    shown = np.asarray(light[:, 3] > KNOWN)
-    error = light[:, :3] - np.float32(1 + motion[4]) * template.light
-    error[~shown] = 0
-    return error, shown
+    # Noise has gradients, too, which tell nothing; nor are those right of what differs.
+    gradients = 3 * count * SOBEL / variance * np.diag([1.0, 1.0, 1.0, 1.0, 0.0])
+    values, axes = np.linalg.eigh(information - template.noise * gradients)
+    known = (axes * np.maximum(values, LEAST)) @ axes.T
+    known = known @ np.linalg.solve(known + power * gradients + template.lamps / variance**2, known)
+    covariance = np.linalg.inv(known + prior)
+    covariance, known = (turned @ part @ turned.T for part in (covariance, known))
+    motion = expected + covariance @ known @ (motion - expected)
+    return Registration(motion, covariance, error, residual, count / len(error))

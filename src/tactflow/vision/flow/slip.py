@@ -32,7 +32,7 @@ OVERLAP: Final = 0.7
 AGED: Final = 0.35
 """Residual from which on the keyframe is replaced: the object shows another side."""
 PRESSED: Final = 0.3
-"""Growth of the contact, or change of its contrast, relative, from which on the keyframe is replaced."""
+"""Growth of the contact, relative, from which on the keyframe is replaced."""
 ROUNDS: Final = 3
 """Of the search for the gel under a point: the field is smooth, so that each gains a digit."""
 LEAST_MOVED: Final = 1e-6
@@ -61,7 +61,8 @@ class _Key(NamedTuple):
 
     cells : (rows, columns), which cells. rest, before : (M,) complex, where they are at rest, px, and how far
     they had moved; share : (M,), how they count, with the sum 1; number : of them, by their shares.
-    slid, covariance : (3,), (3, 3), slip from the start to this frame, px and radians.
+    slid, covariance : (3,), (3, 3), slip from the start to this frame, px and radians. grown : by how much
+    the contact has grown until then, natural logarithm.
     """
 
     template: Template
@@ -72,18 +73,24 @@ class _Key(NamedTuple):
     number: float
     slid: Floats
     covariance: Floats
+    grown: float
 
 
 class _Moment(NamedTuple):
-    """What is known at a time, s: the rigid motion (3,) of the gel under the object since it was at rest, the
-    slip (3,) until then, its covariance (3, 3), and what of that stems from before the keyframe; px and
-    radians."""
+    """What is known at a time, s.
+
+    gel : (3,), rigid motion of the gel under the object since it was at rest. slid, covariance : (3,),
+    (3, 3), slip until then, without what the growth of the contact may add; px and radians. grown : see
+    `_Key`. error : of the registration.
+    """
 
     time: float
+    key: _Key
     gel: Floats
     slid: Floats
     covariance: Floats
-    inherited: Floats
+    grown: float
+    error: Floats32
 
 
 class SlipTracker:
@@ -151,20 +158,21 @@ class SlipTracker:
             self.reset()
             if template is None:
                 return None
-            key = _keyframe(template, field, share, np.zeros(3), np.zeros((3, 3)))
+            key = _keyframe(template, field, share, np.zeros(3), np.zeros((3, 3)), 0.0)
             self._since, self._began, at_rest = seq, time, np.zeros(5)
-            found = Registration(at_rest, np.zeros((5, 5)), 0.0, 1.0, 1.0)
+            found = Registration(at_rest, np.zeros((5, 5)), 0 * template.light, 0.0, 1.0)
         now = _slid(key, found, field, time)
         self._recent.append(now)
         while len(self._recent) > 2 and time - self._recent[1].time > WINDOW - 1e-6:
             self._recent.popleft()
-        slip = self._slip(key, found.fresh, gel.stderr, math.hypot(*gel.outline_stderr), torn)
+        slip = self._slip(gel.stderr, math.hypot(*gel.outline_stderr), torn)
         if slip.slipping:
             self._grip = None
         else:
             slip = replace(slip, stick_ratio=self._sticking(field, share))
         if _aged(key, found) and (template := template_of(change, mask)) is not None:
-            key = _keyframe(template, field, share, now.slid, now.covariance)
+            covariance = now.covariance + _of_growth(key, now.grown - key.grown)
+            key = _keyframe(template, field, share, now.slid, covariance, now.grown)
         if key is not self._key:
             self._key, self._last, self._before = key, np.zeros(5), np.zeros(5)
         return slip
@@ -202,13 +210,14 @@ class SlipTracker:
             return 1.0
         return stick_ratio(before, share, field.grid.points, field.displacement - displacement, field.noise)
 
-    def _slip(self, key: _Key, fresh: float, gel_stderr: float, outline_stderr: float, torn: bool) -> Slip:
-        """The slip up to now. fresh : part of the variance that is new in each frame. gel_stderr,
-        outline_stderr : of the mean displacement of the gel, and what the outline does to it, px."""
+    def _slip(self, gel_stderr: float, outline_stderr: float, torn: bool) -> Slip:
+        """The slip up to now. gel_stderr, outline_stderr : of the mean displacement of the gel, and what the
+        outline does to it, px. torn : whether the picture has changed at once."""
         then, now = self._recent[0], self._recent[-1]
-        radius = key.template.radius * PX
+        key, radius = now.key, now.key.template.radius * PX
         gel_variance = gel_stderr**2 * np.array([1.0, 1.0, 2 / radius**2])
-        slid, stderr = now.slid.tolist(), np.sqrt(np.diag(now.covariance) + gel_variance).tolist()
+        covariance = now.covariance + _of_growth(key, now.grown - key.grown) + np.diag(gel_variance)
+        slid, stderr = now.slid.tolist(), np.sqrt(np.diag(covariance)).tolist()
         probability, speed, speed_stderr = 0.0, None, None
         drag_stderr = math.hypot(gel_stderr, outline_stderr) + LEAST_MOVED
         if torn:
@@ -216,8 +225,11 @@ class SlipTracker:
         if now is not then:
             # At the RMS radius, where a turn moves the object as much as a shift.
             lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
-            covariance = now.covariance + then.covariance - 2 * then.inherited
-            covariance = (fresh * covariance + np.diag(gel_variance)) * np.outer(lever, lever)
+            covariance = now.covariance + then.covariance - 2 * then.key.covariance
+            if key is then.key:
+                covariance *= 1 - _correlation(now.error, then.error)
+            covariance += _of_growth(key, now.grown - then.grown) + np.diag(gel_variance)
+            covariance *= np.outer(lever, lever)
             # What errors alone may make counts less: a smooth ball does not show how it turns.
             shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLID * radius) ** 2)
             moved = shrink @ ((now.slid - then.slid) * lever)
@@ -231,33 +243,37 @@ class SlipTracker:
             probability = slides * _normal(dragged / drag_stderr)
             speed, speed_stderr = length / time, error / time
         return Slip(
-            probability > 0.5,
-            0.0,
-            probability,
-            (slid[0], slid[1]),
-            -math.degrees(slid[2]) + 0.0,
-            speed,
-            self._since,
-            (stderr[0], stderr[1]),
-            math.degrees(stderr[2]),
-            speed_stderr,
+            slipping=probability > 0.5,
+            stick_ratio=0.0,
+            probability=probability,
+            translation=(slid[0], slid[1]),
+            rotation=-math.degrees(slid[2]) + 0.0,
+            speed=speed,
+            since=self._since,
+            translation_stderr=(stderr[0], stderr[1]),
+            rotation_stderr=math.degrees(stderr[2]),
+            speed_stderr=speed_stderr,
         )
 
 
 def _keyframe(
-    template: Template, field: DisplacementField, share: Floats, slid: Floats, covariance: Floats
+    template: Template,
+    field: DisplacementField,
+    share: Floats,
+    slid: Floats,
+    covariance: Floats,
+    grown: float,
 ) -> _Key:
     """A frame that others are compared with. share : (rows, columns), of each cell in contact."""
     inside = _core(field.grid.points, share) & (share > 0)
     rest, before = _complex(field.grid.points[inside]), _complex(field.displacement[inside])
     count = float(share[inside].sum())
-    return _Key(template, inside, rest, before, share[inside] / count, count, slid, covariance)
+    return _Key(template, inside, rest, before, share[inside] / count, count, slid, covariance, grown)
 
 
 def _aged(key: _Key, found: Registration) -> bool:
     """Whether the keyframe is to be replaced."""
-    growth, contrast = np.abs(found.motion[3:]).tolist()
-    pressed = max(growth / key.template.radius, contrast) > PRESSED
+    pressed = abs(float(found.motion[3])) / key.template.radius > PRESSED
     return found.seen < OVERLAP or found.residual > AGED or pressed
 
 
@@ -277,7 +293,16 @@ def _slid(key: _Key, found: Registration, field: DisplacementField, time: float)
     covariance = key.covariance + found.covariance[:3, :3] * np.outer(to_px, to_px)
     covariance += variance * np.diag([1.0, 1.0, 2 / (radius * PX) ** 2])
     gel = _rigid(now - key.share @ now, moved, key.share)[0]
-    return _Moment(time, gel, key.slid + slid, covariance, key.covariance)
+    grown = float(found.motion[3]) / radius
+    return _Moment(time, key, gel, key.slid + slid, covariance, key.grown + grown, found.error)
+
+
+def _of_growth(key: _Key, grown: float) -> Floats:
+    """(3, 3), px and radians: covariance of what a growth of the contact adds to its shift. What is pressed
+    harder grows around one of its points; each may be it."""
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = (grown * PX) ** 2 * key.template.moments
+    return covariance
 
 
 def _complex(pairs: Floats) -> Complexes:
@@ -311,6 +336,12 @@ def _core(places: Floats, share: Floats) -> Flags:
     order = np.argsort(distance, axis=None)
     filled = np.cumsum(share.flat[order])
     return np.asarray(distance <= distance.flat[order[np.searchsorted(filled, CORE * filled[-1])]])
+
+
+def _correlation(first: Floats32, second: Floats32) -> float:
+    """Correlation of what two registrations with one template leave, 0 to 1."""
+    power = math.sqrt(float(np.vdot(first, first)) * float(np.vdot(second, second)))
+    return max(float(np.vdot(first, second)), 0.0) / max(power, 1e-9)
 
 
 def _normal(value: float) -> float:
