@@ -32,7 +32,8 @@ OVERLAP: Final = 0.7
 AGED: Final = 0.35
 """Residual from which on the keyframe is replaced: the object shows another side."""
 PRESSED: Final = 0.3
-"""Growth of the contact, relative, from which on the keyframe is replaced."""
+"""Growth of the contact, relative, from which on the keyframe is replaced: a larger picture shows better how
+it turns."""
 ROUNDS: Final = 3
 """Of the search for the gel under a point: the field is smooth, so that each gains a digit."""
 LEAST_MOVED: Final = 1e-6
@@ -132,7 +133,7 @@ class SlipTracker:
         """Nothing touches the gel: what comes is another contact."""
         self._key: _Key | None = None
         self._since, self._began = 0, 0.0
-        self._last = self._before = np.zeros(5)
+        self._last = np.zeros(5)
         self._grip: tuple[Floats, Floats] | None = None
         self._recent: deque[_Moment] = deque()
 
@@ -170,28 +171,29 @@ class SlipTracker:
             self._grip = None
         else:
             slip = replace(slip, stick_ratio=self._sticking(field, share))
-        if _aged(key, found) and (template := template_of(change, mask)) is not None:
+        pressed = abs(now.grown - key.grown) > PRESSED
+        aged = found.seen < OVERLAP or found.residual > AGED or pressed
+        if aged and (template := template_of(change, mask)) is not None:
             covariance = now.covariance + _of_growth(key, now.grown - key.grown)
             key = _keyframe(template, field, share, now.slid, covariance, now.grown)
         if key is not self._key:
-            self._key, self._last, self._before = key, np.zeros(5), np.zeros(5)
+            self._key, self._last = key, np.zeros(5)
         return slip
 
     def _registered(self, key: _Key, change: Floats32, field: DisplacementField) -> Registration | None:
-        """How the picture has moved since the keyframe: on as before, or else not since the last frame, or
-        with the gel."""
+        """How the picture has moved since the keyframe: nearly as in the last frame, or else with the gel."""
         moved = _complex(field.displacement[key.cells]) - key.before
         x, y, turn = _rigid(key.rest + key.before - key.template.place, moved, key.share)[0].tolist()
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
         best: Registration | None = None
-        for start in (2 * self._last - self._before, self._last, expected):
+        for start in (self._last, expected):
             found = register(key.template, change, start, expected, SPREAD)
             if found is not None and (best is None or found.residual < best.residual):
                 best = found
             if best is not None and best.residual < AGED:
                 break
         if best is not None:
-            self._before, self._last = self._last, best.motion
+            self._last = best.motion
         return best
 
     def _torn(self, key: _Key | None, template: Template, time: float) -> bool:
@@ -269,12 +271,6 @@ def _keyframe(
     rest, before = _complex(field.grid.points[inside]), _complex(field.displacement[inside])
     count = float(share[inside].sum())
     return _Key(template, inside, rest, before, share[inside] / count, count, slid, covariance, grown)
-
-
-def _aged(key: _Key, found: Registration) -> bool:
-    """Whether the keyframe is to be replaced."""
-    pressed = abs(float(found.motion[3])) / key.template.radius > PRESSED
-    return found.seen < OVERLAP or found.residual > AGED or pressed
 
 
 def _slid(key: _Key, found: Registration, field: DisplacementField, time: float) -> _Moment:
