@@ -151,6 +151,14 @@ def test_what_shows_another_side_within_a_frame_has_slipped() -> None:
         assert (slip.since, slip.slipping) == (8, slipping)
 
 
+def test_markers_that_join_start_the_measurement_anew_and_are_no_slip() -> None:
+    tracker = SlipTracker()
+    for seq in range(10):
+        slip = step(tracker, seq, 60, pitch=20.0 if seq < 8 else 18.0)
+        assert slip is not None
+        assert (slip.since, slip.slipping) == (8 * (seq >= 8), False)
+
+
 @pytest.mark.parametrize("spec", ["slide?frames=140", "scrape?frames=140", "spin?frames=140"])
 def test_translation_and_rotation_are_right_and_their_errors_honest(spec: str) -> None:
     scene, start, misses = open_scene(spec), (np.zeros(2), 0.0), []
@@ -179,14 +187,20 @@ STRIPES = np.tile(np.repeat(np.array([20, 250], np.uint8), 10), (60, 3))
 
 
 def step(
-    tracker: SlipTracker, seq: int, left: int | None, shown: float = 1.0, striped: bool = False
+    tracker: SlipTracker,
+    seq: int,
+    left: int | None,
+    shown: float = 1.0,
+    striped: bool = False,
+    pitch: float = 20.0,
 ) -> Slip | None:
     """A square with texture on gel that is dragged to the right; None where no pixel is in contact.
 
-    shown : the part of it that the outline holds."""
-    x, y = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
+    shown : the part of it that the outline holds. pitch : of the markers, px."""
+    x, y = np.meshgrid(np.arange(10.0, 200, pitch), np.arange(10.0, 200, pitch))
     origin = np.column_stack([x.ravel(), y.ravel()])
-    markers = Markers(origin, origin + np.array([3.0, 0]), np.zeros(100, np.uint8), np.full(100, NOISE))
+    count = len(origin)
+    markers = Markers(origin, origin + np.array([3.0, 0]), np.zeros(count, np.uint8), np.full(count, NOISE))
     field = FieldModel(origin, (200, 200))(markers)
     assert field is not None
     mask, picture = np.zeros((200, 200), np.uint8), np.zeros((200, 200, 3), np.uint8)

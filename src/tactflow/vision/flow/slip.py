@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Mask
-from tactflow.vision.flow.displacement_field import CELL, DisplacementField
+from tactflow.vision.flow.displacement_field import CELL, DisplacementField, Grid
 from tactflow.vision.flow.in_mask import OUTLINE, UNKNOWN
 from tactflow.vision.flow.registration import CELL as PX
 from tactflow.vision.flow.registration import UNLIKE, Registration, Template, register, template_of
@@ -60,13 +60,15 @@ Complexes = NDArray[np.complex128]
 class _Key(NamedTuple):
     """The frame that others are compared with: its picture and the gel in the middle of its contact.
 
-    cells : (rows, columns), which cells. rest, before : (M,) complex, where they are at rest, px, and how far
-    they had moved; share : (M,), how they count, with the sum 1; number : of them, by their shares.
+    grid, cells : of the field, and (rows, columns), which of its cells. rest, before : (M,) complex, where
+    they are at rest, px, and how far they had moved; share : (M,), how they count, with the sum 1; number :
+    of them, by their shares.
     slid, covariance : (3,), (3, 3), slip from the start to this frame, px and radians. grown : by how much
     the contact has grown until then, natural logarithm.
     """
 
     template: Template
+    grid: Grid
     cells: Flags
     rest: Complexes
     before: Complexes
@@ -149,10 +151,11 @@ class SlipTracker:
         if gel is None or gel.unknown > UNKNOWN:
             self.reset()
             return None
-        share, key, found = field.share(mask), self._key, None
-        if key is not None and key.cells.shape == share.shape:  # else markers have joined
-            found = self._registered(key, change, field)
-        torn = False
+        if self._key is not None and self._key.grid != field.grid:
+            # Markers have joined: the field is another one.
+            self.reset()
+        share, key, torn = field.share(mask), self._key, False
+        found = None if key is None else self._registered(key, change, field)
         if key is None or found is None:
             template = template_of(change, mask)
             torn = template is not None and self._torn(key, template, time)
@@ -224,7 +227,7 @@ class SlipTracker:
         drag_stderr = math.hypot(gel_stderr, outline_stderr) + LEAST_MOVED
         if torn:
             probability = _normal((math.hypot(*now.gel[:2]) - SLID * radius) / drag_stderr)
-        if now is not then:
+        if now.time > then.time:
             # At the RMS radius, where a turn moves the object as much as a shift.
             lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
             covariance = now.covariance + then.covariance - 2 * then.key.covariance
@@ -270,7 +273,9 @@ def _keyframe(
     inside = _core(field.grid.points, share) & (share > 0)
     rest, before = _complex(field.grid.points[inside]), _complex(field.displacement[inside])
     count = float(share[inside].sum())
-    return _Key(template, inside, rest, before, share[inside] / count, count, slid, covariance, grown)
+    return _Key(
+        template, field.grid, inside, rest, before, share[inside] / count, count, slid, covariance, grown
+    )
 
 
 def _slid(key: _Key, found: Registration, field: DisplacementField, time: float) -> _Moment:
