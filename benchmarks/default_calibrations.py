@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.depth import SETS, radii_of, scale_of, sessions_of
+from tactflow.calibration import KINDS
 from tactflow.calibration.file import (
     KIND_ERRORS,
     Calibration,
@@ -23,7 +24,6 @@ from tactflow.calibration.file import (
 )
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.samples import press_errors, summary
-from tactflow.calibration.stored import KINDS
 
 LEARNED = {
     "mini": (

@@ -25,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tactflow
+from tactflow.calibration import KINDS
 from tactflow.calibration.file import Calibration, PhotometricEntry
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press, Session
 from tactflow.calibration.refine import refine_photometry
 from tactflow.calibration.samples import press_errors
 from tactflow.calibration.scale import centre
-from tactflow.calibration.stored import KINDS
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Scale
@@ -121,7 +121,9 @@ def judge(
         sneddon = contact / 2 * np.log((ball_radius + contact) / (ball_radius - contact))
         stated = (depth.greatest_stderr or np.nan) / depth.greatest
         step = border(depth.heights) / depth.greatest
-        rows.append([depth.greatest / cap, depth.greatest / sneddon, step, abs(cap_error) / stated])
+        # Stated errors are relative to what was found.
+        off = abs(cap_error) / (1 + cap_error)
+        rows.append([depth.greatest / cap, depth.greatest / sneddon, step, off / stated])
     over_cap, over_sneddon, step = np.median(rows, axis=0)[:3]
     cap_rms = 100 * np.sqrt(np.nanmean(errors[:, 3] ** 2))
     one, two = (100 * np.nanmean(np.array(rows)[:, 3] < k) for k in (1, 2))

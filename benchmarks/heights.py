@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 import tactflow
 from benchmarks.depth import SETS, radii_of, read, scale_of
 from benchmarks.peers.depth import CHOICES, PixelNetwork
+from tactflow.calibration import KINDS
 from tactflow.calibration.file import Calibration
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press
-from tactflow.calibration.stored import KINDS
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Scale
 

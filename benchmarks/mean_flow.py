@@ -1,11 +1,12 @@
-"""Judge the stated error of the mean flow, the outline's error in it, on simulated gels.
+"""Judge the stated error of the mean flow, the outline's error in it.
 
-    python -m benchmarks.mean_flow [--scenes 150] [--seeds 1 2]
+    python -m benchmarks.mean_flow [--data ../shared/data] [--scenes 150] [--seeds 1 2]
 
-Named scenes of the simulator, and random gels far beyond any single sensor (`benchmarks/wide.py`), all
-through the pipeline `default`. Columns: RMS error of the mean flow, px; median of its stated error, px; share
-of errors within one and within two stated errors, %; median overlap (IoU) of the contact's region with the
-true one; frames. Random gels are split by that overlap: below 0.3 the contact was found somewhere else.
+Real gels with dots, lab by lab, where the true mean is that inside the outline that a person drew; named
+scenes of the simulator; and random gels far beyond any single sensor (`benchmarks/wide.py`); all through the
+pipeline `default`. Columns: RMS error of the mean flow, px; median of its stated error, px; share of errors
+within one and within two stated errors, %; median overlap (IoU) of the contact's region with the true one;
+frames. Random gels are split by that overlap: below 0.3 the contact was found somewhere else.
 """
 
 from __future__ import annotations
@@ -14,13 +15,16 @@ import argparse
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 import tactflow
 from benchmarks.wide import WideScene, wide_scene
-from tactflow.bench.metrics import mask_iou
+from tactflow.bench.judge import OUTLINES, PLAIN, labelled
+from tactflow.bench.label_file import load_labels
+from tactflow.bench.metrics import filled_polygons, mask_iou
 from tactflow.engine.errors import TactflowError
 from tactflow.message.result import Result
 from tactflow.sim import open_scene
@@ -52,6 +56,24 @@ def compare(result: Result, truth: Floats, contact: Floats) -> Comparison | None
     if mask is None or flow is None or flow.mean is None or flow.stderr is None:
         return None
     return Comparison(np.subtract(flow.mean, truth), np.array(flow.stderr), mask_iou(mask, contact))
+
+
+def real(data: Path) -> dict[str, list[Comparison]]:
+    """Labelled frames of each lab."""
+    labels = [label for label in load_labels(OUTLINES) if label.outlines]
+    labels = [label for label in labels if not label.recording.startswith(PLAIN)]
+    labs: dict[str, list[Comparison]] = {}
+    for label, result in labelled("default", labels, data):
+        if result is None or result.field is None:
+            continue
+        mapping = result["mapping"]
+        corners = [mapping.to_processed(outline) for outline in label.outlines or ()]
+        drawn = np.where(filled_polygons(corners, mapping.size[::-1]) > 0, 255, 0).astype(np.uint8)
+        motion = result.field.motion(drawn)
+        comparison = motion and compare(result, np.array(motion.mean), drawn > 0)
+        if comparison:
+            labs.setdefault(label.lab, []).append(comparison)
+    return labs
 
 
 def named(name: str, seed: int) -> Iterator[Comparison]:
@@ -111,14 +133,17 @@ def row(name: str, frames: list[Comparison]) -> list[str]:
 
 
 def main() -> None:
-    """Judge both kinds of scenes."""
+    """Judge all kinds of scenes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--scenes", type=int, default=150, help="random gels with dots and a contact")
     parser.add_argument("--seeds", type=int, nargs="*", default=[1], help="of the named scenes")
     args = parser.parse_args()
     logging.disable(logging.WARNING)
+    labs = real(args.data)
     sets = {name: [comparison for seed in args.seeds for comparison in named(name, seed)] for name in NAMED}
-    rows = [row(name, frames) for name, frames in sets.items() if frames]
+    rows = [row(name, frames) for name, frames in (labs | sets).items() if frames]
+    outlined = [comparison for frames in labs.values() for comparison in frames]
     known = [comparison for frames in sets.values() for comparison in frames]
     gels: list[Comparison] = []
     seed, tried = FIRST, 0
@@ -134,6 +159,7 @@ def main() -> None:
             continue
         gels += [comparison] if comparison else []
     found = [comparison for comparison in gels if comparison.overlap > FOUND]
+    rows += [row("all labs", outlined)] if outlined else []
     rows += [row("all named", known)] if known else []
     rows += [row("random, found", found), row("random, all", gels)]
     show(table([["scene", "error, px", "stated, px", "one, two", "overlap", "frames"], *rows]))

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 
 import tactflow
 from benchmarks.depth import EDGE, SETS, Balls, scale_of, sessions_of
+from tactflow.calibration import KINDS
 from tactflow.calibration.file import Calibration
 from tactflow.calibration.presses import Session
-from tactflow.calibration.stored import KINDS
 from tactflow.sim import shapes
 from tactflow.sim.recipes import SCENES
 from tactflow.vision.depth.surface import Rest, Surface
@@ -242,7 +242,7 @@ def simulated_calibration(folder: Path) -> Path:
     calibration = folder / "calibration" / "main.yaml"
     if not calibration.exists():
         command = [sys.executable, "-m", "tactflow", "calibrate", "--from", "sim:ball?frames=600"]
-        command += ["--pitch", "1.724", "--ball-radius", "2.375", "--fresh"]
+        command += ["--pitch", "1.724", "--ball-radius", "2.375"]
         subprocess.run(command, cwd=folder, check=True)
     return calibration
 

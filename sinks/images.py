@@ -1,4 +1,4 @@
-"""Images: every n-th annotated frame as a numbered file."""
+"""Images: annotated frames as numbered files."""
 
 from __future__ import annotations
 
@@ -12,37 +12,31 @@ from pydantic import Field
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
+from tactflow.outputs import cannot_write
 from tactflow.ports import Picture
 from tactflow.system.files import expanded, make_folder, next_name
-from tactflow.system.outputs import cannot_write
 
 UNFINISHED = ".unfinished"
-"""Name of a picture until all of it is written, so that nobody reads half of one."""
+"""Name of a picture until it is complete."""
 
 
 class Images(Sink):
     """Writes pictures to `folder/frame-000036.png`, numbered by the frame's `seq`.
 
-    The picture comes from the port `annotated`. `in: {annotated: inpaint.unmarked}` writes another port
-    instead, as long as it is a colour image.
+    The picture comes from the port `annotated`; `in: {annotated: inpaint.unmarked}` selects another colour
+    image. `max_rate` writes fewer frames.
     """
 
     threaded = True
 
     class Params(StageParams):
-        """Where to write, what kind of file, and how many."""
+        """Destination and format."""
 
         folder: str = Field(
             "images", min_length=1, description="folder, relative to the current directory; created"
         )
-        format: Literal["png", "jpg"] = Field("png", description="png keeps every bit, jpg is small and fast")
-        quality: int = Field(95, ge=1, le=100, description="of a jpg: 100 is best and largest")
-        every: int = Field(
-            1,
-            ge=1,
-            description="write the frames whose seq is a multiple of this (after a drop, the next one). The "
-            "others are drawn all the same; max_rate avoids that",
-        )
+        format: Literal["png", "jpg"] = Field("png", description="png is lossless, jpg is small and fast")
+        quality: int = Field(95, ge=1, le=100, description="of a jpg; 100 is the best and largest")
         overwrite: bool = Field(
             False, description="write into a folder that already holds frame-*.png or .jpg"
         )
@@ -52,7 +46,6 @@ class Images(Sink):
         super().__init__(params)
         self._folder = expanded(params.folder)
         self.description = str(self._folder)
-        self._next = 0
         self._files = 0
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
 
@@ -63,13 +56,13 @@ class Images(Sink):
 
     @classmethod
     def on_restart(cls, params: Images.Params) -> Images.Params:
-        """It goes on in another folder, `images-001`, beside the one that it has begun."""
+        """Continue in another folder, `images-001`."""
         return params.changed(folder=str(next_name(expanded(params.folder))), overwrite=False)
 
     def open(self) -> None:
         """Create the folder.
 
-        Raises StageError if it holds frames already and `overwrite` is not set, or it cannot be created.
+        Raises StageError if it already holds frames and `overwrite` is not set, or it cannot be created.
         """
         try:
             make_folder(self._folder)
@@ -87,15 +80,8 @@ class Images(Sink):
         return {"files": self._files}
 
     def write(self, tick: Tick, annotated: Picture) -> None:
-        """Write one file if it is this frame's turn.
-
-        Raises StageError if it cannot be written.
-        """
-        seq, every = tick.frame.seq, self.params.every
-        if seq < self._next:
-            return
-        self._next = seq - seq % every + every
-        path = self._folder / f"frame-{seq:06d}.{self.params.format}"
+        """Write one file. Raises StageError if it cannot be written."""
+        path = self._folder / f"frame-{tick.frame.seq:06d}.{self.params.format}"
         _, data = cv2.imencode(path.suffix, annotated, self._options)
         unfinished = self._folder / UNFINISHED
         try:
@@ -104,6 +90,6 @@ class Images(Sink):
         except OSError as error:
             with suppress(OSError):
                 unfinished.unlink()
-            kept = f"the {self._files} pictures written before are whole"
+            kept = f"the {self._files} pictures written before are complete"
             raise cannot_write(path, error, kept) from error
         self._files += 1

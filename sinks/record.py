@@ -1,4 +1,4 @@
-"""Record: every accepted frame without loss, and its results, in an MCAP file that can be played again."""
+"""Record: lossless frames and their results in an MCAP file, which is also a source."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 BACKLOG_SHARE = 4
-"""Frames from memory that are written per new frame, so that saving them never holds up the run."""
+"""Frames of the ring written per new frame, so that saving them does not delay the run."""
 
 
 class Record(Recorder):
-    """Records to a file from the start, when told to, or when something touches the gel.
+    """Records from the start, on command, or during contacts.
 
     With `ring`, the last seconds are kept in memory, compressed, and become the beginning of the file. A
-    recording always holds the reference frames that its frames are compared with.
+    recording always includes the reference frames of its frames.
 
-    A recording from the start goes to `path` itself and all others to `path` with a number, `press-001.mcap`;
-    those never replace a file. With `rotate_size` or `rotate_after`, a long recording goes on in further
-    numbered files, each of which can be played by itself.
+    A recording from the start is written to `path`, all others to numbered files, `press-001.mcap`, which
+    never replace a file. With `rotate_size` or `rotate_after`, a long recording continues in further numbered
+    files, each of which can be played by itself.
     """
 
     threaded = True
@@ -46,7 +46,7 @@ class Record(Recorder):
     queue_capacity = 32
 
     class Params(StageParams):
-        """Where to record to, and what begins a recording."""
+        """Destination, and start of a recording."""
 
         path: str = Field(
             "recording.mcap", pattern=r"\.mcap$", description="file, relative to the current directory"
@@ -54,54 +54,51 @@ class Record(Recorder):
         overwrite: bool = Field(False, description="replace an existing file")
         trigger: Literal["start", "button", "contact"] | None = Field(
             None,
-            description="what begins a recording: the start of the run, the button of the view, or a contact "
-            "(each contact its own file); null: the button if there is a ring, else the start",
+            description="what starts a recording: the start of the run, the button of the view, or a contact "
+            "(a file for each); null: the button if there is a ring, else the start",
         )
         ring: float | None = Field(
             None,
             gt=0,
             le=3600,
-            description="seconds kept in memory; the button saves them, and a contact's "
-            "recording begins with them",
+            description="seconds kept in memory; the button saves them, and each recording of a contact "
+            "begins with them",
         )
         memory: int = Field(
             2048,
             ge=16,
-            description="memory limit of the ring, MB (30 s of 800 x 600 at 60 Hz take 1300); what does "
-            "not fit is left out, with a warning",
+            description="memory limit of the ring, MB (30 s of 800 x 600 at 60 Hz take 1300); older frames "
+            "are dropped with a warning",
         )
         after: float = Field(1.0, ge=0, description="seconds recorded after a contact has ended")
         rotate_size: int | None = Field(
-            None, ge=1, description="size at which another, numbered file continues, MB"
+            None, ge=1, description="size at which another numbered file begins, MB"
         )
         rotate_after: float | None = Field(
-            None, gt=0, description="time after which another, numbered file continues, s"
+            None, gt=0, description="time after which another numbered file begins, s"
         )
-        preview: float = Field(
-            10.0, ge=0, le=240, description="rate of the JPEG pictures for people, Hz; 0 leaves them out"
-        )
-        quality: int = Field(80, ge=1, le=100, description="of those; higher is sharper and larger")
+        preview: float = Field(10.0, ge=0, le=240, description="rate of JPEG previews, Hz; 0: none")
+        quality: int = Field(80, ge=1, le=100, description="of the previews; higher is sharper and larger")
 
         @model_validator(mode="after")
         def _ring_needs_a_moment(self) -> Record.Params:
             if self.ring is not None and self.trigger == "start":
-                raise ValueError("ring keeps what came before a trigger: set trigger to button or contact")
+                raise ValueError("ring keeps the time before a trigger: set trigger to button or contact")
             return self
 
         @property
         def begins(self) -> Literal["start", "button", "contact"]:
-            """The trigger that is meant."""
+            """The trigger, with the default resolved."""
             return self.trigger or ("start" if self.ring is None else "button")
 
         def needed_inputs(self) -> Mapping[str, str]:
-            """A contact must be seen to begin a recording."""
+            """The trigger `contact` requires the port `contact`."""
             return {"contact": "trigger"} if self.trigger == "contact" else {}
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is written yet.
 
-        sensor : names the channels of the file. control : the run, whose settings are written beside the
-        frames; or None.
+        sensor : names the channels of the file. control : the run, whose settings are attached; or None.
         """
         super().__init__(params)
         self.description = params.path
@@ -121,17 +118,17 @@ class Record(Recorder):
 
     @classmethod
     def outputs(cls, params: Record.Params) -> Sequence[Output]:
-        """The file, or the one whose name the numbered files carry."""
+        """The file; numbered files have its name and a number."""
         refuses = params.begins == "start" and not params.overwrite
         return (Output(expanded(params.path), "file", "path", refuses_existing=refuses),)
 
     @classmethod
     def on_restart(cls, params: Record.Params) -> Record.Params:
-        """It goes on in another file, beside the one that it has begun."""
+        """Continue in another file."""
         return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
-        """Begin the file, if recording starts with the run.
+        """Create the file, if recording starts with the run.
 
         Raises StageError if the file exists and `overwrite` is not set, it cannot be written, or a package is
         missing.
@@ -144,11 +141,11 @@ class Record(Recorder):
 
     @property
     def recording(self) -> bool:
-        """Whether a file is being written. In ring mode it ends by itself."""
+        """Whether a file is being written. With a ring, this ends by itself."""
         return self._file is not None
 
     def start_recording(self) -> None:
-        """Begin a new, numbered file with what the ring holds, which then is all of it. Nothing if recording.
+        """Start a numbered file. With a ring, save the ring and finish. Does nothing if recording.
 
         Raises StageError if it cannot be written.
         """
@@ -158,12 +155,12 @@ class Record(Recorder):
             self._open_next()
             self._backlog = deque(self._ring)
             self._ends = self._backlog[-1].time if self._backlog else None
-            # While the run is paused, no frame comes that would take the ring along.
+            # While the run is paused, no frame would trigger the writing of the ring.
             if self._backlog and self._control is not None and self._control.paused:
                 self.stop_recording()
 
     def stop_recording(self) -> None:
-        """Finish the file, with all that belongs to it. Nothing if not recording.
+        """Finish the file, including pending frames. Does nothing if not recording.
 
         Raises StageError if it cannot be written.
         """
@@ -173,17 +170,17 @@ class Record(Recorder):
             self._finish()
 
     def wants(self) -> bool:
-        """Whether frames are written or kept."""
+        """Whether frames are written or kept in memory."""
         return self.recording or self.params.ring is not None or self.params.trigger == "contact"
 
     def counters(self) -> dict[str, int]:
-        """frames, files : written so far. bytes : of the finished files. ring_frames, ring_bytes : kept."""
+        """frames, files : written so far. bytes : of finished files. ring_frames, ring_bytes : in memory."""
         return self._counts | {"ring_frames": len(self._ring), "ring_bytes": self._ring_bytes}
 
     def write(self, result: Result) -> None:
-        """Record one frame, or keep it for later.
+        """Record one frame, or keep it in memory.
 
-        Raises StageError if it cannot be written. The file then ends with the frame before and can be played.
+        Raises StageError if it cannot be written. The file then ends with the previous frame, and plays.
         """
         with self._lock:
             if not self.wants() and not result.frame.reference:
@@ -201,7 +198,7 @@ class Record(Recorder):
             self._keep(entry)
 
     def close(self) -> None:
-        """Write what is left, and finish the file."""
+        """Write pending frames, and finish the file."""
         self.stop_recording()
 
     def _entry(self, result: Result) -> Entry:
@@ -223,7 +220,7 @@ class Record(Recorder):
         return Entry(time, frame.seq, frame.reference, frame.epoch, data)
 
     def _follow(self, touching: bool, time: int) -> None:
-        """Begin a file when a contact begins; it ends some time after the contact."""
+        """Start a file when a contact begins; it ends some time after the contact."""
         if touching and not self._touching:
             self.start_recording()
         if touching:
@@ -235,7 +232,7 @@ class Record(Recorder):
         return bool(self._backlog) and (self._ends is None or self._backlog[0].time <= self._ends)
 
     def _keep(self, entry: Entry) -> None:
-        """Remember the entry in the ring, and references for as long as frames of their epoch may follow."""
+        """Keep the entry in the ring, and references while frames of their epoch may follow."""
         ring = self._ring
         if self.params.ring is not None:
             ring.append(entry)
@@ -257,9 +254,16 @@ class Record(Recorder):
         self._references = [reference for reference in self._references if reference.epoch >= oldest]
 
     def _open_file(self, path: Path, overwrite: bool = False) -> RecordingWriter:
+        from tactflow.recording.provenance import facts, kept_files
         from tactflow.recording.writer import RecordingWriter
 
-        self._file = RecordingWriter(path, self._sensor, self._control, overwrite=overwrite)
+        self._file = RecordingWriter(
+            path,
+            self._sensor,
+            facts=facts(self._sensor, self._control),
+            files=kept_files(self._control),
+            overwrite=overwrite,
+        )
         self.description = str(path)
         return self._file
 
@@ -269,18 +273,18 @@ class Record(Recorder):
         return file
 
     def _write_entry(self, entry: Entry) -> None:
-        """Write one entry, where the file is large or long enough to a further one."""
+        """Write one entry, to a further file if the current one is full."""
         file = self._file
         assert file is not None
         try:
             if file.frames and self._is_full(file, entry):
-                # `recording` stays True meanwhile, or the run would leave out the next frame.
+                # `recording` must stay True meanwhile, so that the run does not skip the next frame.
                 self._finish_file(file)
                 file = self._open_next()
             if file.frames == 0:
                 for reference in self._references:
                     if reference.epoch == entry.epoch and reference.seq < entry.seq:
-                        # At the beginning of the file's time line, without results of that time.
+                        # At the beginning of the time line, without their earlier results.
                         file.write(replace(reference, data={"frames": reference.data["frames"]}), entry.time)
             file.write(entry)
         except BaseException:

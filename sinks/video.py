@@ -1,4 +1,4 @@
-"""Video: annotated frames as a file to watch."""
+"""Video: annotated frames as a video file."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from tactflow.system.files import expanded, next_name
 class Video(Sink):
     """Writes annotated frames to a video file; its extension chooses the codec.
 
-    The file plays at the pace at which the frames were captured: without `fps`, the rate is the median of
-    the first frames' time differences. Players show frames at a constant rate, so frames that a live run
-    dropped shorten the film.
+    The file plays at the rate of capture: without `fps`, that is the median rate of the first frames. Players
+    show frames at a constant rate, so frames dropped by a live run shorten the film.
     """
 
     threaded = True
 
     class Params(StageParams):
-        """Where to write, and how."""
+        """Destination and rate."""
 
         path: str = Field(
             "annotated.avi",
@@ -57,7 +56,7 @@ class Video(Sink):
 
     @classmethod
     def on_restart(cls, params: Video.Params) -> Video.Params:
-        """It goes on in another file, `annotated-001.avi`, beside the one that it has begun."""
+        """Continue in another file, `annotated-001.avi`."""
         return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
@@ -84,8 +83,8 @@ class Video(Sink):
     def close(self) -> None:
         """Finish the file.
 
-        Raises StageError if not all frames are in it: the disk, or a limit on the size of files, ended it
-        early, or another program has taken it away.
+        Raises StageError if frames are missing, because of a full disk, a limit on the size of files, or
+        another program that removed the file.
         """
         if self._film is not None:
             self._film.close()

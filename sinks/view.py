@@ -1,4 +1,4 @@
-"""View: the run, live, on a page in the browser."""
+"""View: the live page in a browser."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ log = logging.getLogger("tactflow")
 class View(Guiding):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
-    While no page is open, or none is ready for another frame, nothing is wanted and nothing is encoded. A
-    view that cannot be shown is reported once and never stops a run.
+    While no open page is ready for another frame, none is requested or encoded. A view that cannot be served
+    is reported once and never stops a run.
     """
 
     threaded = True
@@ -38,7 +38,7 @@ class View(Guiding):
     observer = True
 
     class Params(StageParams):
-        """Where the page is served, and how much it shows."""
+        """Address of the page, and amount of data."""
 
         host: str = Field(
             "127.0.0.1",
@@ -46,28 +46,25 @@ class View(Guiding):
             description="address of this machine to serve on; any but loopback needs a token, and sends it "
             "unencrypted (from afar, ssh -L 8780:localhost:8780 is safer)",
         )
-        port: int = Field(
-            8780, ge=0, le=65535, description="port; the next free one where it is taken; 0 picks any"
-        )
+        port: int = Field(8780, ge=0, le=65535, description="port, or the next free one; 0: any")
         token: str | None = Field(
             None,
             min_length=16,
             pattern=r"^[A-Za-z0-9_.~-]+$",
-            description="a secret that a page must show, as in http://HOST:PORT/?token=...",
+            description="a secret required of every page, as in http://HOST:PORT/?token=...",
         )
-        max_fps: float = Field(
-            30.0, gt=0, le=240, description="frames shown a second; more is smoother and costs more"
-        )
+        max_fps: float = Field(30.0, gt=0, le=240, description="maximum number of frames per second")
         quality: int = Field(
             85, ge=1, le=100, description="of the JPEG pictures; higher is sharper and larger"
         )
         max_size: int = Field(
-            1280, ge=64, description="larger pictures are reduced to this length of their longer side, px"
+            1280,
+            ge=64,
+            description="maximum length of the longer side of pictures, px; larger ones are reduced",
         )
         neighbours: str | None = Field(
             None,
-            description="folder in which the views of a run of several sensors tell each other where they "
-            "are; such a run sets it by itself",
+            description="folder in which the views of several sensors publish their ports; set by such a run",
         )
 
         @model_validator(mode="after")
@@ -75,7 +72,7 @@ class View(Guiding):
             if self.token is None and not is_loopback(self.host):
                 raise ValueError(
                     f"host {self.host} can be reached from other machines, so a token is required: set token "
-                    "to 16 or more letters and digits that nobody guesses, or host to 127.0.0.1"
+                    "to 16 or more random letters and digits, or host to 127.0.0.1"
                 )
             return self
 
@@ -100,7 +97,7 @@ class View(Guiding):
 
     @classmethod
     def among(cls, params: View.Params, folder: Path, address: str | None) -> View.Params:  # noqa: ARG003
-        """Its page shows a tab for each of the others."""
+        """With tabs for the other sensors."""
         return params.changed(neighbours=str(folder))
 
     def open(self) -> None:
@@ -120,30 +117,28 @@ class View(Guiding):
         from tactflow.view.hub import Hub
         from tactflow.view.server import Server
 
-        session = self.session
-        answers = {} if session is None else {"undo": lambda _: session.undo()}
-        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send, answers)
+        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send)
         self._server = Server(self._hub, listener, p.host, p.token)
         self._server.start()
         self.description = address(p.host, port)
         log.info("view: %s%s", self.description, f"?token={p.token}" if p.token else "")
 
     def wants(self) -> bool:
-        """Whether a page is ready for another frame. From any thread; takes about 0.2 us."""
+        """Whether a page is ready for another frame. Thread-safe; takes about 0.2 us."""
         hub = self._hub
         if hub is None:
             return False
-        # A frame of a paused run is a single step, which every page shall see.
+        # A frame of a paused run is a single step, which every page must show.
         stepped = bool(hub.pages) and self._control is not None and self._control.paused
         return stepped or (hub.wanted and time.perf_counter() >= self._due)
 
     def counters(self) -> dict[str, int]:
-        """encoded : pictures made; and those of `Hub.counters`."""
+        """encoded : encoded pictures; and those of `Hub.counters`."""
         return {"encoded": self._encoded} | ({} if self._hub is None else self._hub.counters())
 
     def write(self, result: Result, valid: Valid | None = None) -> None:
-        """Send the picture and the results; the page draws one over the other."""
-        # What was wanted a moment ago may have become too much meanwhile.
+        """Send the picture and the results, which the page draws over it."""
+        # The pages may not be ready any more.
         if not self.wants():
             return
         now, interval = time.perf_counter(), 1.0 / self.params.max_fps
@@ -154,9 +149,9 @@ class View(Guiding):
         self._send(captured)
 
     def _send(self, captured: float = 0.0) -> None:
-        """Send the last frame, once more if a page of a paused run shows what it did not show before.
+        """Send the last frame, again if a page of a paused run shows another layer.
 
-        captured : `time.perf_counter` at its capture, s; 0 where the delay until it is seen tells nothing.
+        captured : `time.perf_counter` at its capture, s; 0 if the delay is not to be measured.
         """
         with self._sending:
             hub, p = self._hub, self.params
@@ -176,12 +171,12 @@ class View(Guiding):
             hub.publish(*packet, captured)
 
     def close(self) -> None:
-        """Tell the pages that the run has ended, and serve no more."""
+        """Notify the pages of the end of the run, and stop serving."""
         server, self._server = self._server, None
         if server is None:
             return
         if self._neighbours is not None:
             self._neighbours.leave()
         server.close()
-        # A summary at the end of a run does not name a page that is gone.
+        # The summary at the end of a run must not name the page.
         self.description = None

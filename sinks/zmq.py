@@ -25,22 +25,22 @@ log = logging.getLogger("tactflow")
 
 STATS_TOPIC = b"tactflow.stats "
 LARGEST = 2**31 - 1
-"""ZeroMQ takes its numbers as `int` of C."""
+"""Largest number of ZeroMQ, which uses C's `int`."""
 
 
 class Zmq(Sink):
     """Publishes one message per frame: `tactflow.<sensor>`, a space, the JSON of `tactflow.frame/1`.
 
-    Knows who listens: while nobody has subscribed to this sensor, nothing is wanted and nothing encoded.
-    A subscriber that does not keep up loses messages; it never slows the run.
+    Without subscribers to this sensor, no frame is requested and nothing encoded. A slow subscriber loses
+    messages; it never slows the run.
 
-    Whoever subscribes to `tactflow.stats` by that name gets the statistics of the run every `stats_every`
-    seconds: `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter
-    prefix, such as `tactflow.`, does not ask for them, but receives them while somebody else does.
+    Subscribers to the exact topic `tactflow.stats` get the statistics of the run every `stats_every` seconds:
+    `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter prefix, such
+    as `tactflow.`, does not request them, but receives them if another subscriber does.
 
-    Whoever subscribes to `tactflow_picture.<sensor>` or `tactflow_depth.<sensor>` by that name gets the
-    processed picture (JPEG) or the depth map (float32, mm, row by row, little-endian) at the rate `pictures`:
-    the topic, a space, JSON with sensor, seq, t and size (width, height), a line end, the data.
+    Subscribers to the exact topic `tactflow_picture.<sensor>` or `tactflow_depth.<sensor>` get the processed
+    picture (JPEG) or the depth map (float32, mm, row by row, little-endian) at the rate `pictures`: the
+    topic, a space, JSON with sensor, seq, t and size (width, height), a line end, the data.
 
     With `control`, other programs may pause the run, take a new reference, start and end recordings.
     """
@@ -49,12 +49,12 @@ class Zmq(Sink):
     when_live = "latest"
 
     class Params(StageParams):
-        """Where to publish, how much may wait for a slow subscriber, and who may send commands."""
+        """Address, queue, and access of subscribers and of commands."""
 
         endpoint: str = Field(
             "tcp://127.0.0.1:5556",
             description="address to bind: tcp://127.0.0.1:PORT for this machine only (* picks a free port), "
-            "ipc:///path, or tcp://*:PORT for the network, which takes keys",
+            "ipc:///path, or tcp://*:PORT for the network, which requires keys",
         )
         keys: str | None = Field(
             None,
@@ -63,14 +63,14 @@ class Zmq(Sink):
             "directory: only subscribers with a key in it are admitted, and all is encrypted",
         )
         open_to_all: bool = Field(
-            False, description="publish to other machines without keys: everybody there may read"
+            False, description="publish to other machines without keys, so that everybody there may read"
         )
         backlog: int = Field(
             32,
             ge=1,
             le=LARGEST,
-            description="messages that may wait for each subscriber (32: half a second at 60 Hz); more "
-            "bridges its pauses, fewer keep it fresher",
+            description="messages queued for each subscriber (32: half a second at 60 Hz); more bridge "
+            "longer pauses, fewer are fresher",
         )
         linger: float = Field(
             1.0, ge=0, le=60, description="time to deliver the last messages at the end of a run, s"
@@ -85,30 +85,28 @@ class Zmq(Sink):
         field: bool = Field(
             False, description="also publish the displacement field of the stage field: some 100 kB a frame"
         )
-
         stats_every: float = Field(
             1.0,
             ge=0,
             le=3600,
-            description="time between two messages of statistics (topic tactflow.stats), s; 0: none",
+            description="interval of statistics (topic tactflow.stats), s; 0: none",
         )
-
         pictures: float = Field(
             0.0,
             ge=0,
             le=240,
-            description="rate of pictures and depth maps for whoever subscribes to "
-            "tactflow_picture.<sensor> or tactflow_depth.<sensor>, Hz; 0: none",
+            description="rate of pictures and depth maps for subscribers to tactflow_picture.<sensor> or "
+            "tactflow_depth.<sensor>, Hz; 0: none",
         )
         quality: int = Field(80, ge=1, le=100, description="of the pictures; higher is sharper and larger")
         control: str | None = Field(
             None,
             min_length=1,
-            description="address at which commands are taken (tactflow control), such as "
-            "tcp://127.0.0.1:5557; one that other machines can reach takes keys; null: none are",
+            description="address for commands (tactflow control), such as tcp://127.0.0.1:5557; one that "
+            "other machines can reach requires keys; null: no commands",
         )
         control_keys: str | None = Field(
-            None, min_length=1, description="folder of keys for commands; null: that of keys"
+            None, min_length=1, description="folder of keys for commands; null: same as keys"
         )
 
         @field_validator("endpoint", "control")
@@ -122,7 +120,7 @@ class Zmq(Sink):
                 raise ValueError(
                     f"{self.endpoint} can be reached from other machines, so keys are required: make some "
                     "with tactflow keys new and set keys to the publisher's folder, or endpoint to "
-                    "tcp://127.0.0.1:5556; open_to_all: true lets everybody read who reaches it"
+                    "tcp://127.0.0.1:5556; open_to_all: true lets everybody read"
                 )
             open_control = self.control is not None and not Address.parse(self.control).is_local
             if open_control and self.commanders is None:
@@ -135,7 +133,7 @@ class Zmq(Sink):
 
         @property
         def commanders(self) -> str | None:
-            """The folder that says who may send commands; None: who can reach the address."""
+            """The folder of keys for commands; None: everybody who can reach the address."""
             return self.control_keys or self.keys
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
@@ -144,7 +142,7 @@ class Zmq(Sink):
         Parameters
         ----------
         sensor : names the topic.
-        control : the run, asked for its statistics and told what to do; None: there is nothing to ask.
+        control : the run, for statistics and commands; or None.
         """
         super().__init__(params)
         self.endpoint = params.endpoint
@@ -164,18 +162,18 @@ class Zmq(Sink):
 
     @classmethod
     def binds(cls, params: Zmq.Params) -> dict[str, str]:
-        """The address at which it takes commands; several sensors share only the one of the results."""
+        """The address for commands; sensors can share only that of the results."""
         control = params.control
         return {} if control is None or Address.parse(control).picks_a_port else {"control": control}
 
     @classmethod
     def publishes(cls, params: Zmq.Params) -> Publication:
-        """At its endpoint."""
+        """Its endpoint."""
         return Publication(params.endpoint, params.backlog, params.keys, params.linger)
 
     @classmethod
     def among(cls, params: Zmq.Params, folder: Path, address: str | None) -> Zmq.Params:  # noqa: ARG003
-        """With another endpoint, of this machine alone: it is the relay that asks for keys."""
+        """With a local endpoint: the relay requires the keys."""
         if address is None:
             return params
         kept = params.commanders if params.control is not None else params.control_keys
@@ -183,13 +181,13 @@ class Zmq(Sink):
 
     @property
     def control_endpoint(self) -> str | None:
-        """The real address at which commands are taken; None while none are."""
+        """The actual address for commands; None without."""
         return None if self._commands is None else self._commands.endpoint
 
     def open(self) -> None:
-        """Bind the sockets; afterwards `endpoint` and `control_endpoint` are the real addresses.
+        """Bind the sockets; afterwards `endpoint` and `control_endpoint` are the actual addresses.
 
-        Raises StageError if an address is taken or cannot be bound, or the keys are wrong.
+        Raises StageError if an address is in use or cannot be bound, or the keys are wrong.
         """
         p = self.params
         self._publisher = Publisher(p.endpoint, p.backlog, p.keys)
@@ -202,7 +200,7 @@ class Zmq(Sink):
             log.info("taking commands on %s", self.control_endpoint)
         self.wait_for_subscriber(p.wait_for_subscriber)
         if self._control is not None and p.stats_every:
-            # Not in the run's threads: statistics also come while no frame does.
+            # In a thread of its own: statistics are published without frames, too.
             self._stats_thread = threading.Thread(
                 target=self._publish_statistics,
                 args=(self._publisher, self._control),
@@ -212,28 +210,28 @@ class Zmq(Sink):
             self._stats_thread.start()
 
     def wait_for_subscriber(self, seconds: float) -> bool:
-        """Wait until somebody has subscribed to the results, at most so long; whether somebody has."""
+        """Wait for a subscriber to the results, at most `seconds`; returns whether there is one."""
         return self._publisher is not None and self._publisher.wait_for(self._topic, seconds)
 
     def _asked(self) -> list[bytes]:
-        """The topics of pictures and depth maps that somebody has subscribed to by name."""
+        """The topics of pictures and depth maps that have subscribers."""
         if self._publisher is None or not self.params.pictures:
             return []
         topics = (self._picture_topic, self._depth_topic)
         return [topic for topic in topics if self._publisher.is_subscribed(topic, by_name=True)]
 
     def wants(self) -> bool:
-        """Whether anybody has subscribed to this sensor. From any thread; takes about 3 us."""
+        """Whether this sensor has subscribers. Thread-safe; takes about 3 us."""
         publisher = self._publisher
         return publisher is not None and (publisher.is_subscribed(self._topic) or bool(self._asked()))
 
     def counters(self) -> dict[str, int]:
-        """serialised : messages encoded. subscriptions : distinct ones now."""
+        """serialised : encoded messages. subscriptions : distinct ones now."""
         subscriptions = 0 if self._publisher is None else self._publisher.subscriptions
         return {"serialised": self._serialised, "subscriptions": subscriptions}
 
     def write(self, result: Result) -> None:
-        """Send one message to whoever has subscribed; never waits."""
+        """Publish one message; never waits."""
         if self._publisher is None or not self.wants():
             return
         p, frame = self.params, result.frame
@@ -250,7 +248,7 @@ class Zmq(Sink):
                     self._publisher.send(topic + orjson.dumps(about) + b"\n" + data)
 
     def _data(self, topic: bytes, image: Image, result: Result) -> bytes | None:
-        """The picture as JPEG, or the depth map; None where the calibration knows no depth."""
+        """The picture as JPEG, or the depth map; None without depth."""
         if topic == self._picture_topic:
             return encode_jpeg(image, self.params.quality)
         if result.depth is not None:
@@ -260,15 +258,15 @@ class Zmq(Sink):
         return np.zeros(image.shape[:2], "<f4").tobytes() if flat else None
 
     def _publish_statistics(self, publisher: Publisher, control: Control) -> None:
-        """Body of the thread that publishes the statistics while somebody has asked for them."""
+        """Body of the thread that publishes statistics while they have subscribers."""
         while not self._closing.wait(self.params.stats_every):
             if publisher.is_subscribed(STATS_TOPIC, by_name=True):
                 statistics = {"sensor": self._sensor, **control.snapshot()}
-                # A sink of the user's own may count with numbers of NumPy.
+                # The counters of a user's sink may be NumPy numbers.
                 publisher.send(STATS_TOPIC + orjson.dumps(statistics, option=orjson.OPT_SERIALIZE_NUMPY))
 
     def close(self) -> None:
-        """Deliver what is under way, for at most `linger` seconds, and free the addresses."""
+        """Deliver pending messages for at most `linger` seconds, and free the addresses."""
         if self._commands is not None:
             self._commands.close()
             self._commands = None

@@ -1,4 +1,4 @@
-"""Stage `capture`: frames from a simulated sensor, a recording, a camera or a stream."""
+"""Stage `capture`: frames of a simulated sensor, a recording, a camera or a stream."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from tactflow.engine.check import read_only
 from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
@@ -22,16 +23,16 @@ from tactflow.sources.references import References
 
 
 class Capture(Source):
-    """Reads frames and says which of them show the untouched gel.
+    """Reads frames and marks those that show the untouched gel.
 
-    Recordings are handed over as fast as they are taken, or, with `realtime`, at their own pace and then
-    like a live camera. Their first frames are examined ahead: if one of them is a better reference than the
-    very first, it comes before all others, with number -1. Those of a live source are left out until it is
-    steady. A recording of tactflow's own brings its references, seq and epochs.
+    A recording is read as fast as it is processed, or, with `realtime`, at its own pace and like a live
+    camera. Its first frames are examined ahead: a better reference than the first frame is delivered before
+    all others, with number -1. Frames of a live source are omitted until it is steady. A recording of
+    tactflow has its own references, seq and epochs.
     """
 
     class Params(StageParams):
-        """What to capture, and which frames are the reference."""
+        """Source, reference, and handling of faults."""
 
         source: str = Field("sim:press", description=KINDS)
         realtime: bool = Field(
@@ -39,41 +40,38 @@ class Capture(Source):
         )
         reference: Annotated[int, Field(ge=1, strict=True)] | Annotated[str, Field(min_length=1)] = Field(
             1,
-            description="which frames show the untouched gel: the first N in steady light, N >= 1 (more "
-            "average out noise), or an image file that is shown to the stages before the first frame",
+            description="frames that show the untouched gel: the first N in steady light, N >= 1 (more "
+            "reduce noise), or an image file, which the stages get before the first frame",
         )
         settle: float = Field(
             3.0,
             ge=0,
             le=60,
-            description="the reference is taken once exposure and white balance of the camera are steady, "
-            "after so many seconds at most; 0: at once",
+            description="longest wait for steady exposure and white balance before the reference, s; 0: none",
         )
         skip: int = Field(0, ge=0, description="frames discarded at the start")
-        width: int | None = Field(None, ge=1, description="ask the camera for this width, px")
-        height: int | None = Field(None, ge=1, description="ask the camera for this height, px")
+        width: int | None = Field(None, ge=1, description="width requested from the camera, px")
+        height: int | None = Field(None, ge=1, description="height requested from the camera, px")
         fps: float | None = Field(
             None,
             gt=0,
             le=10_000,
-            description="ask the camera for this rate; for images and arrays, their rate (30 if not given); "
-            "frames per second",
+            description="rate requested from the camera, or of images and arrays (30 by default), frames/s",
         )
         format: str | None = Field(
             None,
             pattern=r"^[ -~]{4}$",
-            description="ask the camera for this pixel format, four characters: MJPG, YUYV, ...",
+            description="pixel format requested from the camera, four characters: MJPG, YUYV, ...",
         )
-
         reconnect: bool = Field(
             True,
-            description="reopen a camera or stream that is gone, frozen or black; if false, a camera "
-            "that stops is an error and a stream that ends is the end",
+            description="reopen a camera or stream that is gone, frozen or black; if false, the end of a "
+            "stream ends the run, and a camera that stops is an error",
         )
         on_reconnect: Literal["keep", "retake"] = Field(
             "keep",
-            description="after a reconnection, keep the reference, or retake it: the first frames then must "
-            "show the untouched gel",
+            description="after a reconnection, keep the reference, or retake it from the first frames, which "
+            "must show the untouched gel",
         )
         no_frame_timeout: float | None = Field(
             30.0,
@@ -107,8 +105,8 @@ class Capture(Source):
     ) -> None:
         """Prepare; nothing is opened yet.
 
-        sensor : name given to every frame. directory : where relative paths are looked for if they are not
-        in the current directory. opener : opens the source; called like `open_source`.
+        sensor : name in every frame. directory : for relative paths, after the current directory. opener :
+        opens the source; called like `open_source`.
         """
         super().__init__(params)
         self.live = params.realtime
@@ -148,13 +146,13 @@ class Capture(Source):
         self.description = source.description
 
     def close(self) -> None:
-        """Give the source back."""
+        """Close the source."""
         self._stop.set()
         if self._source is not None:
             self._source.close()
 
     def stop(self) -> None:
-        """End `frames()` soon; wakes it if it waits for the next frame."""
+        """End `frames()` soon, even while it waits for the next frame."""
         self._stop.set()
         if self._source is not None:
             self._source.stop()
@@ -165,18 +163,18 @@ class Capture(Source):
 
     @property
     def state(self) -> str:
-        """How the source is: `running`, `waiting since ...` or `reconnecting since ...`."""
+        """State of the source: `running`, `waiting since ...` or `reconnecting since ...`."""
         return "running" if self._source is None else self._source.state
 
     @property
     def missed(self) -> int:
-        """Frames of a live source that a newer one overtook, or that were only examined: gaps in `seq`."""
+        """Frames of a live source that a newer one replaced, or that were only examined: gaps in `seq`."""
         return 0 if self._source is None else self._source.missed + self._references.left_out
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame of the source, in order, until its end or `stop()`.
+        """All frames of the source in order, until its end or `stop()`.
 
-        Raises SourceError if a frame cannot be read, or the reference image is not as large as the frames.
+        Raises SourceError if a frame cannot be read, or the reference image has another size.
         """
         p, source = self.params, self._source
         if source is None:
@@ -187,8 +185,7 @@ class Capture(Source):
         else:
             arrivals = self._references.arranged(self._unskipped(source), source, self._reference_image)
         for arrival in paced(arrivals, p.source, p.realtime and not source.live, self._stop):
-            image = arrival.image.view()
-            image.setflags(write=False)
+            image = read_only(arrival.image)
             captured = arrival.captured or time.perf_counter()
             yield Frame(
                 self._sensor, arrival.seq, arrival.t, image, captured, arrival.reference, arrival.epoch

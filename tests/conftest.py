@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests import chromium
+from tests.terminal import Terminal
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -86,3 +87,10 @@ def browser() -> Iterator[Any]:
     """One headless Chromium for all tests of a file."""
     with chromium.launched() as started:
         yield started
+
+
+@pytest.fixture
+def terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Terminal:
+    """The command line in an empty folder, `tmp_path`."""
+    monkeypatch.chdir(tmp_path)
+    return Terminal(capsys)

@@ -14,7 +14,7 @@ import threading
 from tactflow.system.signals import ENDING, INTERRUPTED, interrupt, on_ending
 
 ENDLESS = ("run", "record", "listen")
-"""Commands that run until they are told to end: one signal ends them with exit code 0."""
+"""Commands that run until they are stopped: one signal ends them with exit code 0."""
 
 
 def entry() -> None:

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.calibration.stored import with_recorded_calibration
+from tactflow.by_hand import with_frames_made
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
+from tactflow.config.recorded import with_recorded_calibration
 from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
 from tactflow.config.validation import validated
-from tactflow.engine.by_hand import with_frames_made
 from tactflow.engine.conformance import build, component, configured
 from tactflow.engine.contract import Stage
 from tactflow.engine.errors import ConfigError
@@ -86,7 +86,7 @@ def load(
 
 
 _MEMORY = "frames in memory"
-"""What stands in place of the source where the frames came from Python."""
+"""Name of the source in messages if the frames came from Python."""
 
 
 def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:

@@ -129,7 +129,7 @@ def test_a_dataset_is_not_calibrated_in_part(tmp_path: Path, first: bool, said: 
     scale = Scale(0.1, 0.1, (0.001, 0.001), (31.5, 23.5))
     writer = DatasetWriter(tmp_path, 10, "press")
     writer.add([touched(scale if first else None)])
-    with pytest.raises(StageError, match=f"{said} calibration; those before"):
+    with pytest.raises(StageError, match=f"{said} calibration; the earlier ones"):
         writer.add([touched(None if first else scale)])
 
 
@@ -194,7 +194,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
         (
             [first, small],
             3,
-            "small.npy: observation.images.main, 24 x 16 pixels, without calibration; those before",
+            "small.npy: observation.images.main, 24 x 16 pixels, without calibration; the earlier ones",
         ),
         ([odd], 3, "a video needs even numbers; give --pictures png"),
         ([first, "--fps", "0"], 2, "--fps: required 1 to 1000"),

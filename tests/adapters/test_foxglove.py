@@ -83,5 +83,5 @@ def test_a_taken_port_and_a_missing_package_say_what_to_do(monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(StageError, match=r"need foxglove: pip install 'tactflow\[foxglove\]'"):
         second.open()
-    with pytest.raises(ValidationError, match="knows no keys"):
+    with pytest.raises(ValidationError, match="has no keys"):
         Foxglove.Params(host="0.0.0.0")

@@ -13,7 +13,6 @@ import pytest
 
 import tactflow
 from tactflow.adapters.lerobot import DatasetWriter
-from tactflow.adapters.replay_buffer import ReplayBuffer, fit_embedding
 from tactflow.cli.main import main
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
@@ -25,10 +24,8 @@ from tests.messages import Results, result_of
 
 pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
 pytest.importorskip("av", reason="the extra lerobot is not installed")
-pytest.importorskip("zarr", reason="the extra zarr is not installed")
 
 import pyarrow.parquet as pq
-import zarr
 
 SPEC = "sim:press?frames=100"
 ORIGIN = np.array([[10.0, 10.0], [30.0, 10.0], [50.0, 10.0], [10.0, 30.0], [30.0, 30.0], [50.0, 30.0]])
@@ -37,54 +34,23 @@ MAIN = "observation.tactile.main"
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Result]]:
-    """Both formats of the same recording, and what the pipeline finds in it."""
-    out = tmp_path_factory.mktemp("export")
+    """A recording as a dataset, and what the pipeline finds in it."""
+    out = tmp_path_factory.mktemp("export") / "lerobot"
     with redirect_stderr(StringIO()):
-        for name, options in (("lerobot", ["--pictures", "png"]), ("replay-buffer", [])):
-            assert main(["export", name, SPEC, "--out", str(out / name), *options]) == 0
+        assert main(["export", "lerobot", SPEC, "--out", str(out), "--pictures", "png"]) == 0
     return out, list(tactflow.stream(source=SPEC, settings={"sinks": {}}, images=True))
 
 
-def test_both_formats_hold_what_was_found(exported: tuple[Path, list[Result]]) -> None:
+def test_a_dataset_holds_what_was_found(exported: tuple[Path, list[Result]]) -> None:
     out, results = exported
     found = np.stack([r.markers.displacement for r in results if r.markers is not None])
     status = np.stack([r.markers.status for r in results if r.markers is not None])
     assert found.shape == (100, 80, 2)
     assert np.abs(found).max() > 1
 
-    table = pq.read_table(out / "lerobot" / "data").to_pydict()
+    table = pq.read_table(out / "data").to_pydict()
     assert np.array_equal(np.array(table[f"{MAIN}.marker_offset"], np.float32), found.astype(np.float32))
     assert np.array_equal(table[f"{MAIN}.marker_status"], status)
-    data = zarr.open_group(out / "replay-buffer" / "replay_buffer.zarr", mode="r")
-    size = np.array([300, 400])
-    assert list(data["meta/episode_ends"][:]) == [100]
-    assert np.array_equal(data["data/main_img"][:], np.stack([r.image for r in results])[..., ::-1])
-    assert np.array_equal(data["data/main_marker_offset"][:], (found / size).astype(np.float32))
-    assert np.array_equal(data["data/main_marker_status"][:], status)
-    assert results[0].markers is not None
-    origin = (results[0].markers.origin / size).astype(np.float32)
-    assert np.array_equal(data["data/main_initial_marker"][:], np.repeat(origin[None], 100, 0))
-
-
-def test_the_embedding_can_be_made_again_from_its_files(exported: tuple[Path, list[Result]]) -> None:
-    folder = exported[0] / "replay-buffer"
-    data = zarr.open_group(folder / "replay_buffer.zarr", mode="r")["data"]
-    transform, mean = (np.load(folder / f"pca_{name}_matrix.npy") for name in ("transform", "mean"))
-    vectors, embedded = data["main_marker_offset"][:].reshape(100, -1), data["main_marker_offset_emb"][:]
-    assert embedded.shape == (100, 15)
-    assert np.allclose((vectors - mean) @ transform, embedded, atol=1e-6)
-    assert np.allclose(transform.T @ transform, np.eye(15), atol=1e-5)
-    # As much as any 15 numbers can say of these vectors.
-    singular = np.linalg.svd(vectors - vectors.mean(0), compute_uv=False)
-    lost = ((embedded @ transform.T + mean - vectors) ** 2).sum()
-    assert lost == pytest.approx((singular[15:] ** 2).sum(), rel=1e-2)
-
-
-def test_an_embedding_of_few_markers_is_filled_with_zeros() -> None:
-    vectors = np.random.default_rng(0).normal(size=(20, 4))
-    transform, _ = fit_embedding(vectors)
-    assert transform.shape == (4, 15)
-    assert not transform[:, 4:].any()
 
 
 def frames_of(
@@ -106,20 +72,14 @@ def moved(offset: tuple[float, float], origin: np.ndarray = ORIGIN, status: int 
 
 def test_markers_keep_their_place_in_recordings_that_found_others(tmp_path: Path) -> None:
     fewer = ORIGIN[[5, 3, 2, 1, 0]] + 2.0
-    writer, buffer = DatasetWriter(tmp_path / "lerobot", 10, "press"), ReplayBuffer(tmp_path / "zarr")
+    writer = DatasetWriter(tmp_path, 10, "press")
     for markers in (moved((1.0, 0.0)), moved((3.0, 0.0), fewer)):
         writer.add(frames_of(None, markers))
-        buffer.add(frames_of(markers))
     writer.finish()
-    buffer.finish()
-    table = pq.read_table(tmp_path / "lerobot" / "data").to_pydict()
+    table = pq.read_table(tmp_path / "data").to_pydict()
     status = [[2] * 6, [0] * 6, [2] * 6, [0, 0, 0, 0, 2, 0]]
     assert table[f"{MAIN}.marker_status"] == status
     assert np.array_equal(np.array(table[f"{MAIN}.marker_offset"])[:, :, 0], np.outer([0, 1, 0, 3], [1] * 6))
-    data = zarr.open_group(tmp_path / "zarr", mode="r")["data"]
-    assert np.array_equal(data["main_marker_status"][:], status[1::2])
-    places = np.where(np.arange(6)[:, None] == 4, ORIGIN, ORIGIN + 2)
-    assert np.allclose(data["main_initial_marker"][1], places / [64, 48])
 
 
 def test_a_gel_that_was_moved_is_refused() -> None:
@@ -136,8 +96,6 @@ def test_a_recording_with_markers_after_one_without_is_refused(tmp_path: Path) -
     writer.add(frames_of(None))
     with pytest.raises(StageError, match="has markers, and the recordings before have none"):
         writer.add(frames_of(moved((0.0, 0.0))))
-    with pytest.raises(StageError, match="has no markers"):
-        ReplayBuffer(tmp_path / "zarr").add(frames_of(None))
 
 
 def test_points_are_in_millimetres_and_what_is_unknown_is_masked(tmp_path: Path) -> None:
@@ -161,21 +119,6 @@ def test_points_are_in_millimetres_and_what_is_unknown_is_masked(tmp_path: Path)
     assert np.allclose(np.array(stats["mean"])[0], [0.2, -0.2, -0.5, 0, 0, 0])
 
 
-def test_a_window_holds_all_results_since_the_last_frame(tmp_path: Path) -> None:
-    writer = DatasetWriter(tmp_path, 5, "press")
-    results = frames_of(*[moved((0.0, 0.0))] * 6)
-    del results[3]
-    writer.add(results)
-    writer.finish()
-    windows = np.array(pq.read_table(tmp_path / "data").to_pydict()[f"{MAIN}.window"])
-    # Frames at 0, 0.2 and 0.4 s; that at 0.3 s was dropped.
-    assert windows.shape == (3, 2, 10)
-    assert windows[:, :, 0].tolist() == [[0, 1], [1, 1], [0, 1]]
-    assert np.allclose(windows[:, :, 1], [[0, 0], [-0.1, 0], [0, 0]])
-    names = json.loads((tmp_path / "meta" / "info.json").read_text())["features"][f"{MAIN}.window"]["names"]
-    assert names["components"][:4] == ["known", "t_s", "contact.touching", "contact.x"]
-
-
 OPENED = """
 import json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -189,7 +132,7 @@ print(json.dumps([[item[f"observation.tactile.main.{name}"].tolist() for item in
 @needs_datasets
 def test_lerobot_loads_the_markers(exported: tuple[Path, list[Result]]) -> None:
     out, results = exported
-    offsets, status, mask = json.loads(run_with_lerobot(OPENED, str(out / "lerobot")))
+    offsets, status, mask = json.loads(run_with_lerobot(OPENED, str(out)))
     for index, result in enumerate(results):
         assert result.markers is not None
         assert np.array_equal(np.float32(offsets[index]), np.float32(result.markers.displacement))

@@ -112,38 +112,23 @@ def test_a_network_for_pixels_gets_colours_and_places(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, by_hand, atol=1e-6)
 
 
-def test_padding_keeps_the_aspect_and_resizing_takes_the_size_that_the_network_asks_for(
-    tmp_path: Path,
-) -> None:
-    file = echo(tmp_path / "n.onnx", 1, 3, 16, 16)
-    padded = seen(file, {"pad": True, "scale": 1.0}, GREY)
-    assert (padded[:, 2:14] == 100).all()
-    assert not padded[:, :2].any()
-    assert not padded[:, 14:].any()
-    assert (seen(file, {"scale": 1.0, "interpolation": "area"}, GREY) == 100).all()
+def test_a_picture_is_resized_to_the_size_of_the_input(tmp_path: Path) -> None:
+    assert (seen(echo(tmp_path / "n.onnx", 1, 3, 16, 16), {"scale": 1.0}, GREY) == 100).all()
 
 
-@pytest.mark.parametrize(("newest_first", "pairs"), [(False, [(0, 0), (0, 1), (0, 2), (1, 3)]), (True, None)])
-def test_several_frames_lie_a_stride_apart_and_the_first_fills_in(
-    tmp_path: Path, newest_first: bool, pairs: list[tuple[int, int]] | None
-) -> None:
-    file = echo(tmp_path / "n.onnx", 1, 6, 6, 8)
-    settings = {"frames": 2, "stride": 2, "scale": 1.0, "newest_first": newest_first}
-    stage = network(file, settings)
+def test_several_frames_lie_a_stride_apart_and_the_first_fills_in(tmp_path: Path) -> None:
+    stage = network(echo(tmp_path / "n.onnx", 1, 6, 6, 8), {"frames": 2, "stride": 2, "scale": 1.0})
     frames = [np.full((6, 8, 3), number, np.uint8) for number in range(4)]
     found = [stage.process(frame)[0][[0, 3], 0, 0].tolist() for frame in frames]
-    assert found == [list(pair) for pair in pairs or [(0, 0), (1, 0), (2, 0), (3, 1)]]
+    assert found == [[0, 0], [0, 1], [0, 2], [1, 3]]
     stage.reset()
     assert stage.process(frames[3])[0][[0, 3], 0, 0].tolist() == [3, 3]
 
 
-def test_frames_can_lie_along_time_with_channels_last(tmp_path: Path) -> None:
-    file = echo(tmp_path / "n.onnx", 1, 2, 6, 8, 3)
-    settings = {"frames": 2, "join": "time", "layout": "hwc", "scale": 1.0}
-    stage = network(file, settings, {"y": {"shape": (2, "H", "W", 3)}})
-    stage.process(GREY)
-    (found,) = stage.process(GREY + 1)
-    assert found[:, 0, 0].tolist() == [[100] * 3, [101] * 3]
+def test_channels_can_come_last(tmp_path: Path) -> None:
+    file, outputs = echo(tmp_path / "n.onnx", 1, 6, 8, 3), {"y": {"shape": ("H", "W", 3)}}
+    (found,) = network(file, {"layout": "hwc", "scale": 1.0}, outputs).process(GREY)
+    np.testing.assert_array_equal(found, GREY)
 
 
 def test_markers_depth_and_ports_of_others_are_inputs_too(tmp_path: Path) -> None:
@@ -268,7 +253,6 @@ def test_settings_that_contradict_each_other_are_mistakes(tmp_path: Path) -> Non
     file = echo(tmp_path / "n.onnx", 1, 3, 6, 8)
     for settings, words in (
         ({"frames": 2, "layout": "pixels"}, "several frames need"),
-        ({"join": "time"}, "needs frames of 2"),
         ({"port": "depth", "background": "subtract"}, "not a picture"),
     ):
         with pytest.raises(ConfigError, match=words):
@@ -351,7 +335,7 @@ def test_gradients_at_another_size_come_back_at_that_of_the_port(tmp_path: Path)
     keep = helper.make_node("Slice", ["x", "start", "end", "axis"], ["y"])
     ends = {"start": np.array([0]), "end": np.array([2]), "axis": np.array([1])}
     save(tmp_path / "g.onnx", [keep], {"x": [1, 3, 16, 16]}, {"y": [1, 2, 16, 16]}, **ends)
-    stage = network(tmp_path / "g.onnx", {"pad": True, "scale": 1.0}, {"gradients": {"scale": -0.01}})
+    stage = network(tmp_path / "g.onnx", {"scale": 1.0}, {"gradients": {"scale": -0.01}})
     (gradients,) = stage.process(GREY)
     assert gradients.shape == (6, 8, 2)
     np.testing.assert_allclose(gradients, -1.0)

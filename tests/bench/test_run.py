@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tactflow.bench.pipelines import Bench
+from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import BenchResult
 from tactflow.bench.run import measure_scene
 from tactflow.bench.scenes import Case
@@ -16,6 +17,7 @@ from tactflow.bench.timing import CopyUnit
 from tactflow.cli.bench import packaged_files
 from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
+from tests.terminal import Terminal
 
 # The run takes a minute on a quiet machine, twenty on one with a lot of other work.
 pytestmark = pytest.mark.timeout(3600)
@@ -62,37 +64,77 @@ def test_a_gel_without_markers_is_measured_without_a_tracker(case: Case, tmp_pat
     ("arguments", "message"),
     [
         (["--against", "nothing.json"], "cannot be read"),
+        (["--against", "other.json"], "not a result of `tactflow bench`"),
+        (["--against", __file__], "not JSON"),
         (["--json", f"{__file__}/x.json"], "test_run.py is not a folder"),
         (["nothing.yaml"], "no such pipeline"),
         (["--scene", "nowhere"], "nowhere"),
     ],
 )
 def test_mistakes_are_refused_before_anything_is_measured(
-    arguments: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    arguments: list[str], message: str, terminal: Terminal
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["bench", "--quick", *arguments]) == 2
-    assert message in capsys.readouterr().err
+    Path("other.json").write_text('{"schema": "other/1"}')
+    assert terminal("bench", "--quick", *arguments) == 2
+    assert message in terminal.err
 
 
+def measured(scene: str = "press", **errors: float) -> BenchResult:
+    """A run that measured these errors of one pipeline."""
+    result = BenchResult(quick=True, copy_ms=0.1)
+    times = {"contact": [0.003, 0.001, 0.002], "idle": [0.0001]}
+    result.add("pipeline", "default", scene, errors, times=times, frames=4)
+    return result
+
+
+ALLOWED = QUANTITIES["displacement_rms"].allowed(0.02)
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "worse"),
+    [
+        (measured(displacement_rms=0.02), measured(displacement_rms=ALLOWED), ""),
+        (
+            measured(displacement_rms=0.02),
+            measured(displacement_rms=ALLOWED + 1e-6),
+            "default/press: marker displacement error, RMS: was 0.02, allowed 0.026",
+        ),
+        (measured(marker_recall=0.9), measured(marker_recall=1.0), ""),
+        (measured(marker_recall=0.9), measured(marker_recall=0.8), "was 0.9, allowed"),
+        (measured(displacement_rms=0.02), measured(wrong_percent=0.0), "no longer measured"),
+        (measured("cable", displacement_rms=0.02), measured(displacement_rms=0.02), "no longer measured"),
+    ],
+)
 def test_the_command_fails_when_an_error_grew(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    before: BenchResult, now: BenchResult, worse: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def measured(*_: Any, **__: Any) -> BenchResult:
-        result = BenchResult(quick=True, copy_ms=0.1)
-        result.add("pipeline", "default", "press", {"displacement_rms": next(errors)}, frames=1)
-        return result
+    before.save(Path("before.json"))
+    monkeypatch.setattr("tactflow.cli.bench.run_bench", lambda *_, **__: now)
+    words = ["bench", "--quick", "--json", "now.json", "--against", "before.json"]
+    assert terminal(*words) == (3 if worse else 0)
+    assert (worse or "no error has increased") in terminal.err
+    # Scenes that were not chosen are not compared.
+    chosen = "press" in str(before.measured)
+    assert terminal(*words, "--scene", "press") == (3 if worse and chosen else 0)
 
-    errors = iter((0.01, 0.01, 0.1))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tactflow.cli.bench.run_bench", measured)
-    assert main(["bench", "--quick", "--json", "b.json"]) == 0
-    assert "### Whole pipelines" in capsys.readouterr().out
-    assert main(["bench", "--quick", "--json", "c.json", "--against", "b.json"]) == 0
-    assert "no error has increased" in capsys.readouterr().err
-    assert main(["bench", "--quick", "--json", "c.json", "--against", "b.json"]) == 3
-    assert "pipeline/default/press: marker displacement error" in capsys.readouterr().err
+
+def test_every_kind_of_measurement_has_its_row(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = measured(displacement_rms=0.01, hull_iou=0.97, false_contacts=0, missed_contacts=4)
+    for method, scene, ms, rms, wrong in (
+        ("slow & <exact>", "press", 5.0, 0.01, 0),
+        ("fast", "press", 0.5, 0.1, 1),
+        ("fast", "cable", 0.6, 0.3, 3),
+    ):
+        errors = {"displacement_rms": rms, "wrong_percent": wrong}
+        result.add("tracker", method, scene, errors, times={"contact": [ms / 1e3]}, frames=1)
+    result.failures["pipeline/classic/press"] = "no markers\nmore"
+    monkeypatch.setattr("tactflow.cli.bench.run_bench", lambda *_, **__: result)
+    assert terminal("bench", "--quick") == 0
+    lines = terminal.out.splitlines()
+    rows = [" ".join(line.split()) for line in lines if line.startswith("|")]
+    assert "| fast | 0.55 | 5.5 | - | - | 0.2 (0.3) | - | 2 (3) |" in rows
+    assert "| press | default | 2 | -, - | 0.01 | -, - | 0, 4, - | 0.97 | - | - | - |" in rows
+    assert "| pipeline/classic/press | no markers |" in rows
+    for above, below in pairwise(lines):
+        if above.startswith("|") and below.startswith("|"):
+            assert len(above) == len(below)

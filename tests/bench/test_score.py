@@ -115,40 +115,33 @@ def test_markers_at_their_true_places_score_perfectly_in_any_order(truth: Truth)
         }
 
 
-def test_markers_that_were_never_found_are_lost(truth: Truth) -> None:
+def test_markers_that_were_never_found_are_lost_and_false_ones_are_counted(truth: Truth) -> None:
     count = len(truth.origin)
     assert truth.visible.all()
     some = Markers(truth.origin[4:], truth.position[4:], np.zeros(count - 4, np.uint8), np.zeros(count - 4))
     errors = marker_errors(truth, some)
     assert errors["lost_percent"] == pytest.approx(100 * 4 / count)
     assert errors["markers_missed"] == 4
-
-
-def test_false_markers_are_counted_and_an_inferred_place_is_not(truth: Truth) -> None:
     places = np.concatenate([truth.origin, [(-30.0, -30.0), (-60.0, -60.0)]])
     status = np.full(len(places), MarkerStatus.TRACKED, np.uint8)
+    # An inferred place is not a false marker.
     status[-1] = MarkerStatus.INFERRED
     errors = marker_errors(truth, Markers(places, places, status, np.zeros(len(places))))
     assert (errors["markers_false"], errors["markers_missed"]) == (1, 0)
 
 
-def test_a_swap_counts_as_wrong_and_does_not_enter_the_rms(truth: Truth) -> None:
-    position = truth.position.copy()
+def test_a_swap_counts_as_wrong_and_a_lost_marker_is_not_judged_by_its_position(truth: Truth) -> None:
+    position, count = truth.position.copy(), len(truth.position)
     position[[0, 1]] = position[[1, 0]]
     errors = marker_errors(truth, markers(truth), markers(truth, position=position))
-    assert errors["wrong_percent"] == pytest.approx(100 * 2 / (2 * len(position)))
+    assert errors["wrong_percent"] == pytest.approx(100 * 2 / (2 * count))
     assert errors["displacement_rms"] == 0
     assert errors["displacement_p99"] > 1
-
-
-def test_a_marker_declared_lost_is_not_judged_by_its_position(truth: Truth) -> None:
-    status = np.zeros(len(truth.origin), np.uint8)
-    status[0] = MarkerStatus.LOST
-    position = truth.position.copy()
-    position[0] = (-900, -900)
+    position, status = truth.position.copy(), np.zeros(count, np.uint8)
+    position[0], status[0] = (-900, -900), MarkerStatus.LOST
     errors = marker_errors(truth, markers(truth, position=position, status=status))
     assert errors["wrong_percent"] == errors["displacement_p99"] == 0
-    assert errors["lost_percent"] == pytest.approx(100 / len(position))
+    assert errors["lost_percent"] == pytest.approx(100 / count)
 
 
 def test_flow_is_compared_where_both_know_it_and_with_its_own_standard_error(

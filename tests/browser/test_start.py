@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
@@ -174,15 +173,6 @@ def choose(page: Any, label: str) -> None:
     page.get_by_role("button", name=label, exact=True).click()
 
 
-SHOTS = os.environ.get("TACTFLOW_SCREENSHOTS")
-
-
-def shoot(page: Any, name: str) -> None:
-    """Keep a picture of the page where TACTFLOW_SCREENSHOTS names a folder."""
-    if SHOTS:
-        page.screenshot(path=f"{SHOTS}/start-{name}.png")
-
-
 def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
     camera: Callable[[str], Camera], start: Callable[..., Start], page: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -190,25 +180,20 @@ def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
     running = start(gel.address)
     shown = page(running.said(r"on the page: (http\S+)"))
     asked(shown, "Which sensor")
-    shoot(shown, "1-sensor")
     choose(shown, "Another one, or unknown")
     asked(shown, "untouched")
     choose(shown, "Nothing touches the gel")
     asked(shown, "points away")
-    shoot(shown, "2-edge")
     choose(shown, "left edge")
     asked(shown, "several places")
     gel.press()
-    shoot(shown, "3-press")
     choose(shown, "Done")
     asked(shown, "Proposed")
-    shoot(shown, "4-proposal")
     written = tmp_path / "pipeline.yaml"
     assert not written.exists()
     choose(shown, "Write pipeline.yaml and go on live")
     shown.wait_for_function("() => document.body.dataset.asks === 'false'")
     shown.wait_for_function("() => document.getElementById('value-area').textContent !== '–'")
-    shoot(shown, "5-live")
     running.process.send_signal(signal.SIGINT)
     assert running.process.wait(PATIENCE / 1000) == 0, "".join(running.errors)
     assert not [line for line in running.errors if "the server failed" in line]

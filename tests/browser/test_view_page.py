@@ -242,43 +242,6 @@ def settled(page: Any) -> None:
         page.wait_for_timeout(300)
 
 
-def test_a_recording_is_paused_stepped_resumed_and_stopped(
-    run: Callable[..., Run], open_page: Callable[..., Any], tmp_path: Path
-) -> None:
-    # At full speed it would take all processors while the page is clicked.
-    (tmp_path / "slow.py").write_text(
-        "import time\n"
-        "from tactflow import Frame, Sink\n"
-        "class Slow(Sink):\n"
-        "    def write(self, frame: Frame) -> None:\n"
-        "        time.sleep(0.02)\n"
-    )
-    slow = ("--set", f"sinks.slow={{use: {tmp_path}/slow.py:Slow}}")
-    started = run("--source", ENDLESS, *slow, pipeline="pipelines/markerless.yaml")
-    page = open_page(started.url, lost=True)
-    watch(page)
-    page.click("#pause")
-    status(page, "paused")
-    assert page.inner_text("#pause .label") == "Resume"
-    # A fast recording has gone on since the frame that is shown; the first step catches up with it.
-    first = seq(page)
-    page.click("#step")
-    until(page, "seq => Number(document.getElementById('picture').dataset.seq) > seq", first)
-    settled(page)
-    first = seq(page)
-    page.keyboard.press("s")
-    until(page, "seq => Number(document.getElementById('picture').dataset.seq) === seq", first + 1)
-    page.evaluate("document.activeElement.blur()")
-    page.keyboard.press(" ")
-    status(page, "live")
-    advance(page, 2)
-    page.click("#stop")
-    assert started.exit_code() == 0
-    status(page, "ended")
-    assert "The run was stopped." in page.inner_text("#empty-text")
-    assert page.is_disabled("#stop")
-
-
 def test_a_page_finds_the_run_again_after_a_restart(
     run: Callable[..., Run], open_page: Callable[..., Any], screenshots: Path
 ) -> None:
@@ -669,9 +632,7 @@ def test_buttons_and_keys_send_commands_or_say_why_not(
     assert why in page.text_content("#note")
 
 
-def test_a_session_of_presses_is_guided_and_the_last_one_can_be_undone(
-    staged: Callable[..., Stage], open_page: Callable[..., Any]
-) -> None:
+def test_a_session_of_presses_is_guided(staged: Callable[..., Stage], open_page: Callable[..., Any]) -> None:
     def guided(number: int, **changes: Any) -> bytes:
         good = {"center": [10.0, 10.0], "radius": 5.0, "fault": None}
         light = {"center": [40.0, 20.0], "radius": 2.0, "fault": "light; press harder"}
@@ -693,12 +654,8 @@ def test_a_session_of_presses_is_guided_and_the_last_one_can_be_undone(
     assert page.evaluate("document.getElementById('guide-progress').value") == 0.5
     until(page, "() => document.querySelector('#stop .label').textContent === 'Finish'")
     assert shows(page, "picture", lambda seen: seen != plain)
-    page.keyboard.press("Backspace")
-    page.click("#undo")
-    until_heard(page, stage, {"do": "undo", "value": None}, times=2)
     stage.send(guided(3, lasts=True, now="Lift the ball.", presses=[]))
     until(page, "() => document.getElementById('guide-now').textContent === 'Lift the ball.'")
-    assert page.is_disabled("#undo")
     stage.send(state("main", end="signal"))
     until(page, "() => document.getElementById('empty-title').textContent === 'All presses are recorded'")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +10,13 @@ import pytest
 import tactflow
 from tactflow.calibration.darkness import darkness_error, fit_darkness
 from tactflow.calibration.presses import Press, Session
-from tactflow.cli.main import main
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 from tactflow.vision.depth.darkness import DarknessModel, DarkSurface
 from tactflow.vision.depth.surface import Rest
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
+from tests.terminal import Terminal
 
 MM, RADIUS = 0.05, 3.0
 SCALE = Scale(MM, MM, (0.0, 0.0), (0.0, 0.0))
@@ -101,16 +100,13 @@ def test_a_curve_that_does_not_increase_is_refused(darkening: list[float]) -> No
         DarknessModel(darkening, [0.5, 1.0])
 
 
-def test_the_command_learns_it_and_the_pipeline_has_depth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_command_learns_it_and_the_pipeline_has_depth(terminal: Terminal) -> None:
     gel = "light=absorbing&markers=none"
     command = ["calibrate", "markerless", "--from", f"sim:ball?frames=60&{gel}", "--area", "15", "20"]
-    assert main([*command, "--darkness"]) == 2
-    assert "required --ball-radius" in capsys.readouterr().err
-    assert main([*command, "--darkness", "--ball-radius", "2.375"]) == 0
-    assert "% darker; standard error" in capsys.readouterr().err
+    assert terminal(*command, "--darkness") == 2
+    assert "required --ball-radius" in terminal.err
+    assert terminal(*command, "--darkness", "--ball-radius", "2.375") == 0
+    assert "% darker; standard error" in terminal.err
     spec = f"ball?frames=40&seed=3&{gel}"
     settings = {"calibration": "calibration/main.yaml"}
     scene = open_scene(spec)
@@ -122,7 +118,10 @@ def test_the_command_learns_it_and_the_pipeline_has_depth(
     assert np.median(measured[deep] / true[deep]) == pytest.approx(1, abs=0.25)
     assert np.corrcoef(measured, true)[0, 1] > 0.97
     check = ["calibrate", "check", "calibration/main.yaml", "markerless", "--source", f"sim:{spec}"]
-    assert main(check) == 0
-    assert "mm fits\nit still fits" in capsys.readouterr().out
+    assert terminal(*check) == 0
+    output = terminal.out
+    assert "mm RMS off" in output
+    assert output.endswith("it still fits\n")
     dimmer = ["--source", "sim:ball?frames=40&light=bright&markers=none"]
-    assert main([*check[:-2], *dimmer]) == 3
+    assert terminal(*check[:-2], *dimmer) == 3
+    assert "mm RMS fit; few presses, a ball whose radius is not 2.375 mm" in terminal.out

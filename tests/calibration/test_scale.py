@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tactflow.calibration.scale import scale_from_pitch
 
@@ -65,12 +65,13 @@ def test_a_grid_at_45_degrees_gives_one_scale_for_both_axes() -> None:
     assert scale.x == scale.y == pytest.approx(0.1, rel=1e-6)
 
 
-def test_too_few_dots_are_refused_with_the_way_out() -> None:
-    with pytest.raises(ValueError, match="with --area instead"):
-        scale_from_pitch([[0, 0], [10, 0], [0, 10]], 2.0, SIZE)
-
-
-@pytest.mark.parametrize("pitch", [0.0, -1.0, float("nan")])
-def test_a_pitch_that_is_none_is_refused(pitch: float) -> None:
-    with pytest.raises(ValueError, match="pitch: required > 0 mm"):
-        scale_from_pitch(grid(0.1, 0.1, 2.0, 0, 0, 1), pitch, SIZE)
+@pytest.mark.parametrize(
+    ("dots", "pitch", "words"),
+    [
+        ([[0, 0], [10, 0], [0, 10]], 2.0, "with --area instead"),
+        *((grid(0.1, 0.1, 2.0, 0, 0, 1), pitch, "pitch: required > 0 mm") for pitch in (0.0, -1.0, np.nan)),
+    ],
+)
+def test_too_few_dots_and_an_invalid_pitch_are_refused(dots: ArrayLike, pitch: float, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        scale_from_pitch(dots, pitch, SIZE)

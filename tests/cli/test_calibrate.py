@@ -10,27 +10,19 @@ import pytest
 import yaml
 
 import tactflow
-from tactflow.cli.main import main
 from tactflow.sim import open_scene
 from tactflow.vision.geometry import Preprocessor
+from tests.terminal import Terminal
 
 RAW_MM = 0.025
 """Millimetres per raw pixel of the simulated gel, chosen so that its ball has a radius of 2.375 mm."""
 
 
-def calibrate(*words: str) -> int:
-    """Run the command."""
-    return main(["calibrate", *words])
-
-
-def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(terminal: Terminal) -> None:
     pitch = f"{open_scene('ball').layout.pitch * RAW_MM:.5f}"
     words = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--ball-radius", "2.375"]
-    assert calibrate(*words) == 0
-    output = capsys.readouterr().err
+    assert terminal("calibrate", *words) == 0
+    output = terminal.err
     assert "press 8 of 30: good, radius" in output
     assert "calibration/main.yaml is written" in output
     stored = yaml.safe_load(Path("calibration/main.yaml").read_text())
@@ -48,17 +40,17 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert abs(deepest.depth.greatest - sunk) < max(3 * deepest.depth.greatest_stderr, 0.03 * sunk)
 
     gauge = ["ball?frames=100&shear=0.6", "--out", "gauge.avi", "--truth", "gauge.csv", "--quiet"]
-    assert main(["sim", *gauge]) == 0
+    assert terminal("sim", *gauge) == 0
     force = ["force", "calibration/main.yaml", "--from", "gauge.avi"]
-    assert calibrate(*force) == 0
-    output = capsys.readouterr().err
+    assert terminal("calibrate", *force) == 0
+    output = terminal.err
     assert "heights are not known" not in output
     assert "the gauge's x axis lies -90 degrees" in output
     today = ["check", *force[1:], "--csv", "gauge.csv"]
-    assert calibrate(*today) == 0
-    assert "N RMS from the gauge today; when it was made" in capsys.readouterr().out
-    assert calibrate(*force) == 2
-    assert "has a force already" in capsys.readouterr().err
+    assert terminal("calibrate", *today) == 0
+    assert "N RMS from the gauge today; when it was made" in terminal.out
+    assert terminal("calibrate", *force) == 2
+    assert "has a force already" in terminal.err
     spec = "ball?frames=60&shear=0.6&seed=3"
     felt = [r for r in tactflow.stream(source=f"sim:{spec}", settings=settings) if r.force]
     mapping = Preprocessor((800, 600), rotate=90, downsample=2).mapping
@@ -77,56 +69,35 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(
     assert np.mean([abs(error) < 2 for _, error in off]) > 0.85
     assert max(abs(error) for _, error in off) < 6
 
-    assert calibrate(*words) == 2
-    assert "give --overwrite" in capsys.readouterr().err
-    assert calibrate("check", "calibration/main.yaml", "--source", "sim:ball?frames=60&seed=2") == 0
-    assert "it still fits" in capsys.readouterr().out
-    assert calibrate("check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
-    output = capsys.readouterr().out
+    assert terminal("calibrate", *words) == 2
+    assert "give --overwrite" in terminal.err
+    assert (
+        terminal("calibrate", "check", "calibration/main.yaml", "--source", "sim:ball?frames=60&seed=2") == 0
+    )
+    assert "it still fits" in terminal.out
+    assert terminal("calibrate", "check", "calibration/main.yaml", "--source", "sim:round_gel?frames=3") == 3
+    output = terminal.out
     assert "another sensor or light, or an object on the gel at the start" in output
     assert "calibrate again" in output
     # One press of another ball is no drift.
-    assert calibrate("check", "calibration/main.yaml", "--source", "sim:finger?frames=12") == 3
-    output = capsys.readouterr().out
+    assert terminal("calibrate", "check", "calibration/main.yaml", "--source", "sim:finger?frames=12") == 3
+    output = terminal.out
     assert "presses today, 1: " in output
     assert "a ball whose radius is not 2.375 mm" in output
-    assert calibrate("check", "calibration/main.yaml", "--source", "sim:idle?frames=3") == 0
-    assert "no presses today: to check the depth" in capsys.readouterr().out
-
-
-def test_a_printed_target_gives_the_scale(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    squares = np.add.outer(np.arange(600) // 60, np.arange(800) // 60) % 2
-    board = np.full((600, 800, 3), 200, np.uint8)
-    board[60:420, 60:540] -= np.uint8(150) * squares[60:420, 60:540, None].astype(np.uint8)
-    cv2.imwrite("board.png", board)
-    words = ["--from", "sim:idle?frames=3", "--target", "board.png", "--pitch", "3"]
-    assert calibrate(*words, "--grid", "9x6") == 2
-    assert "board.png does not show 9 x 6 inner corners" in capsys.readouterr().err
-    assert calibrate(*words, "--grid", "5x7") == 0
-    stored = yaml.safe_load(Path("calibration/main.yaml").read_text())["scale"]
-    # 60 raw pixels are 30 processed ones.
-    assert stored["mm_per_pixel"] == pytest.approx([0.1, 0.1], rel=2e-3)
-    assert stored["found_by"] == "target of 5x7, pitch of 3 mm"
+    assert terminal("calibrate", "check", "calibration/main.yaml", "--source", "sim:idle?frames=3") == 0
+    assert "no presses today: to check the depth" in terminal.out
 
 
 @pytest.mark.parametrize(("rows_apart", "warned"), [(30, False), (28, True)])
 def test_a_scale_from_dots_in_no_square_grid_is_told(
-    rows_apart: int,
-    warned: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    rows_apart: int, warned: bool, terminal: Terminal
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     picture = np.full((240, 320, 3), 150, np.uint8)
     for x, y in np.ndindex(10, 7):
         cv2.circle(picture, (25 + 30 * x, 25 + rows_apart * y), 5, (30, 30, 30), -1, cv2.LINE_AA)
     cv2.imwrite("gel.png", picture)
-    assert calibrate("mini", "--from", "gel.png", "--pitch", "3") == 0
-    output = capsys.readouterr().err
+    assert terminal("calibrate", "mini", "--from", "gel.png", "--pitch", "3") == 0
+    output = terminal.err
     assert ("--pitch is for dots in a square grid" in output) == warned
     scale = yaml.safe_load(Path("calibration/mini.yaml").read_text())["scale"]
     apart = abs(scale["mm_per_pixel"][0] - scale["mm_per_pixel"][1])
@@ -149,32 +120,26 @@ def test_a_scale_from_dots_in_no_square_grid_is_told(
     ],
 )
 def test_what_gives_no_calibration_is_refused_in_words(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    words: list[str], message: str, tmp_path: Path, terminal: Terminal
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert calibrate(*words) == 2
-    assert message in capsys.readouterr().err
+    assert terminal("calibrate", *words) == 2
+    assert message in terminal.err
     assert not list(tmp_path.rglob("*.yaml"))
 
 
-def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert calibrate("--from", "sim:ball?frames=60", "--pitch", "1.724", "--out", "film.yaml") == 0
-    output = capsys.readouterr().err
+def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(terminal: Terminal) -> None:
+    assert (
+        terminal("calibrate", "--from", "sim:ball?frames=60", "--pitch", "1.724", "--out", "film.yaml") == 0
+    )
+    output = terminal.err
     assert "press 1" not in output
     assert "--set calibration=film.yaml" in output
-    assert calibrate("check", "film.yaml", "--from", "sim:ball?frames=2") == 0
-    assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in capsys.readouterr().err
+    assert terminal("calibrate", "check", "film.yaml", "--from", "sim:ball?frames=2") == 0
+    assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in terminal.err
     # As a camera, for ten minutes, unless it ends when it knows what it needs.
     live = ["--from", "sim:idle?frames=36000", "--realtime", "--pitch", "1.724", "--out", "camera.yaml"]
-    assert calibrate(*live) == 0
-    assert "Leave the gel untouched." in capsys.readouterr().err
+    assert terminal("calibrate", *live) == 0
+    assert "Leave the gel untouched." in terminal.err
     scales = [yaml.safe_load(Path(name).read_text())["scale"] for name in ("film.yaml", "camera.yaml")]
     assert scales[0]["mm_per_pixel"] == pytest.approx(scales[1]["mm_per_pixel"], rel=5e-3)
 
@@ -199,17 +164,15 @@ sinks:
 
 
 def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_pictures_of_one_press(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    terminal: Terminal,
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     ball = ["--ball-radius", "2.375"]
     pitch = f"{open_scene('ball').layout.pitch * RAW_MM:.5f}"
     words = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--kind", "test gel", "--out", "kind.yaml"]
-    assert calibrate(*words, *ball) == 0
+    assert terminal("calibrate", *words, *ball) == 0
     kind = yaml.safe_load(Path("kind.yaml").read_text())
     assert kind["kind"] == "test gel"
     assert kind["photometric"]["depth_stderr"] > 0.094
-    capsys.readouterr()
 
     Path("left.yaml").write_text(REFINED)
     scene = open_scene("ball?frames=200&seed=4")
@@ -221,10 +184,10 @@ def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_picture
     for number, index in enumerate((0, *going_down)):
         cv2.imwrite(f"pictures/{number}.png", scene.frame(int(index)))
     refine = ["left.yaml", "--from", "pictures", "--refine"]
-    assert calibrate(*refine) == 2
-    assert "required --ball-radius MM" in capsys.readouterr().err
-    assert calibrate(*refine, *ball) == 0
-    output = capsys.readouterr().err
+    assert terminal("calibrate", *refine) == 2
+    assert "required --ball-radius MM" in terminal.err
+    assert terminal("calibrate", *refine, *ball) == 0
+    output = terminal.err
     assert "2 presses; learning" in output
     assert "press 1 of 9" in output
     assert "not its diameter" not in output
@@ -234,21 +197,18 @@ def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_picture
     assert found["photometric"]["presses"] == 2
     assert found["photometric"]["depth_stderr"] < 0.8 * kind["photometric"]["depth_stderr"]
 
-    assert calibrate(*refine, "--ball-radius", "4.75", "--overwrite") == 0
-    assert "is 4.75 mm the radius of the ball, and not its diameter" in capsys.readouterr().err
+    assert terminal("calibrate", *refine, "--ball-radius", "4.75", "--overwrite") == 0
+    assert "is 4.75 mm the radius of this ball, and not its diameter" in terminal.err
     Path("left.yaml").write_text(REFINED.replace("rotate: 90", "rotate: 270"))
-    assert calibrate(*refine, *ball, "--overwrite") == 2
-    assert "does not fit: the frames are turned" in capsys.readouterr().err
+    assert terminal("calibrate", *refine, *ball, "--overwrite") == 2
+    assert "does not fit: the frames are turned" in terminal.err
     Path("left.yaml").write_text(REFINED.replace("calibration: kind.yaml", ""))
-    assert calibrate(*refine, *ball, "--overwrite") == 2
-    assert "required a pipeline with a calibration" in capsys.readouterr().err
+    assert terminal("calibrate", *refine, *ball, "--overwrite") == 2
+    assert "required a pipeline with a calibration" in terminal.err
 
 
-def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert calibrate("--from", "sim:idle?frames=3", "--pitch", "1.724", "--out", "gel.yaml") == 0
+def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(terminal: Terminal) -> None:
+    assert terminal("calibrate", "--from", "sim:idle?frames=3", "--pitch", "1.724", "--out", "gel.yaml") == 0
     Path("forces").mkdir()
     for name, scene in (
         ("good", "ball?frames=100&shear=0.6"),
@@ -256,15 +216,14 @@ def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(
         ("bad", "ball?frames=12"),
     ):
         files = ["--out", f"forces/{name}.avi", "--truth", f"forces/{name}.csv"]
-        assert main(["sim", scene, *files, "--quiet"]) == 0
+        assert terminal("sim", scene, *files, "--quiet") == 0
     Path("forces/bad.csv").write_text("t,force\n0,1\n")
-    capsys.readouterr()
-    assert calibrate("force", "gel.yaml", "--from", "forces") == 0
-    output = capsys.readouterr().err
+    assert terminal("calibrate", "force", "gel.yaml", "--from", "forces") == 0
+    output = terminal.err
     assert "forces/idle.avi is left out: " in output
     assert "forces/bad.avi is left out: " in output
     assert "forces/good.avi: 100 frames" in output
     assert list(yaml.safe_load(Path("gel.yaml").read_text())["force"]["recordings"]) == ["forces/good.avi"]
     Path("forces/good.csv").unlink()
-    assert calibrate("force", "gel.yaml", "--from", "forces", "--overwrite") == 2
-    assert "none of the 2 recordings can be used" in capsys.readouterr().err
+    assert terminal("calibrate", "force", "gel.yaml", "--from", "forces", "--overwrite") == 2
+    assert "none of the 2 recordings can be used" in terminal.err

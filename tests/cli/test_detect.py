@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.cli.main import main
+from tests.terminal import Terminal
 
 GEL = "sim:press?frames=2"
 
 
-def test_what_was_found_is_told_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_found_is_told_and_drawn(tmp_path: Path, terminal: Terminal) -> None:
     file = tmp_path / "found.png"
-    assert main(["detect", GEL, "--downsample", "2", "--rotate", "90", "--picture", str(file)]) == 0
-    title, *lines = capsys.readouterr().out.splitlines()
+    assert terminal("detect", GEL, "--downsample", "2", "--rotate", "90", "--picture", str(file)) == 0
+    title, *lines = terminal.out.splitlines()
     assert title == f"{GEL}, frame 0: 300 x 400 px"
     assert lines[0].startswith("yellow circles: 80 dark dots, radius 4.9 px, 34.0 px apart")
     assert lines[1].startswith("green: 142 links; 98 % of the parallelograms")
@@ -30,23 +30,23 @@ def test_what_was_found_is_told_and_drawn(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_a_gel_without_marks_is_exit_code_3_and_the_best_spots_are_drawn(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, terminal: Terminal
 ) -> None:
     speckle = np.random.default_rng(1).normal(0, 1, (240, 320))
     speckle = cv2.GaussianBlur(speckle, (0, 0), 2.0)
     image, file = tmp_path / "speckle.png", tmp_path / "found.jpg"
     cv2.imwrite(str(image), np.where(speckle > 0.1, 40, 170).astype(np.uint8))
-    assert main(["detect", "--source", str(image), "--picture", str(file)]) == 3
-    out = capsys.readouterr().out
+    assert terminal("detect", "--source", str(image), "--picture", str(file)) == 3
+    out = terminal.out
     assert "0 markers found" in out
     assert "form no lattice" in out
     assert "magenta: best, " in out
     assert cv2.imread(str(file)) is not None
 
 
-def test_what_was_found_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["detect", "--source", GEL, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+def test_what_was_found_as_json(terminal: Terminal) -> None:
+    assert terminal("detect", "--source", GEL, "--json") == 0
+    found = json.loads(terminal.out)
     assert len(found["centers"]) == 80
     assert found["polarity"] == "dark"
 
@@ -64,15 +64,9 @@ def test_what_was_found_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 def test_wrong_input_is_refused_in_words(
-    options: list[str],
-    code: int,
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    options: list[str], code: int, words: str, tmp_path: Path, terminal: Terminal
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "here.png").write_bytes(b"mine")
-    assert main(["detect", *options]) == code
-    assert words in capsys.readouterr().err
+    assert terminal("detect", *options) == code
+    assert words in terminal.err
     assert (tmp_path / "here.png").read_bytes() == b"mine"

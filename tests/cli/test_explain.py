@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tactflow.cli.main import main
+from tests.terminal import Terminal
 
 PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 TEXT = """\
@@ -67,9 +67,9 @@ def paragraphs(text: str) -> dict[str, dict[str, str]]:
 
 
 @pytest.mark.usefixtures("pipeline")
-def test_each_stage_says_why_it_runs_and_when_it_is_skipped(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["explain"]) == 0
-    facts = paragraphs(capsys.readouterr().out)
+def test_each_stage_says_why_it_runs_and_when_it_is_skipped(terminal: Terminal) -> None:
+    assert terminal("explain") == 0
+    facts = paragraphs(terminal.out)
     assert list(facts) == ["capture", "prepare", "unused", "compare", "outline", "refine", "out", "view"]
     assert facts["capture"]["runs because"] == "it captures the frames"
     assert facts["prepare"]["runs because"] == "out and view need it"
@@ -89,27 +89,22 @@ def test_each_stage_says_why_it_runs_and_when_it_is_skipped(capsys: pytest.Captu
     assert facts["refine"]["skipped when"] == "outline gives no contact"
     assert "skipped when" not in facts["prepare"]
     assert "skipped when" not in facts["out"]
-    main(["explain", "--set", "skipping=false"])
-    out = capsys.readouterr().out
+    terminal("explain", "--set", "skipping=false")
+    out = terminal.out
     assert "skipping is off" in out
     assert "touching" not in out
 
 
-def test_statistics_say_how_often_and_what_it_cost(
-    pipeline: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_statistics_say_how_often_and_what_it_cost(pipeline: Path, terminal: Terminal) -> None:
     (pipeline / "run.json").write_text(json.dumps(STATISTICS))
-    assert main(["explain", "--stats", "run.json"]) == 0
-    out = capsys.readouterr().out
-    assert (
-        "the run: 100 frames in 1.5 s, 2 dropped, latency p50 2.00 ms, p99 5.00 ms, ended: end of source"
-        in out
-    )
+    assert terminal("explain", "--stats", "run.json") == 0
+    out = terminal.out
+    assert "the run: 100 frames in 1.5 s, 2 dropped, latency p50 2 ms, p99 5 ms, ended: end of source" in out
     facts = paragraphs(out)
     # 59 frames left out at 0.3 ms each, over 100 frames; the failed one is no gain.
     assert facts["outline"]["statistics"] == (
         "ran 40 %, skipped 44 % no contact, 15 % unchanged, 1 % error; "
-        "a run: mean 0.300 ms, p50 0.250 ms, p99 0.500 ms; saved 0.177 ms of 0.297 ms a frame"
+        "a run: mean 0.3 ms, p50 0.25 ms, p99 0.5 ms; saved 0.177 ms of 0.297 ms a frame"
     )
     assert facts["compare"]["statistics"] == "never reached by a frame"
     assert facts["prepare"]["statistics"] == "not part of that run"
@@ -117,20 +112,16 @@ def test_statistics_say_how_often_and_what_it_cost(
 
 
 @pytest.mark.parametrize("content", ["{", "{}", json.dumps({**STATISTICS, "latency_ms": None})])
-def test_a_file_without_statistics_is_refused(
-    content: str, pipeline: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_without_statistics_is_refused(content: str, pipeline: Path, terminal: Terminal) -> None:
     (pipeline / "run.json").write_text(content)
-    assert main(["explain", "--stats", "run.json"]) == 2
-    assert capsys.readouterr().err.startswith("tactflow: --stats run.json: not ")
+    assert terminal("explain", "--stats", "run.json") == 2
+    assert terminal.err.startswith("tactflow: --stats run.json: not ")
 
 
 @pytest.mark.usefixtures("pipeline")
-def test_the_graph_shows_segments_edges_gates_queues_and_pruned_stages(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(["graph"]) == 0
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+def test_the_graph_shows_segments_edges_gates_queues_and_pruned_stages(terminal: Terminal) -> None:
+    assert terminal("graph") == 0
+    lines = [line.strip() for line in terminal.out.splitlines()]
     assert lines[0] == "flowchart LR"
     assert 'subgraph s1["segment compute"]' in lines
     assert any(re.fullmatch(r'subgraph s\d\["segment heavy"\]', line) for line in lines)

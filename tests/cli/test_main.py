@@ -14,6 +14,7 @@ import pytest
 
 from tactflow.cli.main import COMMANDS, main
 from tests.clock import PATIENCE
+from tests.terminal import Terminal
 
 
 def program(*args: str, **options: object) -> subprocess.CompletedProcess[str]:
@@ -28,12 +29,12 @@ def in_shell(redirection: str, *args: str, **options: object) -> subprocess.Comp
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_listed_command_is_there(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
+def test_every_listed_command_is_there(name: str, terminal: Terminal) -> None:
+    assert terminal("--help") == 0
     summary = COMMANDS[name][1]
-    assert f" {name} {summary}" in " ".join(capsys.readouterr().out.split())
-    assert main([name, "--help"]) == 0
-    words = " ".join(capsys.readouterr().out.split())
+    assert f" {name} {summary}" in " ".join(terminal.out.split())
+    assert terminal(name, "--help") == 0
+    words = " ".join(terminal.out.split())
     assert f"usage: tactflow {name}" in words
     assert summary in words
 
@@ -57,10 +58,10 @@ def test_every_listed_command_is_there(name: str, capsys: pytest.CaptureFixture[
     ],
 )
 def test_a_wrong_command_line_gives_a_message_and_exit_code_2(
-    argv: list[str], words: str, capsys: pytest.CaptureFixture[str]
+    argv: list[str], words: str, terminal: Terminal
 ) -> None:
-    assert main(argv) == 2
-    out, err = capsys.readouterr()
+    assert terminal(*argv) == 2
+    out, err = terminal.out, terminal.err
     assert out == ""
     assert words in err
 
@@ -83,17 +84,16 @@ def test_what_is_not_needed_at_the_start_is_not_imported(imports: str, without: 
 
 
 def test_without_a_name_the_pipeline_in_the_current_folder_is_taken_else_the_packaged_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, terminal: Terminal
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["check"]) == 0
-    assert "default.yaml: OK" in capsys.readouterr().out
+    assert terminal("check") == 0
+    assert "default.yaml: OK" in terminal.out
     (tmp_path / "pipeline.yaml").write_text("stages:\n  capture:\nsinks:\n  jsonl:\n")
-    assert main(["check"]) == 0
-    assert capsys.readouterr().out == "pipeline.yaml: OK (1 stage, 1 sink, 2 segments)\n"
+    assert terminal("check") == 0
+    assert terminal.out == "pipeline.yaml: OK (1 stage, 1 sink, 2 segments)\n"
     for name in ("classic", "classic.yaml", "pipelines/classic.yaml"):
-        assert main(["check", name]) == 0
-        assert "classic.yaml: OK" in capsys.readouterr().out
+        assert terminal("check", name) == 0
+        assert "classic.yaml: OK" in terminal.out
 
 
 # -- what stands behind standard output and standard error ------------------------------------------------
@@ -137,62 +137,57 @@ def test_a_full_disk_behind_standard_output_is_an_error_without_a_traceback() ->
 # -- reports of a run -------------------------------------------------------------------------------------
 
 
-def test_statistics_replace_only_older_statistics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_statistics_replace_only_older_statistics(tmp_path: Path, terminal: Terminal) -> None:
     file = tmp_path / "numbers.json"
     command = ["run", "--quiet", "--set", "sinks={}", "--source", "sim:press?frames=2", "--stats", str(file)]
-    assert main(command) == main(command) == 0
+    assert terminal(*command) == terminal(*command) == 0
     file.write_text("a year of work")
-    assert main(command) == 2
-    assert "is not a statistics file" in capsys.readouterr().err
+    assert terminal(*command) == 2
+    assert "is not a statistics file" in terminal.err
     assert file.read_text() == "a year of work"
 
 
-def test_statistics_replace_no_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_statistics_replace_no_results(terminal: Terminal) -> None:
     command = ["run", "--quiet", "--set", "sinks={}", "--source", "sim:press?frames=2"]
-    assert main([*command, "--jsonl", "a.jsonl", "--stats", "./a.jsonl"]) == 3
-    assert "a.jsonl" in capsys.readouterr().err
+    assert terminal(*command, "--jsonl", "a.jsonl", "--stats", "./a.jsonl") == 3
+    assert "a.jsonl" in terminal.err
     assert '"frames"' not in Path("a.jsonl").read_text()
 
 
-def test_a_limit_on_which_opencv_would_abort_is_refused(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("limit", ["many", "64MB"])
+def test_a_limit_that_is_not_a_number_is_refused(
+    limit: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", "many")
-    assert main(["check", "default"]) == 2
-    assert "OPENCV_IO_MAX_IMAGE_PIXELS is 'many'; required: a number" in capsys.readouterr().err
+    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", limit)
+    assert terminal("check", "default") == 2
+    assert f"OPENCV_IO_MAX_IMAGE_PIXELS is '{limit}'; required: a number" in terminal.err
 
 
-def test_no_name_of_a_file_forges_a_line_of_the_messages(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_name_of_a_file_forges_a_line_of_the_messages(terminal: Terminal) -> None:
     for mark in ("\n", "\r", "\u2028", "\u2029", "\x85", "\u202e", "\x1b["):
         name = f"left{mark}tactflow: INFO: all frames delivered"
         for words, code in ((["run", "--source", name], 4), (["run", "a.yaml", name], 2), ([name], 2)):
-            assert main(words) == code
-            lines = capsys.readouterr().err.splitlines()
+            assert terminal(*words) == code
+            lines = terminal.err.splitlines()
             assert not any(line.startswith("tactflow: INFO") for line in lines)
             assert not any(letter in "".join(lines) for letter in "\x1b\u202e")
 
 
-def test_a_shipped_pipeline_is_printed_to_be_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["pipelines", "mini"]) == 0
-    Path("pipeline.yaml").write_text(capsys.readouterr().out)
-    assert main(["check", "--json"]) == 0
-    checked = json.loads(capsys.readouterr().out)
+def test_a_shipped_pipeline_is_printed_to_be_changed(terminal: Terminal) -> None:
+    assert terminal("pipelines", "mini") == 0
+    Path("pipeline.yaml").write_text(terminal.out)
+    assert terminal("check", "--json") == 0
+    checked = json.loads(terminal.out)
     assert checked["mistakes"] == []
     assert checked["sensors"]["mini"]["stages"][0] == "capture"
-    assert main(["explain", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["nodes"]["hull"]["runs because"].endswith("need it")
-    assert main(["check", "--json", "--set", "stages.hull.min_aera=3"]) == 2
-    assert "did you mean min_area?" in json.loads(capsys.readouterr().out)["mistakes"][0]
-    assert main(["pipelines", "--json"]) == 0
-    assert "mini" in json.loads(capsys.readouterr().out)
-    assert main(["pipelines", "minni"]) == 2
-    assert "did you mean mini?" in capsys.readouterr().err
+    assert terminal("explain", "--json") == 0
+    assert json.loads(terminal.out)["nodes"]["hull"]["runs because"].endswith("need it")
+    assert terminal("check", "--json", "--set", "stages.hull.min_aera=3") == 2
+    assert "did you mean min_area?" in json.loads(terminal.out)["mistakes"][0]
+    assert terminal("pipelines", "--json") == 0
+    assert "mini" in json.loads(terminal.out)
+    assert terminal("pipelines", "minni") == 2
+    assert "did you mean mini?" in terminal.err
 
 
 @pytest.mark.parametrize("pipeline", ["mini", "default"])
@@ -207,14 +202,11 @@ def test_a_video_with_what_was_found_takes_one_option(
     film.release()
 
 
-def test_the_summary_counts_what_the_results_say(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_summary_counts_what_the_results_say(terminal: Terminal) -> None:
     # Stages before `hull` see contacts that are too small for it.
     command = ["run", "default", "--source", "sim:press?frames=60", "--set", "stages.hull.min_area=2000"]
-    assert main([*command, "--set", "sinks={}", "--jsonl", "a.jsonl"]) == 0
+    assert terminal(*command, "--set", "sinks={}", "--jsonl", "a.jsonl") == 0
     touched = [json.loads(line)["contact"] is not None for line in Path("a.jsonl").read_text().splitlines()]
     begun = sum(now and not before for before, now in pairwise([False, *touched]))
     assert begun > 0
-    assert f"contacts: {begun} ({sum(touched)} frames with contact)" in capsys.readouterr().err
+    assert f"contacts: {begun} ({sum(touched)} frames with contact)" in terminal.err

@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from tactflow.cli.main import main
 from tactflow.sim import open_scene
 from tactflow.sources import Arrival, open_source
+from tests.terminal import Terminal
 
 QUIET = ["--quiet", "--set", "sinks.zmq=null", "--set", "sinks.jsonl=null", "--set", "sinks.view=null"]
 
@@ -82,11 +83,11 @@ def frames_of(path: Path) -> list[Arrival]:
     ],
 )
 def test_a_wrong_file_is_refused_before_anything_starts(
-    tmp_path: Path, out: str, words: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, out: str, words: str, terminal: Terminal
 ) -> None:
     (tmp_path / "there.mcap").write_bytes(b"precious")
-    assert main(["record", *QUIET, "--source", "sim:press?frames=3", "--out", str(tmp_path / out)]) == 2
-    assert words in capsys.readouterr().err
+    assert terminal("record", *QUIET, "--source", "sim:press?frames=3", "--out", str(tmp_path / out)) == 2
+    assert words in terminal.err
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"
 
 
@@ -102,14 +103,13 @@ def test_number_records_beside_what_is_there_and_overwrite_replaces_it(tmp_path:
 
 
 def test_repair_leaves_a_whole_file_alone_and_replaces_nothing_unasked(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, terminal: Terminal
 ) -> None:
     out, copy, folder = tmp_path / "a.mcap", tmp_path / "b.mcap", tmp_path / "kept"
-    assert main(["record", *QUIET, "--source", "sim:press?frames=3", "--out", str(out)]) == 0
+    assert terminal("record", *QUIET, "--source", "sim:press?frames=3", "--out", str(out)) == 0
     whole = out.read_bytes()
-    capsys.readouterr()
-    assert main(["repair", str(out)]) == 0
-    assert "is intact; nothing to repair" in capsys.readouterr().err
+    assert terminal("repair", str(out)) == 0
+    assert "is intact; nothing to repair" in terminal.err
     assert out.read_bytes() == whole
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
     out.write_bytes(whole[:-200])
@@ -120,11 +120,11 @@ def test_repair_leaves_a_whole_file_alone_and_replaces_nothing_unasked(
         (["--out", str(folder), "--overwrite"], f"--out: {folder} is a folder; required a file"),
         (["--out", str(out), "--overwrite"], "is the file to repair"),
     ):
-        assert main(["repair", str(out), *words]) == 2
-        assert message in capsys.readouterr().err
+        assert terminal("repair", str(out), *words) == 2
+        assert message in terminal.err
     assert copy.read_bytes() == b"precious"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "kept"]
-    assert main(["repair", str(out), "--out", str(copy), "--overwrite"]) == 0
+    assert terminal("repair", str(out), "--out", str(copy), "--overwrite") == 0
     assert out.read_bytes() == whole[:-200]
     with copy.open("rb") as file:
         assert make_reader(file).get_summary() is not None
@@ -133,11 +133,11 @@ def test_repair_leaves_a_whole_file_alone_and_replaces_nothing_unasked(
 
 @pytest.mark.parametrize(("content", "words"), [(b"no", "is not an MCAP file"), (None, "no such file")])
 def test_repair_refuses_what_is_no_recording(
-    tmp_path: Path, content: bytes | None, words: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, content: bytes | None, words: str, terminal: Terminal
 ) -> None:
     path = tmp_path / "a.mcap"
     if content is not None:
         path.write_bytes(content)
-    assert main(["repair", str(path)]) == 4
-    assert words in capsys.readouterr().err
+    assert terminal("repair", str(path)) == 4
+    assert words in terminal.err
     assert len(list(tmp_path.iterdir())) == (content is not None)

@@ -6,17 +6,15 @@ import json
 import shutil
 from pathlib import Path
 
-import pytest
-
-from tactflow.cli.main import main
 from tactflow.config.registry import catalogue
+from tests.terminal import Terminal
 
 PARTS = Path(__file__).resolve().parents[1] / "config" / "parts.py"
 
 
-def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stages"]) == 0
-    out, err = capsys.readouterr()
+def test_the_table_has_a_line_for_every_stage_and_sink(terminal: Terminal) -> None:
+    assert terminal("stages") == 0
+    out, err = terminal.out, terminal.err
     assert err == ""
     heading, *rows = out.splitlines()
     assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT", "IT", "DOES"]
@@ -26,23 +24,20 @@ def test_the_table_has_a_line_for_every_stage_and_sink(capsys: pytest.CaptureFix
     assert hull.split()[:7] == ["hull", "stage", *ports, "built-in"]
 
 
-def test_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stages", "--json"]) == 0
-    every = {part["name"]: part for part in json.loads(capsys.readouterr().out)}
+def test_the_same_as_json(terminal: Terminal) -> None:
+    assert terminal("stages", "--json") == 0
+    every = {part["name"]: part for part in json.loads(terminal.out)}
     assert sorted(every) == sorted(c.name for c in catalogue()[0])
-    assert main(["stages", "hull", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == [every["hull"]]
+    assert terminal("stages", "hull", "--json") == 0
+    assert json.loads(terminal.out) == [every["hull"]]
     assert every["hull"]["outputs"] == {"contact": "Contact (may be absent)"}
     assert "rotate" in every["preprocess"]["parameters"]["properties"]
 
 
-def test_one_stage_is_explained_with_ports_and_parameters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_stage_is_explained_with_ports_and_parameters(tmp_path: Path, terminal: Terminal) -> None:
     shutil.copy(PARTS, tmp_path / "parts.py")
-    monkeypatch.chdir(tmp_path)
-    assert main(["stages", "./parts.py:Prepare"]) == 0
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert terminal("stages", "./parts.py:Prepare") == 0
+    lines = [line.strip() for line in terminal.out.splitlines()]
     assert lines[0] == "./parts.py:Prepare: stage, ./parts.py"
     assert "memory: pure" in lines
     assert "frame  Frame" in lines

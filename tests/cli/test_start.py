@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -18,14 +16,14 @@ import tactflow
 from tactflow.cli import start
 from tactflow.cli.main import main, make_parser
 from tactflow.engine.errors import SourceError
-from tests.clock import PATIENCE
+from tests.terminal import Terminal
 
 Recorded = Callable[[str], str]
 """Name and settings of a simulated scene -> a recording of it with few pixels."""
 
 
-def propose(source: str, out: Path, *words: str) -> int:
-    return main(["start", source, "--yes", "--no-run", "--out", str(out), *words])
+MADE = Path("made.yaml")
+PROPOSE = ("start", "--yes", "--no-run", "--out", str(MADE))
 
 
 @pytest.fixture(scope="module")
@@ -44,60 +42,42 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 @pytest.mark.parametrize(
     ("scene", "base", "dots"),
-    [
-        ("press", "default", True),
-        ("halo", "markerless", False),
-        ("painted", "default", True),
-    ],
+    [("press", "default", True), ("halo", "markerless", False), ("painted", "default", True)],
 )
 def test_a_script_takes_the_proposals_and_the_file_finds_the_contacts(
-    scene: str,
-    base: str,
-    dots: bool,
-    recorded: Recorded,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    scene: str, base: str, dots: bool, recorded: Recorded, terminal: Terminal
 ) -> None:
-    out = tmp_path / "made.yaml"
-    out.write_text("mine")
-    assert propose(recorded(f"{scene}?frames=120"), out, "--overwrite") == 0
-    assert "is written" in capsys.readouterr().err
-    text = out.read_text()
+    source = recorded(f"{scene}?frames=120")
+    MADE.write_text("mine")
+    assert terminal(*PROPOSE, source) == 2
+    assert "already exists; give --overwrite" in terminal.err
+    assert MADE.read_text() == "mine"
+    assert terminal(*PROPOSE, source, "--overwrite") == 0
+    assert "is written" in terminal.err
+    text = MADE.read_text()
     assert f"from {base}.yaml" in text.splitlines()[0]
     assert ("tracker" in yaml.safe_load(text)["stages"]) == dots
-    assert tactflow.check(out) == []
-    results = list(tactflow.stream(out))
+    assert tactflow.check(MADE) == []
+    results = list(tactflow.stream(MADE))
     assert not results[0].contact
     assert sum(result.contact is not None for result in results) > 20
 
 
-def test_a_file_is_never_replaced_without_being_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "pipeline.yaml"
-    out.write_text("mine")
-    assert propose("sim:press", out) == 2
-    assert "already exists; give --overwrite" in capsys.readouterr().err
-    assert out.read_text() == "mine"
-
-
 def test_without_a_press_the_proposal_says_that_contacts_are_untested(
-    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recorded: Recorded, terminal: Terminal
 ) -> None:
-    assert propose(recorded("idle?frames=40"), tmp_path / "made.yaml") == 0
-    assert "No press was seen" in capsys.readouterr().err
+    assert terminal(*PROPOSE, recorded("idle?frames=40")) == 0
+    assert "No press was seen" in terminal.err
 
 
-def test_a_gel_whose_presses_no_pipeline_finds_is_not_set_up(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_gel_whose_presses_no_pipeline_finds_is_not_set_up(terminal: Terminal) -> None:
     frames = np.full((24, 96, 128, 3), 90, np.uint8)
     frames += np.random.default_rng(0).integers(0, 4, frames.shape, np.uint8)
     frames[8:, 30:60, 40:80] = 97  # a change too faint for a contact, and too large for rest
-    np.save(tmp_path / "faint.npy", frames)
-    assert propose(str(tmp_path / "faint.npy"), tmp_path / "made.yaml") == 3
-    assert "No pipeline finds the presses" in capsys.readouterr().err
-    assert not (tmp_path / "made.yaml").exists()
+    np.save("faint.npy", frames)
+    assert terminal(*PROPOSE, "faint.npy") == 3
+    assert "No pipeline finds the presses" in terminal.err
+    assert not MADE.exists()
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="cameras have no list outside Linux")
@@ -113,24 +93,6 @@ def test_without_a_camera_it_is_said_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "video1").write_text("not a device")
     with pytest.raises(tactflow.ConfigError, match="2 cameras are plugged in; name the sensor"):
         start.run(args)
-
-
-def test_ctrl_c_before_the_end_leaves_no_file(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tactflow", "start", "sim:press?frames=60"],
-        cwd=tmp_path,
-        stdin=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stderr is not None
-    for line in process.stderr:
-        if line.startswith("Which sensor"):
-            process.send_signal(signal.SIGINT)
-    assert process.wait(PATIENCE) == 130
-    assert list(tmp_path.iterdir()) == []
-    process.stdin.close()
-    process.stderr.close()
 
 
 class Scripted:
@@ -174,7 +136,6 @@ def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
 
 
 @pytest.mark.parametrize(("recording", "dots"), [("gels/digit_fots", False), ("gels/gelslim_ball", True)])
-def test_real_sensors(recording: str, dots: bool, shared_data: Path, tmp_path: Path) -> None:
-    out = tmp_path / "made.yaml"
-    assert propose(str(shared_data / recording), out) == 0
-    assert ("tracker" in yaml.safe_load(out.read_text())["stages"]) == dots
+def test_real_sensors(recording: str, dots: bool, shared_data: Path, terminal: Terminal) -> None:
+    assert terminal(*PROPOSE, str(shared_data / recording)) == 0
+    assert ("tracker" in yaml.safe_load(MADE.read_text())["stages"]) == dots

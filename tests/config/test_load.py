@@ -318,7 +318,6 @@ def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Lo
     [
         ("press[1].npy", "what stages.capture reads"),
         ("p.yaml", "the pipeline file"),
-        ("parts.py", "the code of out"),
     ],
 )
 def test_a_sink_never_writes_over_what_the_run_reads(

@@ -227,37 +227,6 @@ def test_a_file_that_may_not_be_touched_is_refused_for_good(folder: Path) -> Non
     assert len(rows(folder / "out-right.jsonl")) == 30
 
 
-# A module that a sensor's process imports long before it can end well.
-WAITING = """
-import signal, sys, time
-from tactflow.stages.capture import Capture
-
-class Waiting(Capture):
-    pass
-
-if "--sensor" in sys.argv:
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    open("here-" + sys.argv[sys.argv.index("--sensor") + 1], "w").close()
-    time.sleep(100)
-"""
-
-
-def test_one_signal_soon_after_the_start_ends_all_sensors_well(folder: Path) -> None:
-    (folder / "waiting.py").write_text(WAITING)
-    text = GRAPH.replace('  capture: {source: "sim:idle"}', "  capture: {use: './waiting.py:Waiting'}")
-    (folder / "pipeline.yaml").write_text(text)
-    files = [folder / "here-left", folder / "here-right"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tactflow", "run"], cwd=folder, stderr=subprocess.PIPE, text=True
-    )
-    until(lambda: process.poll() is not None or all(file.exists() for file in files))
-    assert process.poll() is None
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, errors
-    assert "Traceback" not in errors
-
-
 def test_the_run_goes_on_when_nobody_reads_its_lines_any_more(folder: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "tactflow", "run", "--quiet", "--jsonl", "-"],

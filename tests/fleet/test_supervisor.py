@@ -120,20 +120,26 @@ def test_a_mistake_in_the_command_line_ends_the_other_sensors(tmp_path: Path) ->
     assert machine.starts == {"left": [0.0], "right": [0.0]}
 
 
-def test_a_process_that_does_not_end_is_killed_at_the_third_signal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("hangs", "code"),
+    [(True, 130), (False, 0)],
+    ids=["third signal kills", "ends before its handler is there"],
+)
+def test_signals_end_a_process(
+    hangs: bool, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Process, "hangs", True)
+    monkeypatch.setattr(Process, "hangs", hangs)
     machine = Machine(tmp_path, {"left": [(1e9, 0)]})
     before = machine.clock.pause
+    signals = iter(range(3 if hangs else 1))
 
     def pause(seconds: float) -> None:
         before(seconds)
-        if machine.clock.now > 1:
+        if machine.clock.now > 1 and next(signals, None) is not None:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(machine.clock, "pause", pause)
-    assert machine.run() == 130
+    assert machine.run() == code
 
 
 def test_a_process_that_has_no_heartbeat_is_killed_and_started_again(

@@ -138,37 +138,6 @@ def test_what_is_too_long_or_no_request_is_dropped(bare: ControlSocket) -> None:
             assert run.ping()["ok"]
 
 
-def test_a_late_answer_to_an_earlier_command_is_not_taken_for_the_next() -> None:
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as run:
-        run.linger = 0
-        port = run.bind_to_random_port("tcp://127.0.0.1")
-        asked: dict[str, list[bytes]] = {}
-
-        def answer() -> None:
-            """Answer the second command, after the first one has been answered late, on the same way."""
-            while "stats" not in asked:
-                parts = run.recv_multipart()
-                asked[json.loads(parts[-1])["do"]] = parts
-            (way, second, *rest), first = asked["stats"][:-1], asked["ping"][1]
-            for number, message in ((first, "late"), (second, "in time")):
-                answered = {"ok": True, "message": message, "state": {"sensor": "main"}}
-                run.send_multipart([way, number, *rest, json.dumps(answered).encode()])
-
-        with RemoteControl(f"tcp://127.0.0.1:{port}", timeout=0.05) as control:
-
-            def ping_arrives() -> int:
-                with pytest.raises(TimeoutError):
-                    control.ping()
-                return run.poll(0)
-
-            until(ping_arrives)
-            thread = threading.Thread(target=answer)
-            thread.start()
-            control.timeout = PATIENCE
-            assert control.stats()["message"] == "in time"
-            thread.join()
-
-
 @pytest.mark.parametrize("answer", [b"[", b"[]", b'{"ok": true, "message": "here"}', b'{"state": 5}'])
 def test_an_answer_of_another_program_is_an_error(answer: bytes, capsys: pytest.CaptureFixture[str]) -> None:
     with zmq.Context() as context, context.socket(zmq.REP) as stranger:

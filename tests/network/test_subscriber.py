@@ -19,7 +19,7 @@ from tactflow.cli.main import main
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.result import encode_message
 from tactflow.network.remote_control import RemoteControl
-from tactflow.network.subscriber import LONGEST_MESSAGE, Subscriber
+from tactflow.network.subscriber import Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Flow, Markers
 from tests.clock import PATIENCE
@@ -241,17 +241,6 @@ def test_listen_prints_the_messages_as_they_are(
 def test_listen_reports_that_nothing_came(publisher: Publisher, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["listen", publisher.endpoint, "--timeout", "0.05"]) == 4
     assert "is tactflow running" in capsys.readouterr().err
-
-
-def test_a_publisher_of_messages_longer_than_any_result_is_disconnected() -> None:
-    with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
-        port = publisher.bind_to_random_port("tcp://127.0.0.1")
-        publisher.linger = 0
-        publisher.rcvtimeo = round(PATIENCE * 1000)
-        with Subscriber(f"tcp://127.0.0.1:{port}"):
-            assert publisher.recv() == b"\x01tactflow."
-            publisher.send(b"tactflow.main {" + bytes(LONGEST_MESSAGE))
-            assert publisher.recv() == b"\x00tactflow."
 
 
 def test_what_a_publisher_sends_commands_no_terminal() -> None:

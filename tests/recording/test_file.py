@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+import zstandard
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from mcap.reader import make_reader
@@ -173,3 +174,6 @@ def test_a_frame_that_is_damaged_or_of_another_kind_is_refused() -> None:
             parse_frame(changed.SerializeToString())
     with pytest.raises(ValueError, match=r"not a tactflow\.RawFrame"):
         parse_frame(b"\xff" * 20)
+    for size, packed_bytes, message in ((1 << 16, 100, "65536 x 65536"), (4, 64 << 20, "required 48 bytes")):
+        with pytest.raises(ValueError, match=message):
+            decode_pixels(RawFrame(width=size, height=size, data=zstandard.compress(bytes(packed_bytes))))

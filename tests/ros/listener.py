@@ -112,10 +112,6 @@ def main() -> None:
             tell(found=order["topic"])
         elif order["do"] == "ask too much":
             kept.append(node.create_subscription(Bool, f"{NODE}/touching", print, 10))
-        elif order["do"] == "transform":
-            from tactflow_ros.messages import stamp, transform
-
-            tell(transform=plain(transform("gel", "finger", *order["place"], stamp(1.7e9 + 0.125))))
         elif order["do"] == "object":
             from tactflow_ros.messages import header, object_transform
 

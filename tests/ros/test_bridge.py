@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,10 +16,10 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.network.keys import make_keys
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Pose, Scale, Slip
-from tests.clock import PATIENCE, until
+from tests.clock import until
 from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
-from tests.ros.programs import PYTHON, Program, environment, needs_rclpy
+from tests.ros.programs import Program, needs_rclpy
 from tests.sinks.test_view import fake_run
 
 IMAGE = np.full((40, 60, 3), 90, np.uint8)
@@ -287,10 +286,7 @@ def test_a_subscriber_that_asks_for_more_is_told_why_it_receives_nothing(pair: P
     ("parameters", "state", "words"),
     [
         ({"reliability": "perhaps"}, "configured", "required best_effort or reliable, got 'perhaps'"),
-        ({"parent_frame": "finger"}, "configured", "parent_frame needs tf2_msgs"),
         ({"object_frame": "object"}, "configured", "object_frame needs tf2_msgs"),
-        ({"parent_frame": "finger", "rotation": [0.0] * 4}, "configured", "required a quaternion x, y, z, w"),
-        ({"parent_frame": "finger", "translation": [1.0]}, "configured", "required 3 finite numbers"),
         ({"endpoint": "nowhere"}, "activated", "required an address such as tcp://127.0.0.1:5556"),
         ({"keys": "/nowhere"}, "activated", "tactflow keys new creates such a folder"),
     ],
@@ -301,41 +297,6 @@ def test_parameters_that_cannot_be_are_refused_with_what_to_do(
     pair.listener.order(do="configure", parameters=parameters)
     assert pair.listener.told(lambda told: "configured" in told)[state] == "FAILURE"
     until(lambda: any(words in line for line in pair.listener.complaints))
-
-
-STOPPED_EARLY = """
-import os, signal, sys
-from tactflow_ros import bridge
-
-class Early(bridge.Bridge):
-    def on_configure(self, state):
-        os.kill(os.getpid(), signal.SIGTERM)
-        while bridge.rclpy.ok():
-            pass
-        return super().on_configure(state)
-
-bridge.Bridge = Early
-sys.exit(bridge.main())
-"""
-
-
-@needs_rclpy
-def test_a_bridge_that_is_stopped_while_it_starts_ends_without_a_traceback() -> None:
-    command = [str(PYTHON), "-c", STOPPED_EARLY]
-    done = subprocess.run(
-        command, env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-@needs_rclpy
-def test_the_transform_says_where_the_sensor_is(pair: Pair) -> None:
-    pair.listener.order(do="transform", place=[[0.1, 0.2, 0.3], [0.0, 0.0, 3.0, 4.0]])
-    told = pair.listener.told(lambda told: "transform" in told)["transform"]
-    assert told["header"] == {"stamp": {"sec": 1_700_000_000, "nanosec": 125_000_000}, "frame_id": "finger"}
-    assert told["child_frame_id"] == "gel"
-    assert told["transform"]["translation"] == {"x": 0.1, "y": 0.2, "z": 0.3}
-    assert told["transform"]["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
 
 
 @needs_rclpy

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import ast
-import runpy
 import subprocess
 import sys
-from types import ModuleType
 from typing import Any, cast
 from xml.etree import ElementTree
 
-import pytest
 import yaml
 
 from tests.ros.programs import PACKAGE, PYTHON, environment, needs_rclpy
@@ -51,50 +48,6 @@ def test_the_package_names_what_is_there_and_all_that_it_needs() -> None:
 def test_the_file_of_parameters_has_every_parameter_with_its_default() -> None:
     (node,) = yaml.safe_load((PACKAGE / "config" / "tactflow.yaml").read_text()).values()
     assert node["ros__parameters"] == {name: default for name, (default, _) in parameters().items()}
-
-
-class Noted:
-    """What a launch file has made of a class of `launch`, which no wheel has."""
-
-    def __init__(self, name: str, words: tuple[Any, ...], named: dict[str, Any]) -> None:
-        self.name, self.words, self.named = name, words, named
-
-    def perform(self, context: dict[str, str]) -> str:
-        """As a LaunchConfiguration does it."""
-        return context[self.words[0]]
-
-
-class Noting(ModuleType):
-    """A module of `launch` whose classes only note what they are given."""
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *words, **named: Noted(name, words, named)
-
-
-def test_the_launch_file_starts_the_node_with_parameters_that_it_has(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    parts = ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions")
-    for module in (*parts, "launch_ros.substitutions"):
-        monkeypatch.setitem(sys.modules, module, Noting(module))
-    file = runpy.run_path(str(PACKAGE / "launch" / "tactflow.launch.py"))
-    (actions,) = file["generate_launch_description"]().words
-    declared = {one.words[0]: one.named["default_value"] for one in actions if one.name != "OpaqueFunction"}
-    (start,) = [one.named["function"] for one in actions if one.name == "OpaqueFunction"]
-
-    def parameters_for(**given: str) -> Any:
-        (node,) = start(declared | {"params": "mine.yaml"} | given)
-        assert (node.named["package"], node.named["executable"]) == ("tactflow_ros", "bridge")
-        assert node.named["namespace"] == given.get("sensor", "main")
-        return node.named["parameters"]
-
-    # What is not given does not hide what the file says.
-    assert parameters_for() == ["mine.yaml", {"sensor": "main"}, {}]
-    given = dict.fromkeys(declared.keys() - {"params"}, "true")
-    _, sensor, others = parameters_for(**given)
-    assert sensor == {"sensor": "true"}
-    assert others.keys() <= parameters().keys() | {"use_sim_time"}
-    assert others["publish_clock"] is True
 
 
 @needs_rclpy

@@ -13,8 +13,6 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.images import Images
 
-SEQS_WITH_DROPS = [0, 1, 2, 4, 5, 8, 9, 10, 11, 12]
-
 
 def picture(seq: int) -> np.ndarray:
     return np.random.default_rng(seq).integers(0, 256, (24, 32, 3), np.uint8)
@@ -50,17 +48,6 @@ def test_jpg_files_are_smaller_with_less_quality(tmp_path: Path) -> None:
         run(folder, [7], format="jpg", quality=quality)
         sizes.append((folder / "frame-000007.jpg").stat().st_size)
     assert sizes[1] < sizes[0]
-
-
-@pytest.mark.parametrize(
-    ("every", "expected"),
-    [(1, SEQS_WITH_DROPS), (3, [0, 4, 8, 9, 12]), (4, [0, 4, 8, 12]), (100, [0])],
-)
-def test_every_nth_frame_is_written_or_the_next_one_if_it_was_dropped(
-    every: int, expected: list[int], tmp_path: Path
-) -> None:
-    run(tmp_path, SEQS_WITH_DROPS, every=every)
-    assert names(tmp_path) == [f"frame-{seq:06d}.png" for seq in expected]
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])

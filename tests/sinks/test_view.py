@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 from unittest.mock import Mock, call
 from urllib.parse import urlsplit
@@ -394,23 +393,16 @@ def test_a_record_sink_is_started_and_stopped_and_its_failure_ends_nothing(
     browser.next("stats")
 
 
-def test_a_page_that_guides_is_told_what_to_do_and_can_undo(stack: ExitStack, page: Pages) -> None:
+def test_a_page_that_guides_is_told_what_to_do(stack: ExitStack, page: Pages) -> None:
     class Session:
         state: Mapping[str, Any] = {"now": "Press the ball"}
-        undone = 0
 
-        def undo(self) -> None:
-            self.undone += 1
-
-    session = Session()
-    sink = View.through(session)(View.Params(port=0, max_fps=240.0), "main", control=fake_run())
+    sink = View.through(Session())(View.Params(port=0, max_fps=240.0), "main", control=fake_run())
     stack.callback(sink.close)
     sink.open()
     browser = page(sink)
     write(sink, 1)
     assert browser.next("frame")[0]["guide"] == {"now": "Press the ball"}
-    browser.say(do="undo")
-    until(lambda: session.undone == 1)
     assert View.session is None
 
 
@@ -571,20 +563,6 @@ def test_at_the_end_pages_learn_how_it_ended(view: Views, page: Pages) -> None:
     assert browser.until("state", lambda state: state["end"] is not None)["end"] == "eos"
     assert browser.close_code() == 1001
     assert sink.description is None
-
-
-def test_views_of_several_sensors_know_of_each_other(stack: ExitStack, page: Pages, tmp_path: Path) -> None:
-    views = {}
-    for sensor in ("left", "right"):
-        views[sensor] = View(View.Params(port=0, neighbours=str(tmp_path)), sensor, control=fake_run())
-        stack.callback(views[sensor].close)
-        views[sensor].open()
-    address = views["right"].description
-    assert address is not None
-    browser = page(views["left"])
-    assert browser.next("state")["neighbours"] == {"right": int(address.rstrip("/").rpartition(":")[2])}
-    views["right"].close()
-    browser.until("state", lambda state: state["neighbours"] == {})
 
 
 def test_too_many_pages_are_turned_away(view: Views, page: Pages) -> None:

@@ -183,13 +183,6 @@ def test_a_relative_path_is_looked_for_here_first_and_then_beside_the_pipeline(
         np.testing.assert_array_equal(image, FRAMES[index])
 
 
-def test_a_pattern_for_all_folders_follows_no_links_in_circles(tmp_path: Path) -> None:
-    pictures = Path(make(tmp_path, "folder"))
-    for name in ("one", "two"):
-        (pictures / name).symlink_to(pictures, target_is_directory=True)
-    assert len(read_all(open_source(str(tmp_path / "**" / "*.png")))) == 5
-
-
 # -- what cannot be opened ---------------------------------------------------------------------------------
 
 

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.cli.main import main
 from tactflow.engine.errors import SourceError
 from tactflow.sources import Watch, Watched, open_source
 from tests.clock import PATIENCE, until
@@ -128,13 +127,6 @@ def test_an_address_without_a_stream_is_an_error_without_the_password(
     assert str(server.port) in str(raised.value)
     assert "secret" not in str(raised.value)
     assert capfd.readouterr().err == ""
-
-
-def test_detect_shows_no_password_of_the_stream_it_looks_at(
-    server: Server, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["detect", server.address.replace("//", "//operator:secret@")]) == 3
-    assert capsys.readouterr().out.startswith(f"http://127.0.0.1:{server.port}/..., frame 0: 64 x 48 px")
 
 
 @pytest.mark.parametrize(("does", "says"), [("gone", "is gone since"), ("silent", "no frames since")])

@@ -94,26 +94,3 @@ def test_a_third_signal_is_not_caught() -> None:
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-
-
-def test_a_signal_while_nobody_takes_the_last_of_the_output(tmp_path: Path) -> None:
-    (tmp_path / "ending.py").write_text("""
-import sys
-from tactflow import __main__
-from tactflow.cli import main
-from tactflow.system.signals import Interrupted
-
-def interrupted():
-    sys.stdout.flush = lambda: None
-    raise Interrupted
-
-def print_little(*_):
-    sys.stdout.flush = interrupted
-    return 0
-
-main.main = print_little
-__main__.entry()
-""")
-    command = [sys.executable, "-m", "ending"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (130, "")

@@ -13,7 +13,6 @@ ARGUMENTS = {
     "control": "address for tactflow's commands",
     "keys": "folder of the subscriber, from tactflow keys new",
     "frame_id": "frame of the picture",
-    "parent_frame": "parent of frame_id",
     "reliability": "best_effort or reliable",
 }
 """Argument -> description; the parameter file has the defaults."""

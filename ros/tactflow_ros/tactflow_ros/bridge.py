@@ -47,9 +47,6 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "control": ("", "sinks.zmq.control, for the service ~/take_reference; empty disables it"),
     "keys": ("", "folder of the subscriber, from tactflow keys new; empty for no keys"),
     "frame_id": ("tactile_optical_frame", "frame of the picture: x right, y down, z out of the gel"),
-    "parent_frame": ("", "parent of frame_id; empty for no transform"),
-    "translation": ([0.0, 0.0, 0.0], "of frame_id in parent_frame: x, y, z, m"),
-    "rotation": ([0.0, 0.0, 0.0, 1.0], "quaternion x, y, z, w"),
     "object_frame": ("", "frame of the object on /tf, a child of frame_id; empty for no transform"),
     "reliability": ("best_effort", "of the topics: best_effort or reliable"),
     "timeout": (2.0, "time without a message before /diagnostics reports it, s"),
@@ -82,12 +79,12 @@ ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
 """Message sent by tactflow only on subscription -> topic."""
 
 
-def _tf_message(parameter: str) -> Any:
-    """`TFMessage`. Raises ImportError, saying what to install for a parameter."""
+def _tf_message() -> Any:
+    """`TFMessage`. Raises ImportError, saying what to install."""
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError:
-        raise ImportError(f"{parameter} needs tf2_msgs: apt install ros-$ROS_DISTRO-tf2-msgs") from None
+        raise ImportError("object_frame needs tf2_msgs: apt install ros-$ROS_DISTRO-tf2-msgs") from None
     return TFMessage
 
 
@@ -160,8 +157,6 @@ class Bridge(LifecycleNode):
         del state
         try:
             self._make_topics()
-            if self.value("parent_frame"):
-                self._publish_transform()
         except (ValueError, ImportError) as error:
             self.get_logger().error(str(error))
             self._forget()
@@ -226,7 +221,7 @@ class Bridge(LifecycleNode):
         if self.value("publish_clock"):
             self._topics["/clock"] = self._publisher(Clock, "/clock", qos)
         if self.value("object_frame"):
-            self._topics["/tf"] = self._publisher(_tf_message("object_frame"), "/tf", QoSProfile(depth=DEPTH))
+            self._topics["/tf"] = self._publisher(_tf_message(), "/tf", QoSProfile(depth=DEPTH))
         self._topics["/diagnostics"] = self.create_publisher(DiagnosticArray, "/diagnostics", DEPTH)
 
     def _publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
@@ -239,19 +234,6 @@ class Bridge(LifecycleNode):
             "request best_effort and volatile (qos_profile_sensor_data), or set the parameter reliability to "
             "reliable"
         )
-
-    def _publish_transform(self) -> None:
-        place = messages.transform(
-            self.value("frame_id"),
-            self.value("parent_frame"),
-            self.value("translation"),
-            self.value("rotation"),
-            self.get_clock().now().to_msg(),
-        )
-        kind = _tf_message("parent_frame")
-        qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-        self._topics["/tf_static"] = self.create_publisher(kind, "/tf_static", qos)
-        self._topics["/tf_static"].publish(kind(transforms=[place]))
 
     # -- messages -----------------------------------------------------------------------------------------
 
@@ -284,7 +266,7 @@ class Bridge(LifecycleNode):
 
     def _object_transform(self, message: messages.Message, head: Any) -> Any:
         place = messages.object_transform(message, head, self.value("object_frame"))
-        return None if place is None else _tf_message("object_frame")(transforms=[place])
+        return None if place is None else _tf_message()(transforms=[place])
 
     def _offer(self, topic: str, make: Callable[[], Any]) -> None:
         """Create and publish a message, unless the topic has no subscribers or there is nothing to

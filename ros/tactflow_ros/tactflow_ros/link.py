@@ -10,6 +10,7 @@ from typing import Any
 
 import zmq
 import zmq.auth
+from zmq.utils.monitor import recv_monitor_message
 
 POLL_MS = 100
 """Interval at which the thread checks for closing and for changed subscriptions, ms. Chosen by hand."""
@@ -17,8 +18,12 @@ BACKLOG = 120
 """Messages queued while this process is blocked: two seconds at 60 Hz. Chosen by hand."""
 MAX_MESSAGE_BYTES = 16 << 20
 """Maximum size of a message. Chosen by hand."""
-REFUSALS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """Handshake failures after which ZeroMQ does not reconnect."""
+HUNG_UP = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+"""The server closed the connection during the handshake; ZeroMQ reconnects."""
+MOST_HANG_UPS = 5
+"""Consecutive hang-ups that count as a rejection; a server that ends causes one or two. Chosen by hand."""
 REQUIRED = frozenset(["sensor", "seq", "t", "contact", "flow", "markers"])
 """Keys that a result message must have."""
 
@@ -109,7 +114,8 @@ class Link:
         self._socket.rcvhwm = BACKLOG
         # Heartbeats detect a publisher that disappeared without closing its connection, and reconnect.
         self._socket.setsockopt(zmq.HEARTBEAT_IVL, 2000)
-        self._monitor = self._socket.get_monitor_socket(REFUSALS)
+        self._monitor = self._socket.get_monitor_socket(REFUSED | HUNG_UP | zmq.EVENT_HANDSHAKE_SUCCEEDED)
+        self._hang_ups = 0
         try:
             connect(self._socket, endpoint, keys, "endpoint")
         except LinkError:
@@ -143,10 +149,16 @@ class Link:
             self._subscribe()
             ready = dict(poller.poll(POLL_MS))
             if self._monitor in ready:
-                self._monitor.recv_multipart()
-                self.refused = f"{self._endpoint} requires other keys, or any: set the parameter keys"
+                self._note_handshake(recv_monitor_message(self._monitor)["event"])
             if self._socket in ready:
                 self._pass_on(self._socket.recv())
+
+    def _note_handshake(self, event: int) -> None:
+        self._hang_ups = self._hang_ups + 1 if event == HUNG_UP else 0
+        if event & REFUSED or self._hang_ups >= MOST_HANG_UPS:
+            self.refused = f"{self._endpoint} requires other keys, or any: set the parameter keys"
+        elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            self.refused = None
 
     def _subscribe(self) -> None:
         wanted = self._wanted

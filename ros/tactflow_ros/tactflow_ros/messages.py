@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -240,25 +239,3 @@ def depth(message: Message, data: bytes, frame_id: str) -> Image:
         step=4 * width,
         data=array("B", metres.tobytes()),
     )
-
-
-def transform(
-    frame_id: str, parent: str, translation: Sequence[float], rotation: Sequence[float], now: Time
-) -> TransformStamped:
-    """Pose of the sensor's frame. translation : x, y, z, m. rotation : quaternion x, y, z, w.
-
-    Raises
-    ------
-    ValueError : not three or four finite numbers, or a quaternion of zeros.
-    """
-    for name, values, count in (("translation", translation, 3), ("rotation", rotation, 4)):
-        if len(values) != count or not all(map(math.isfinite, values)):
-            raise ValueError(f"{name}: required {count} finite numbers, got {list(values)}")
-    length = math.hypot(*rotation)
-    if length == 0:
-        raise ValueError("rotation: required a quaternion x, y, z, w other than 0")
-    result = TransformStamped(header=Header(stamp=now, frame_id=parent), child_frame_id=frame_id)
-    to = result.transform
-    to.translation.x, to.translation.y, to.translation.z = map(float, translation)
-    to.rotation.x, to.rotation.y, to.rotation.z, to.rotation.w = (value / length for value in rotation)
-    return result

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 ROWS: Final = 1024
-"""Frames whose numbers are written together, as one chunk of each array. Chosen by hand."""
+"""Number of frames per chunk of the arrays of numbers. Chosen by hand."""
 FILL: Final[Mapping[str, tuple[str, float]]] = {
     "number": ("<f8", math.nan),
     "numbers": ("<f8", math.nan),
@@ -42,7 +42,7 @@ FILL: Final[Mapping[str, tuple[str, float]]] = {
     "boolean": ("i1", -1),
     "byte": ("u1", 255),
 }
-"""Kind of a column -> data type, and the value that stands for a missing one."""
+"""Kind of a column -> data type, and the placeholder for a missing value."""
 UNIT: Final = re.compile(r"(?:^|, | and )(mm per px|mm\^[23]|px\^2|mm/s|px/s|mm|px|degrees|N|s)(?=[ ;:,]|$)")
 """A unit in the description of a column."""
 MARKERS: Final = {
@@ -66,17 +66,17 @@ ARRAYS: Final[Mapping[str, tuple[str, str]]] = {
 }
 """Name of each array -> kind and description; texts are left out."""
 NO_MARKERS: Final = Markers(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.uint8), np.empty(0))
-"""Those of a frame that has none."""
+"""The markers of a frame without any."""
 
 
 def export_hdf5(
     folder: Path, episodes: Iterable[tuple[str, Iterable[Result]]], *, fps: int | None = None, **_: object
 ) -> None:
-    """Write `episode_000.h5`, ... into a folder; an exporter of `tactflow export`.
+    """Write `episode_000.h5`, ... into a folder, for `tactflow export`.
 
     Parameters
     ----------
-    folder : not there yet.
+    folder : must not exist.
     episodes : the name of each recording, and its results with pictures.
     fps : frames per second, the nearest in time of each; None keeps every frame.
 
@@ -133,17 +133,17 @@ def write(file: Hdf5 | Zarr, name: str, results: Iterable[Result]) -> int:
 
 
 def _file_attributes(name: str, result: Result) -> dict[str, Any]:
-    """Where a recording comes from, and how its pixels become those of the processed frame."""
+    """Provenance of a recording, and the transform from its pixels to those of the processed frame."""
     attributes = {"recording": name, "schema": SCHEMA, **facts(result.sensor, None)}
     mapping: PixelMapping | None = result.value("mapping")
     return attributes if mapping is None else attributes | {"raw_to_processed": mapping.matrix.tolist()}
 
 
 def _array_attributes(name: str) -> dict[str, Any]:
-    """The description of an array, its unit, and what stands for a missing value where that is not NaN."""
+    """The description of an array, its unit, and its placeholder for missing values unless that is NaN."""
     kind, description = ARRAYS[name]
     attributes: dict[str, Any] = {"description": description}
-    # Where there are several, the description says which is whose.
+    # If there are several, the description assigns them.
     if len(units := set(UNIT.findall(description))) == 1:
         attributes["units"] = units.pop()
     if kind in ("integer", "boolean") or name == "markers_status":
@@ -164,7 +164,7 @@ def _row(result: Result) -> dict[str, ArrayLike]:
 
 
 def _missing(kind: str) -> ArrayLike:
-    """What stands for a missing value before it is padded."""
+    """The placeholder for a missing value, before padding."""
     return np.empty((0, 2)) if kind == "points" else () if kind == "numbers" else FILL[kind][1]
 
 
@@ -187,13 +187,13 @@ class _ArrayFile:
             self.flush()
 
     def flush(self) -> None:
-        """Write the numbers that are kept. Raises OSError if they cannot be written."""
+        """Write the buffered numbers. Raises OSError if they cannot be written."""
         rows, self._rows = self._rows, []
         for name in rows[0] if rows else ():
             self._append(name, [row[name] for row in rows])
 
     def _append(self, name: str, values: Sequence[ArrayLike]) -> None:
-        """Append values, which may differ in length: shorter ones are padded."""
+        """Append values; shorter ones are padded."""
         dtype, fill = FILL[ARRAYS[name][0]]
         rows = [np.asarray(value, dtype) for value in values]
         shape = tuple(map(max, zip(*(row.shape for row in rows), strict=True)))
@@ -211,7 +211,7 @@ class _ArrayFile:
             array[(slice(begin, begin + len(rows)), *_first(shape))] = block
 
     def _create(self, name: str, fill: float, **options: Any) -> Any:
-        """Make an array that can grow. options : its shape, dtype and chunks."""
+        """Create an array that can grow. options : its shape, dtype and chunks."""
         raise NotImplementedError
 
 
@@ -221,7 +221,7 @@ def _first(shape: tuple[int, ...]) -> list[slice]:
 
 
 class Hdf5(_ArrayFile):
-    """An HDF5 file to write. path : of the file. Raises OSError if it cannot be made."""
+    """Writes an HDF5 file. path : of the file. Raises OSError if it cannot be created."""
 
     suffix = ".h5"
     needs = ("HDF5 files", "hdf5", ("h5py",))
@@ -233,7 +233,7 @@ class Hdf5(_ArrayFile):
         super().__init__(h5py.File(self._disk, "w"))
 
     def _create(self, name: str, fill: float, **options: Any) -> Any:
-        # Any program that knows HDF5 can unpack gzip.
+        # Every HDF5 library can unpack gzip.
         options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
         maxshape = (None,) * len(options["shape"])
         return self.group.create_dataset(name, maxshape=maxshape, fillvalue=fill, **options)
@@ -250,7 +250,7 @@ class Hdf5(_ArrayFile):
 
 
 class _Disk(io.FileIO):
-    """A file that remembers why it could not be written, and takes what follows for written.
+    """A file that remembers a write error, and pretends that later writes succeed.
 
     HDF5 2.0 crashes at the end of the process if a file could not be completed.
     """
@@ -267,13 +267,13 @@ class _Disk(io.FileIO):
         return memoryview(data).nbytes
 
     def check(self) -> None:
-        """Raise the error of a write that failed."""
+        """Raise the error of a failed write."""
         if self._error is not None:
             raise self._error
 
 
 class Zarr(_ArrayFile):
-    """A Zarr folder to write. path : of the folder. Raises OSError if it cannot be made."""
+    """Writes a Zarr folder. path : of the folder. Raises OSError if it cannot be created."""
 
     suffix = ".zarr"
     needs = ("Zarr files", "zarr", ("zarr",))
@@ -281,11 +281,11 @@ class Zarr(_ArrayFile):
     def __init__(self, path: Path) -> None:
         import zarr
 
-        # Version 2 of the package, too, reads this format.
+        # Version 2 of the package also reads this format.
         super().__init__(zarr.open_group(path, mode="w", zarr_format=2))
 
     def _create(self, name: str, fill: float, **options: Any) -> Any:
-        # A source must be able to tell black pictures from those that were never written.
+        # A source must distinguish black pictures from unwritten ones.
         options["config"] = {"write_empty_chunks": True}
         return self.group.create_array(name, fill_value=fill, **options)
 

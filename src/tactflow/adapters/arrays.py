@@ -22,11 +22,12 @@ SETTINGS = {
     "order": "rgb (bgr if not given)",
 }
 EXPORTED = {"dataset": "/frames", "times": "/t"}
-"""What `tactflow export` writes, and what is read of a file that has both if nothing else is asked for."""
+"""Written by `tactflow export`, and read by default from a file that has both."""
 BLOCK = 64 << 20
-"""Frames are read chunk by chunk, but not more than so many bytes together. Chosen by hand."""
+"""Maximum number of bytes read at a time. Chosen by hand."""
 LARGEST_CHUNK = 1 << 30
-"""Bytes of an uncompressed chunk at most, so that a damaged file does not take all memory. Chosen by hand."""
+"""Maximum size of an uncompressed chunk, bytes, so that a damaged file does not take all memory. Chosen by
+hand."""
 ZARR_CHUNK = re.compile(r"(?:c[./])?(\d+)(?:[./]\d+)*")
 """Path of a chunk or shard in the folder of a Zarr array: its index along each axis."""
 
@@ -36,8 +37,8 @@ class ArrayDataset(FrameReader):
 
     spec : `file.h5?dataset=/frames`; `times=/t` names their times, else frame i is taken at i / fps;
     `order=rgb` if the colors are in that order. An export of tactflow needs none of these. directory, fps :
-    as for `open_source`. Raises SourceError if there is no such file or array (it lists those that are
-    there), it holds no frames, or a package is missing.
+    as for `open_source`. Raises SourceError if there is no such file or array (it lists the valid
+    ones), it holds no frames, or a package is missing.
     """
 
     # HDF5 and the codecs of both formats raise all kinds of errors.
@@ -84,12 +85,12 @@ class ArrayDataset(FrameReader):
             yield frame, float(t)
 
     def _count_stored(self, stored: Collection[int], length: int) -> int:
-        """Frames up to the last chunk that is stored: others read as the fill value, for any length.
+        """Number of frames up to the last stored chunk; later ones would read as the fill value.
 
         stored : indices of chunks along the first axis. length : frames in each.
         """
         chunks, claimed = max(stored, default=-1) + 1, int(self._array.shape[0])
-        # Zarr leaves out chunks of black pictures. Where most are missing, it is no recording.
+        # Zarr omits chunks of black pictures. If most are missing, it was not written completely.
         if 2 * len(stored) < max(chunks, 1):
             raise SourceError(f"{self.name}: only {len(stored)} of its chunks are stored; was it written?")
         if chunks * length < claimed:
@@ -115,14 +116,14 @@ class ArrayDataset(FrameReader):
 
 
 def _hdf5_arrays(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
-    """The arrays of an HDF5 file by name, and what closes it."""
+    """The arrays of an HDF5 file by name, and the function that closes it."""
     import h5py  # type: ignore[import-untyped]
 
     file = h5py.File(path, "r")
     arrays: dict[str, Any] = {}
 
     def visit(name: str, item: Any) -> None:
-        # Not those whose pixels lie in other files, which may be any file of this machine.
+        # Skip those with pixels in other files, which may be any file of this machine.
         if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
             arrays[f"/{name}"] = item
 
@@ -162,7 +163,7 @@ def _open(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
 def _stored_chunks(array: Any) -> tuple[Collection[int], int]:
     """Indices of the stored chunks along the first axis, and the frames in each."""
     if hasattr(array, "store"):
-        # The zarr package itself would look for every chunk that may be.
+        # The zarr package would look for every possible chunk.
         folder = Path(array.store.root, array.path)
         paths = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
         found = {int(match[1]) for path in paths if (match := ZARR_CHUNK.fullmatch(path))}
@@ -197,7 +198,7 @@ def _check(array: Any, name: str) -> None:
 
 
 def _read_chunks(array: Any, length: int) -> Iterator[NDArray[Any]]:
-    """One frame after the other; the file is read by whole chunks, as they are compressed."""
+    """Frames in order. The file is read by whole chunks, because they are compressed."""
     frame_bytes = max(math.prod(array.shape[1:]) * array.dtype.itemsize, 1)
     together = max(1, min(array.chunks[0] if array.chunks else 1, BLOCK // frame_bytes))
     for begin in range(0, length, together):

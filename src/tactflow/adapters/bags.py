@@ -53,11 +53,11 @@ Topics = Mapping[str, tuple[str, int | None]]
 class Bag(FrameReader):
     """The pictures of one topic.
 
-    A frame's time is the stamp in its message, or, where that is 0, when it was recorded; from 0 at the first
-    frame.
+    The time of a frame is the stamp in its message, or the time of its recording if that is 0; it counts from
+    the first frame.
 
     spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder. directory : as for
-    `open_source`. Raises SourceError if there is no such file or topic (it lists those that are there), or a
+    `open_source`. Raises SourceError if there is no such file or topic (it lists the valid ones), or a
     package is missing.
     """
 
@@ -99,7 +99,7 @@ class Bag(FrameReader):
 
 
 def _choose(spec: str, topic: str | None, topics: Topics) -> str:
-    """The requested topic, if it is there and has pictures; without a request, the only one that has some."""
+    """The requested topic, if it has pictures; without a request, the only topic with pictures."""
     pictures = [name for name, (kind, _) in sorted(topics.items()) if _decoder(kind) is not None]
     if topic in pictures:
         return topic
@@ -145,19 +145,19 @@ class RosBag:
         }
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """When each message of a topic was written, ns, and the message, whose fields are attributes."""
+        """The messages of a topic: time of writing, ns, and the message, with its fields as attributes."""
         connections = [connection for connection in self._reader.connections if connection.topic == topic]
         for connection, written, data in self._reader.messages(connections):
             yield written, self._reader.deserialize(data, connection.msgtype)
 
     def close(self) -> None:
-        """Close the files; may be called twice."""
+        """Close the files. Idempotent."""
         if self._reader.stack is not None:
             self._reader.close()
 
 
 class McapFile:
-    """An .mcap file, whoever wrote it, also one that was cut off."""
+    """An .mcap file of any program, also a truncated one."""
 
     def __init__(self, path: Path) -> None:
         require(path, "MCAP files", "bags", "mcap", "zstandard")
@@ -201,7 +201,7 @@ class McapFile:
             yield message.log_time, parsers[message.channel_id](message.data)
 
     def _parser(self, channel: Channel) -> Callable[[bytes], Any]:
-        """What decodes the messages of a channel."""
+        """The decoder for the messages of a channel."""
         schema, encoding = self._summary.schemas[channel.schema_id], channel.message_encoding
         if encoding not in DECODERS:
             raise SourceError(
@@ -221,7 +221,7 @@ class McapFile:
         return _from_ros(schema, encoding)
 
     def close(self) -> None:
-        """Nothing stays open between two reads."""
+        """Nothing to do: no file stays open."""
 
 
 def _from_ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
@@ -237,7 +237,7 @@ def _from_ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
 
 
 def _from_json(data: bytes) -> Any:
-    """A message of Foxglove's JSON schemas, whose bytes are written in base64."""
+    """A message of Foxglove's JSON schemas, with bytes in base64."""
     message = json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
     message.data = base64.b64decode(message.data)
     return message
@@ -247,7 +247,7 @@ def _from_json(data: bytes) -> Any:
 
 
 def _stamp(message: Any) -> int:
-    """When the picture of a message was taken, ns; 0 where it does not say."""
+    """Capture time of the picture in a message, ns; 0 if unknown."""
     time = message.header.stamp if hasattr(message, "header") else message.timestamp
     names = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
     seconds, rest = next(pair for pair in names if all(hasattr(time, name) for name in pair))
@@ -255,7 +255,7 @@ def _stamp(message: Any) -> int:
 
 
 def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any] | None] | None:
-    """What takes the picture out of a message of this type; None where messages hold none."""
+    """The function that extracts the picture from a message of this type; None for other types."""
     package, _, name = kind.replace(".", "/").rpartition("/")
     if package not in PACKAGES:
         return None
@@ -267,7 +267,7 @@ def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any] | None] | None:
 def raw_image(message: Any, name: str) -> NDArray[Any]:
     """The pixels of an `Image` or `RawImage`: (H, W) or (H, W, 3) uint8 or uint16, in the order BGR.
 
-    Raises SourceError if the encoding is unknown, or there are fewer bytes than the message promises.
+    Raises SourceError if the encoding is unknown, or there are fewer bytes than the message states.
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     check_pixel_count(name, width, height)
@@ -300,14 +300,14 @@ def compressed_image(message: Any, name: str) -> NDArray[Any]:
 
 
 class VideoDecoder:
-    """Decodes a video that comes in pieces, one picture each."""
+    """Decodes a video from messages with one picture each."""
 
     def __init__(self) -> None:
         self._codec: av.VideoCodecContext | None = None
         self._begun = False
 
     def __call__(self, message: Any, name: str) -> NDArray[np.uint8] | None:
-        """The picture of one piece, (H, W, 3) uint8 BGR; None as long as the video has not begun.
+        """The picture of one message, (H, W, 3) uint8 BGR; None before the first key frame.
 
         Raises SourceError if PyAV is not installed, or the codec is unknown.
         """

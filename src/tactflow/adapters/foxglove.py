@@ -1,4 +1,4 @@
-"""Foxglove: live pictures, what was found on them, and results, for Foxglove to connect to."""
+"""Foxglove: serves live pictures, annotations and results to Foxglove."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 BACKLOG = 32
-"""Messages that may wait for each viewer. Chosen by hand."""
+"""Messages queued per viewer. Chosen by hand."""
 
 
 class Foxglove(Sink):
     """Serves the channels of a recording live: `/main/image`, `/main/annotations`, `/main/results`, and
     `/main/pose`, the pose of the object for the 3D panel, in metres.
 
-    In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. Channels that nobody looks at
-    are not encoded, and a slow viewer loses messages; the run never waits.
+    In Foxglove: *Open connection*, *Foxglove WebSocket*, `ws://localhost:8765`. Channels without
+    viewers are not encoded, and a slow viewer loses messages; the run never waits.
     """
 
     threaded = True
@@ -38,14 +38,14 @@ class Foxglove(Sink):
     observer = True
 
     class Params(StageParams):
-        """Where to serve, and how good the pictures are."""
+        """Address, and quality of the pictures."""
 
         host: str = Field(
             "127.0.0.1", min_length=1, description="address to listen at; 127.0.0.1 is this machine only"
         )
         port: int = Field(8765, ge=0, le=65535, description="0 picks a free one")
         open_to_all: bool = Field(
-            False, description="serve other machines: Foxglove's protocol knows no keys, anybody may look"
+            False, description="serve other machines: anybody may look, as Foxglove's protocol has no keys"
         )
         quality: int = Field(
             80, ge=1, le=100, description="of the JPEG pictures; higher is sharper and larger"
@@ -55,14 +55,14 @@ class Foxglove(Sink):
         def _local(self) -> Foxglove.Params:
             if not self.open_to_all and not is_loopback(self.host):
                 raise ValueError(
-                    f"{self.host} can be reached from other machines, and Foxglove's protocol knows no keys: "
+                    f"{self.host} can be reached from other machines, and Foxglove's protocol has no keys: "
                     "set host to 127.0.0.1, or open_to_all: true to let anybody look"
                 )
             return self
 
     @classmethod
     def binds(cls, params: Foxglove.Params) -> dict[str, str]:
-        """Where it serves."""
+        """Its address."""
         return {"port": f"ws://{params.host}:{params.port}"} if params.port else {}
 
     def __init__(self, params: Params, sensor: str = "main") -> None:
@@ -76,9 +76,9 @@ class Foxglove(Sink):
         self._sent = 0
 
     def open(self) -> None:
-        """Begin to serve; afterwards `address` is the real one.
+        """Start serving; afterwards `address` has the actual port.
 
-        Raises StageError if a package is missing, or the address is taken or not one of this machine.
+        Raises StageError if a package is missing, or the address is in use or not one of this machine.
         """
         needed = ["foxglove", "mcap_protobuf", "foxglove_schemas_protobuf"]
         problem = missing("live views in Foxglove", "foxglove", needed)
@@ -89,7 +89,7 @@ class Foxglove(Sink):
 
         from tactflow.recording.schemas import channel_type, channel_types
 
-        # Kept, as channels end with it.
+        # Keep a reference: the channels end with it.
         self._context = context = foxglove.Context()
         for name, kind in (channel_types() | {"pose": channel_type(PoseInFrame)}).items():
             encoding, data = kind.schema
@@ -99,7 +99,7 @@ class Foxglove(Sink):
                 topic, schema=schema, message_encoding=kind.packing, context=context
             )
         p = self.params
-        # It complains of every connection that is not Foxglove's, and anybody may connect.
+        # It logs every connection of other programs, and anybody may connect.
         logging.getLogger("foxglove").setLevel(logging.ERROR)
         try:
             self._server = foxglove.start_server(
@@ -114,7 +114,7 @@ class Foxglove(Sink):
         log.info("foxglove: %s", self.address)
 
     def wants(self) -> bool:
-        """Whether anybody looks at a channel. From any thread."""
+        """Whether a channel has viewers. Thread-safe."""
         return any(channel.has_sinks() for channel in list(self._channels.values()))
 
     def counters(self) -> dict[str, int]:
@@ -122,7 +122,7 @@ class Foxglove(Sink):
         return {"messages": self._sent}
 
     def write(self, result: Result) -> None:
-        """Send the channels that somebody looks at; never waits."""
+        """Send the channels that have viewers; never waits."""
         from tactflow.recording.frames import nanoseconds
         from tactflow.recording.schemas import encode_annotations, encode_picture
 
@@ -141,7 +141,7 @@ class Foxglove(Sink):
                 self._sent += 1
 
     def close(self) -> None:
-        """Stop the server; viewers see that the connection is closed."""
+        """Stop the server, which closes the connections."""
         server, self._server = self._server, None
         if server is not None:
             server.stop()

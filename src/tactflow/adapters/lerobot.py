@@ -10,8 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,11 +33,9 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 VERSION = "v3.0"
-"""Of the layout, as LeRobot compares it."""
+"""Version of the layout, which LeRobot checks."""
 PICTURES = "observation.images."
 TACTILE = "observation.tactile"
-WINDOW = "window"
-"""Key under which a row keeps the numbers of all results since the row before."""
 NAMES = {
     "contact": ["touching", "x", "y", "area", "angle"],
     "flow": ["known", "dx", "dy"],
@@ -49,19 +46,19 @@ NAMES = {
     "drag": ["known", "x_N", "y_N"],
     "pose": ["known", "x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg"],
 }
-"""Features and the names of their numbers: the first two in px, the others only with a calibration, whatever
-parts it has. All numbers are 0 where the first is 0."""
+"""Feature -> names of its numbers. The first two are in px; the others exist with any calibration. All
+numbers are 0 where the first is 0."""
 FORCES = ("Fx_N", "Fy_N", "Fz_N")
-"""Force on a marker: always unknown, as tactflow knows only that on the whole gel."""
+"""Force on a marker: always unknown, because tactflow measures only that on the whole gel."""
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
 """Integer columns that every dataset has, besides `timestamp`."""
 CHUNK = 1000
-"""Files in one folder, as LeRobot has it."""
+"""Files per folder, as in LeRobot."""
 QUALITY = {"crf": "18", "g": "2", "preset": "veryfast"}
-"""Of the video: hardly any visible loss, and every other picture is a key frame, for random access. Chosen by
-hand."""
+"""Options of the encoder: hardly any visible loss, and every other picture is a key frame, for random access.
+Chosen by hand."""
 SAMPLED = 10
-"""Every so many pictures are used for their statistics. Chosen by hand."""
+"""Every 10th picture counts for the statistics. Chosen by hand."""
 
 
 def export(
@@ -73,19 +70,19 @@ def export(
     pictures: str = "video",
     **_: object,
 ) -> None:
-    """Write a dataset; an exporter of `tactflow export`.
+    """Write a dataset, for `tactflow export`.
 
     Parameters
     ----------
-    folder : empty, or not there.
+    folder : empty or missing.
     episodes : the name of each recording, and its results with pictures.
     fps : of the dataset, frames per second.
-    task : what is done, in words.
+    task : description of the task.
     pictures : "video" (H.264, lossy) or "png" (lossless).
 
     Raises
     ------
-    StageError : a package is missing, or a recording does not go with those before. OSError : the files
+    StageError : a package is missing, or a recording does not match the earlier ones. OSError : the files
         cannot be written.
     """
     writer = DatasetWriter(folder, fps, task, video=pictures == "video")
@@ -95,7 +92,7 @@ def export(
 
 
 class DatasetWriter:
-    """Writes one dataset. Parameters as for `export`; video : whether pictures are kept as a video."""
+    """Writes one dataset. Parameters as for `export`; video : whether to store pictures as a video."""
 
     def __init__(self, folder: Path, fps: int, task: str, *, video: bool = True) -> None:
         problem = missing("LeRobot datasets", "lerobot", ["pyarrow", "av"])
@@ -109,8 +106,6 @@ class DatasetWriter:
         self._features: dict[str, dict[str, Any]] = {}
         self._moments: dict[str, Moments] = {}
         self._order = MarkerOrder()
-        self._window = 0
-        self._recent: deque[tuple[float, list[float]]] = deque()
         self._pixels: list[NDArray[np.float64]] = []
 
     def add(self, results: Iterable[Result]) -> int:
@@ -128,8 +123,7 @@ class DatasetWriter:
         rows: list[dict[str, Any]] = []
         encode: Callable[[NDArray[np.uint8] | None], None] | None = None
         with ExitStack() as stack:
-            self._recent.clear()
-            for index, result in enumerate(at_rate(self._remembered(results), self._fps)):
+            for index, result in enumerate(at_rate(results, self._fps)):
                 image = self._check(result)
                 if self._is_video and encode is None:
                     path = self._folder / "videos" / self._camera / f"{file}.mp4"
@@ -137,7 +131,7 @@ class DatasetWriter:
                 rows.append(self._row(result, image, index, episode))
                 if encode is not None:
                     encode(image)
-            # Not after a write that failed, which would end the process.
+            # After a failed write, this would crash the process.
             if encode is not None:
                 encode(None)
         if not rows:
@@ -154,7 +148,7 @@ class DatasetWriter:
 
         meta = self._folder / "meta"
         _write(pa.Table.from_pylist(self._episodes), meta / "episodes" / "chunk-000" / "file-000.parquet")
-        # LeRobot finds a task by the index of a pandas table; this says which column that is.
+        # LeRobot looks up a task by the index of a pandas table; this names the index column.
         types = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
         columns = [
             {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
@@ -167,7 +161,7 @@ class DatasetWriter:
         (meta / "stats.json").write_text(json.dumps(self._statistics(), indent=4))
 
     def _check(self, result: Result) -> NDArray[np.uint8]:
-        """The picture of a result, if it goes with those before."""
+        """The picture of a result, if it matches the earlier ones."""
         image = result.image
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")
@@ -177,27 +171,14 @@ class DatasetWriter:
         if not self._kind:
             self._kind, self._camera, self._shape = kind, camera, image.shape
         if kind != self._kind:
-            raise StageError(f"{kind}; those before are {self._kind}: make two datasets")
+            raise StageError(f"{kind}; the earlier ones are {self._kind}: make two datasets")
         if self._is_video and (image.shape[0] % 2 or image.shape[1] % 2):
             raise StageError(f"pictures of {size}: a video needs even numbers; give --pictures png")
         return image
 
-    def _remembered(self, results: Iterable[Result]) -> Iterator[Result]:
-        """The same results; the numbers of each are kept until the next frame of the dataset."""
-        for result in results:
-            self._recent.append(
-                (result.t, [number for values in _values(result).values() for number in values])
-            )
-            yield result
-
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
         row: dict[str, Any] = {f"{TACTILE}.{name}": values for name, values in _values(result).items()}
         row |= self._marker_rows(result)
-        window = []
-        while self._recent and self._recent[0][0] <= result.t:
-            t, numbers = self._recent.popleft()
-            window.append([1.0, t - result.t, *numbers])
-        row[WINDOW] = window
         if index % SAMPLED == 0:
             # Mean, mean square, minimum and maximum of red, green, blue.
             rgb = image.reshape(-1, 3)[:, ::-1] / 255.0
@@ -208,7 +189,7 @@ class DatasetWriter:
         return row | {"timestamp": index / self._fps} | dict(zip(INTEGERS, integers, strict=True))
 
     def _marker_rows(self, result: Result) -> dict[str, NDArray[Any]]:
-        """The features of the markers; empty as long as no frame had any."""
+        """The features of the markers; empty before the first frame with markers."""
         if result.markers is not None:
             markers = self._order.align(result.markers)
             return _marker_features(result.sensor, markers, _points(markers, result))
@@ -219,7 +200,7 @@ class DatasetWriter:
         return _marker_features(sensor, lost, np.full((len(lost.offset), 6), np.nan))
 
     def _complete(self, rows: list[dict[str, Any]]) -> None:
-        """Give every row of an episode all features, in their fixed lengths, and count their values.
+        """Complete the features of every row of an episode, and add their values to the statistics.
 
         Raises
         ------
@@ -229,14 +210,6 @@ class DatasetWriter:
         if self._order.origin is not None:
             lost = self._lost_markers(sensor)
             rows[:] = [lost | row for row in rows]
-        windows = [row.pop(WINDOW) for row in rows]
-        if not self._features:
-            self._window = max(map(len, windows))
-        if self._window > 1:
-            nothing = [0.0] * len(windows[0][0])
-            for row, window in zip(rows, windows, strict=True):
-                newest = window[-self._window :]
-                row[f"{TACTILE}.{sensor}.window"] = [nothing] * (self._window - len(newest)) + newest
         values = [
             {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE)} for row in rows
         ]
@@ -321,7 +294,7 @@ class DatasetWriter:
         }
 
     def _statistics(self) -> dict[str, Any]:
-        """What training normalises by: of each number, and of each color (in [0, 1], red first)."""
+        """Statistics for normalisation: of each number, and of each color (in [0, 1], red first)."""
         statistics: dict[str, Any] = {}
         for name, moments in self._moments.items():
             summary: dict[str, Any] = {key: value.tolist() for key, value in moments.summary().items()}
@@ -336,7 +309,7 @@ class DatasetWriter:
 
 
 def _values(result: Result) -> dict[str, list[float]]:
-    """The numbers of each feature of a frame: all 0 where the first is 0."""
+    """The numbers of each feature of a frame; all 0 if unknown."""
     return {
         name: [1.0, *map(float, numbers)] if numbers else [0.0] * len(NAMES[name])
         for name, numbers in _numbers(result).items()
@@ -378,19 +351,17 @@ def _feature(name: str, value: NDArray[Any], calibrated: bool) -> dict[str, Any]
     ending = name.removeprefix(f"{TACTILE}.")
     if ending in NAMES:
         return {"dtype": dtype, "shape": [len(value)], "names": NAMES[ending]}
-    parts = list(NAMES) if calibrated else ["contact", "flow"]
     components = {
         "marker_offset": ["dx_px", "dy_px"],
         "marker_status": ["0 tracked, 1 inferred, 2 lost"],
         "points": [*(["dx_mm", "dy_mm"] if calibrated else ["dx_px", "dy_px"]), "dz_mm", *FORCES],
         "points_mask": ["known"],
-        "window": ["known", "t_s", *(f"{part}.{number}" for part in parts for number in NAMES[part])],
     }[ending.rpartition(".")[2]]
     return {"dtype": dtype, "shape": list(value.shape), "names": {"components": components}}
 
 
 def _numbers(result: Result) -> dict[str, Sequence[float] | None]:
-    """What each feature of a frame holds behind its first number; None where that is 0."""
+    """The numbers of each feature of a frame without the first one; None if unknown."""
     contact, depth, force, scale = result.contact, result.depth, result.force, result.scale
     mean = None if result.flow is None else result.flow.mean
     found: dict[str, Sequence[float] | None] = dict.fromkeys(NAMES if scale else ("contact", "flow"))
@@ -417,7 +388,7 @@ def _numbers(result: Result) -> dict[str, Sequence[float] | None]:
 def _open_video(
     stack: ExitStack, path: Path, fps: int, image: NDArray[np.uint8]
 ) -> Callable[[NDArray[np.uint8] | None], None]:
-    """Begin an H.264 video; what adds a picture, (H, W, 3) uint8 BGR, or at None writes what is left."""
+    """Open an H.264 video. The returned function adds a picture, (H, W, 3) uint8 BGR; None flushes it."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -25,11 +25,11 @@ class LeRobotEpisode(FrameReader):
     """The pictures of one camera in one episode; frame i is taken at i / fps.
 
     spec : `lerobot:PATH?camera=observation.images.left_tactile&episode=3`. directory : as for `open_source`.
-    Raises SourceError if there is no such dataset, camera or episode (it lists those that are there), or a
-    package is missing.
+    Raises SourceError if there is no such dataset, camera or episode (it lists the valid ones), or a package
+    is missing.
     """
 
-    # What is wrong with JSON, Parquet and video files raises whatever their parsers do.
+    # The parsers of JSON, Parquet and video raise all kinds of errors.
     parser_errors = (Exception,)
 
     def __init__(self, spec: str, directory: Path | None = None, _fps: float | None = None) -> None:
@@ -75,7 +75,7 @@ class LeRobotEpisode(FrameReader):
         with av.open(str(path)) as file:
             (stream, *_) = file.streams.video
             check_pixel_count(self.name, stream.width, stream.height)
-            # To the key frame before; from there every picture is decoded.
+            # Seeks to the key frame before; pictures from there on are decoded.
             file.seek(round(self._begin / (stream.time_base or 1)), stream=stream)
             for frame in file.decode(stream):
                 if frame.time is not None and frame.time < self._begin - 0.5 / self._rate:
@@ -106,7 +106,7 @@ def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int, b
 
 
 def _find(root: Path, info: Any, camera: str, episode: int) -> tuple[Path, Path, float, int]:
-    """An episode's table and video, where it begins in the video, s, and the number of its frames."""
+    """The table and the video of an episode, its start in the video, s, and its number of frames."""
     if str(info["codebase_version"]).startswith("v2"):
         chunk = f"chunk-{episode // int(info.get('chunks_size', CHUNK)):03d}"
         data = root / "data" / chunk / f"episode_{episode:06d}.parquet"

@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -39,7 +39,7 @@ log = logging.getLogger("tactflow")
 
 Floats = NDArray[np.float32]
 Side = int | None
-"""Length of an axis; None where only a frame tells, or any will do."""
+"""Length of an axis; None if any is valid, or only a frame tells."""
 
 KNOWN: Final[dict[str, tuple[Any, int]]] = {
     "image": (Image, 3),
@@ -54,35 +54,31 @@ KNOWN: Final[dict[str, tuple[Any, int]]] = {
     "field": (DisplacementField, 2),
     "markers": (Markers, 4),
 }
-"""Port -> its type, and its channels: of markers x and y in the reference, then dx and dy."""
+"""Port -> type and number of channels; those of markers are x and y in the reference, dx and dy."""
 DTYPES: Final = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
     "tensor(double)": np.float64,
     "tensor(uint8)": np.uint8,
 }
-"""Number types that inputs may have, by onnxruntime's names."""
+"""Valid number types of inputs, by onnxruntime's names."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")]
 
 
 class InputParams(StageParams):
-    """What one input of the network gets: a port, resized, then (value - background) * scale, then
+    """One input of the network: the value of a port, resized, then (value - background) * scale, then
     (value - mean) / std."""
 
     port: Name = Field("image", description="the output of another stage, by name")
     background: Literal["none", "subtract", "subtract_half", "concat"] = Field(
         "none",
-        description="what becomes of the untouched gel: subtract takes it off; subtract_half also adds 0.5 "
-        "and clips to 0..1; concat puts it behind the channels of the picture",
+        description="use of the untouched gel: subtract it; subtract_half also adds 0.5 and clips to 0..1; "
+        "concat appends it to the channels of the picture",
     )
     size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
         None,
-        description="width and height, px; null: those that the network asks for, else those of the port",
-    )
-    pad: bool = Field(False, description="keep the aspect when resizing, with black bars, and do not stretch")
-    interpolation: Literal["linear", "area"] = Field(
-        "linear", description="area averages when shrinking: smoother, but slower"
+        description="width and height, px; null: those of the network's input, else those of the port",
     )
     colour: Literal["bgr", "rgb", "grey"] = Field("bgr", description="order of the channels of a picture")
     scale: float = Field(1 / 255, description="factor on the values of the port; 1/255 brings bytes to 0..1")
@@ -93,33 +89,29 @@ class InputParams(StageParams):
     coordinates: bool = Field(
         False, description="add two channels: column / width and row / height of each pixel"
     )
-    frames: int = Field(1, ge=1, le=64, description="how many frames it sees; the first frame fills in")
-    stride: int = Field(1, ge=1, le=1000, description="processed frames from one of these to the next")
-    newest_first: bool = Field(False, description="order of these frames")
-    join: Literal["channels", "time"] = Field(
-        "channels", description="frames lie behind each other as channels, or along an axis of their own"
+    frames: int = Field(
+        1,
+        ge=1,
+        le=64,
+        description="number of frames, joined as channels, newest last; the first one fills in",
     )
+    stride: int = Field(1, ge=1, le=1000, description="distance of these frames, in processed frames")
     layout: Literal["chw", "hwc", "pixels"] = Field(
         "chw",
-        description="order of the axes; pixels: one row of channels for each pixel (or marker), as a network "
-        "for single pixels takes them",
+        description="order of the axes; pixels: a row of channels for each pixel or marker",
     )
 
     @model_validator(mode="after")
     def _fits(self) -> InputParams:
-        if self.frames > 1 and self.layout == "pixels":
-            raise ValueError("several frames need the layout chw or hwc")
-        if self.join == "time" and self.frames == 1:
-            raise ValueError("join: time needs frames of 2 or more")
-        if self.layout == "hwc" and self.join == "channels" and self.frames > 1:
-            raise ValueError("with the layout hwc, several frames need join: time")
+        if self.frames > 1 and self.layout != "chw":
+            raise ValueError("several frames need the layout chw")
         if self.background != "none" and KNOWN.get(self.port, (None, 3))[1] != 3:
-            raise ValueError(f"background: {self.port} is not a picture, so that it has none")
+            raise ValueError(f"background: {self.port} is not a picture, so it has none")
         return self
 
     @property
     def channels(self) -> Side:
-        """Channels of one frame; None where the port does not tell before it comes."""
+        """Channels of one frame; None if only a frame tells."""
         known = KNOWN.get(self.port)
         if known is None:
             return None
@@ -127,18 +119,16 @@ class InputParams(StageParams):
         return channels * (2 if self.background == "concat" else 1) + 2 * self.coordinates
 
     def shape(self, channels: Side, height: Side, width: Side) -> tuple[Side, ...]:
-        """Axes of what the network gets, without the batch."""
+        """Shape of the input, without the batch."""
         if self.layout == "pixels":
             return (None if height is None or width is None else height * width, channels)
-        if self.join == "channels":
-            channels = None if channels is None else channels * self.frames
-        axes = (channels, height, width) if self.layout == "chw" else (height, width, channels)
-        return (self.frames, *axes) if self.join == "time" else axes
+        channels = None if channels is None else channels * self.frames
+        return (channels, height, width) if self.layout == "chw" else (height, width, channels)
 
 
 class OutputParams(StageParams):
-    """One output. What it is follows from the name of its port: `force`, `gradients`, `contact_mask` and
-    `features` are known to other stages and to the message, all others are arrays."""
+    """One output. The name of its port defines its meaning: other stages and the message know `force`,
+    `gradients`, `contact_mask` and `features`; all others are arrays."""
 
     output: str | None = Field(
         None, description="its name in the file; null: that of the port, or the only one"
@@ -148,23 +138,23 @@ class OutputParams(StageParams):
     shape: tuple[int | Name, ...] = Field(
         ("N",), description="of an array, without the batch: a number, or a name for any length"
     )
-    threshold: float = Field(0.5, description="for contact_mask: what is larger is contact")
+    threshold: float = Field(0.5, description="for contact_mask: larger values are contact")
 
 
 class Network(Stage):
-    """Runs an ONNX file of your own on values of other stages, on the CPU or by another provider.
+    """Runs an ONNX file of your own on values of other stages, on the CPU or with another provider.
 
-    The file is read as data: no library with operators of its own is loaded, nor weights from other files.
+    The file is read as data: neither libraries of custom operators nor weights from other files are loaded.
     """
 
     memory = "pure"
 
     class Params(StageParams):
-        """The file, and what goes in and comes out."""
+        """The file, its inputs and its outputs."""
 
         file: str = Field(min_length=1, description="the ONNX file; relative to the pipeline file")
-        inputs: dict[str, InputParams] = Field(min_length=1, description="name in the file -> what it gets")
-        outputs: dict[Name, OutputParams] = Field(min_length=1, description="name of a port -> which output")
+        inputs: dict[str, InputParams] = Field(min_length=1, description="name in the file -> its settings")
+        outputs: dict[Name, OutputParams] = Field(min_length=1, description="name of a port -> its output")
         provider: str = Field(
             "CPUExecutionProvider", description="of onnxruntime, such as CUDAExecutionProvider"
         )
@@ -181,7 +171,7 @@ class Network(Stage):
 
     @classmethod
     def declare(cls, params: Params) -> Declared:
-        """Its inputs are the ports that `inputs` names, its outputs those of `outputs`."""
+        """The inputs are the ports that `inputs` names, the outputs those of `outputs`."""
         names = [value.port for value in params.inputs.values()]
         if any(value.background != "none" for value in params.inputs.values()):
             names.append("untouched")
@@ -191,7 +181,7 @@ class Network(Stage):
         return Declared(inputs, outputs, "stateful" if stateful else "pure")
 
     def __init__(self, params: Params, directory: Path = Path()) -> None:
-        """Prepare; nothing is read yet. directory : where a relative path is looked for."""
+        """Prepare; nothing is read yet. directory : for a relative path."""
         super().__init__(params)
         found = directory / expanded(params.file)
         self._file = found if found.exists() else expanded(params.file)
@@ -216,7 +206,7 @@ class Network(Stage):
             raise StageError(f"there is no provider {p.provider} here; there are {', '.join(providers)}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = p.threads, 1
-        # What goes wrong is raised, too.
+        # Errors are raised as well.
         options.log_severity_level = 4
         try:
             # As bytes, so that the file cannot name others for its weights.
@@ -260,7 +250,7 @@ class Network(Stage):
 
     @property
     def _first(self) -> _Feed:
-        """The input whose picture outputs of a picture's size belong to."""
+        """The input whose pixels the outputs of a picture's size have."""
         return next(iter(self._feeds.values()))
 
     def close(self) -> None:
@@ -268,7 +258,7 @@ class Network(Stage):
         self._session = None
 
     def reset(self) -> None:
-        """Forget earlier frames."""
+        """Discard earlier frames."""
         for feed in self._feeds.values():
             feed.reset()
 
@@ -291,7 +281,7 @@ class Network(Stage):
         return tuple(results)
 
     def _result(self, port: str, params: OutputParams, array: Floats) -> list[Any]:
-        """The values of the ports that an output becomes."""
+        """The values of the ports made from an output."""
         if port == "force":
             return [_force(array.ravel().tolist())]
         if port == "features":
@@ -302,19 +292,6 @@ class Network(Stage):
             mask = (self._first.picture(array, 1)[..., 0] > params.threshold) * np.uint8(255)
             return [mask, bool(mask.any())]
         return [array[0] if array.ndim == len(params.shape) + 1 else array]
-
-
-class _Geometry(NamedTuple):
-    """Where a picture lies in the network's input, px.
-
-    size : of the picture. inner : of the picture after resizing. corner : its upper left corner in the input.
-    outer : size of the input.
-    """
-
-    size: tuple[int, int]
-    inner: tuple[int, int]
-    corner: tuple[int, int]
-    outer: tuple[int, int]
 
 
 class _Feed:
@@ -358,20 +335,18 @@ class _Feed:
                 raise StageError(f"{self._where}: {name} has {len(numbers)} numbers for {channels} channels")
 
     def reset(self) -> None:
-        """Forget earlier frames."""
+        """Discard earlier frames."""
         self._past.clear()
 
     def __call__(self, value: Any, background: Untouched | None) -> NDArray[Any]:
         """The input tensor for this frame. value : of the port. background : the untouched gel."""
         p, array = self.params, _array(value)
-        size = (array.shape[1], array.shape[0])
-        self._geometry = _placed(size, self._size or size, p.pad)
+        self._port_size = (array.shape[1], array.shape[0])
+        self._input_size = self._size or self._port_size
         self._past.append(self._arranged(self._planes(array, background)))
         newest = len(self._past) - 1
-        frames = [self._past[max(0, newest - back * p.stride)] for back in range(p.frames)]
-        frames = frames if p.newest_first else frames[::-1]
-        in_time = p.join == "time"
-        tensor = np.stack(frames) if in_time else np.concatenate(frames, 0 if p.layout == "chw" else -1)
+        frames = [self._past[max(0, newest - back * p.stride)] for back in reversed(range(p.frames))]
+        tensor = np.concatenate(frames)
         self._check_shape(tensor.shape)
         if len(self._sides) > tensor.ndim:
             tensor = tensor[None]
@@ -380,7 +355,7 @@ class _Feed:
         return tensor.astype(self._dtype, copy=False)
 
     def _planes(self, array: NDArray[Any], background: Untouched | None) -> list[Floats]:
-        """The channels of the network's picture, (h, w) float32 each, normalised."""
+        """The channels of the input, (h, w) float32 each, normalised."""
         p, picture = self.params, self._resized(array)
         parts = [picture]
         if p.background != "none":
@@ -400,7 +375,7 @@ class _Feed:
         return [_linear(plane, scale / s, -m / s) for plane, m, s in zip(planes, mean, std, strict=True)]
 
     def _arranged(self, planes: list[Floats]) -> Floats:
-        """The channels, and coordinates if asked for, along the axes of `layout`."""
+        """The channels, optionally with coordinates, along the axes of `layout`."""
         height, width = planes[0].shape
         if self.params.coordinates:
             across = np.arange(width, dtype=np.float32) / np.float32(width)
@@ -412,34 +387,27 @@ class _Feed:
         return values.reshape(height * width, -1) if self.params.layout == "pixels" else values
 
     def _resized(self, array: NDArray[Any]) -> NDArray[Any]:
-        """The array at the network's size, with the colours in its order."""
-        p, geometry = self.params, self._geometry
-        if array.ndim == 3 and array.shape[2] == 3 and p.colour != "bgr":
-            array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY if p.colour == "grey" else cv2.COLOR_BGR2RGB)
-        if geometry.inner != geometry.size:
-            method = cv2.INTER_AREA if p.interpolation == "area" else cv2.INTER_LINEAR
-            array = cv2.resize(array, geometry.inner, interpolation=method)
-        if geometry.inner != geometry.outer:
-            (left, top), (width, height) = geometry.corner, geometry.inner
-            right, bottom = geometry.outer[0] - left - width, geometry.outer[1] - top - height
-            array = cv2.copyMakeBorder(array, top, bottom, left, right, cv2.BORDER_CONSTANT)
+        """The array at the size of the input, with its order of colours."""
+        colour = self.params.colour
+        if array.ndim == 3 and array.shape[2] == 3 and colour != "bgr":
+            array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY if colour == "grey" else cv2.COLOR_BGR2RGB)
+        if self._input_size != self._port_size:
+            array = cv2.resize(array, self._input_size, interpolation=cv2.INTER_LINEAR)
         return array
 
     def picture(self, array: Floats, channels: int) -> Floats:
-        """(H, W, channels) float32: an output of the size of the network's picture, at that of the port."""
-        geometry = self._geometry
-        width, height = geometry.outer
+        """(H, W, channels) float32: an output of the size of the input, resized to that of the port."""
+        width, height = self._input_size
         shape = (channels, height, width) if self.params.layout == "chw" else (height, width, channels)
         if array.size != channels * height * width:
             raise StageError(f"required an output of the size of the input, {shape}, got {array.shape}")
         array = array.reshape(shape)
         if self.params.layout == "chw":
             array = np.moveaxis(array, 0, -1)
-        (left, top), (width, height) = geometry.corner, geometry.inner
-        inner = np.ascontiguousarray(array[top : top + height, left : left + width])
-        if geometry.inner != geometry.size:
-            inner = np.asarray(cv2.resize(inner, geometry.size, interpolation=cv2.INTER_LINEAR), np.float32)
-        return inner.reshape(*geometry.size[::-1], channels)
+        array = np.ascontiguousarray(array)
+        if self._input_size != self._port_size:
+            array = np.asarray(cv2.resize(array, self._port_size, interpolation=cv2.INTER_LINEAR), np.float32)
+        return array.reshape(*self._port_size[::-1], channels)
 
 
 def _linear(plane: NDArray[Any], factor: float, offset: float) -> Floats:
@@ -447,17 +415,8 @@ def _linear(plane: NDArray[Any], factor: float, offset: float) -> Floats:
     return np.asarray(cv2.addWeighted(plane, factor, plane, 0.0, offset, dtype=cv2.CV_32F), np.float32)
 
 
-def _placed(size: tuple[int, int], outer: tuple[int, int], pad: bool) -> _Geometry:
-    """Where a picture of a size lies in the network's input. pad : whether it keeps its aspect."""
-    inner = outer
-    if pad:
-        ratio = min(outer[0] / size[0], outer[1] / size[1])
-        inner = max(1, round(size[0] * ratio)), max(1, round(size[1] * ratio))
-    return _Geometry(size, inner, ((outer[0] - inner[0]) // 2, (outer[1] - inner[1]) // 2), outer)
-
-
 def _ports(name: str, params: OutputParams) -> list[Port]:
-    """The ports that an output becomes."""
+    """The ports made from an output."""
     if name == "contact_mask":
         return [Port(name, ContactMask), Port("touching", Touching)]
     known: Mapping[str, Any] = {"force": Force, "features": Features, "gradients": Gradients}
@@ -482,7 +441,7 @@ def _array(value: Any) -> NDArray[Any]:
 
 
 def _force(numbers: Sequence[float]) -> Force:
-    """A force of (z) or (x, y, z), N. A network tells neither its errors nor what it was trained on."""
+    """A force of (z) or (x, y, z), N. Its errors and range are unknown."""
     if len(numbers) not in (1, 3):
         raise StageError(f"force: required 1 number (z) or 3 (x, y, z), got {len(numbers)}")
     x, y = numbers[:-1] or (None, None)
@@ -491,7 +450,7 @@ def _force(numbers: Sequence[float]) -> Force:
 
 
 def _wanted_shapes(port: str, params: OutputParams, first: InputParams) -> list[tuple[Side, ...]]:
-    """Shapes that an output may have, without the batch."""
+    """Valid shapes of an output, without the batch."""
     if port == "force":
         return [(1,), (3,)]
     if port == "features":
@@ -505,12 +464,12 @@ def _wanted_shapes(port: str, params: OutputParams, first: InputParams) -> list[
 
 
 def _sides(shape: Sequence[Any]) -> tuple[Side, ...]:
-    """A shape of onnxruntime; axes of any length have names there, or None."""
+    """A shape of onnxruntime, where axes of any length have names or None."""
     return tuple(side if isinstance(side, int) else None for side in shape)
 
 
 def _agree(network: tuple[Side, ...], ours: tuple[Side, ...]) -> bool:
-    """Whether shapes fit, the network's with or without a batch of one in front."""
+    """Whether shapes agree; that of the network may begin with a batch of one."""
     if len(network) == len(ours) + 1 and network[0] in (1, None):
         network = network[1:]
     pairs = zip(network, ours, strict=False)

@@ -10,18 +10,18 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
 import orjson
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from tactflow.engine.contract import Output, Sink, StageParams
+from tactflow.engine.contract import Output, Sink
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
 from tactflow.message.encoding import SCHEMA
 from tactflow.message.result import Result, encode_message
+from tactflow.outputs import AppendParams, cannot_write
 from tactflow.recording.provenance import facts, kept_files
 from tactflow.system.extras import missing
 from tactflow.system.files import completed, expanded, make_folder
-from tactflow.system.outputs import cannot_write
 
 if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]
@@ -33,11 +33,11 @@ TABLES = {
     "contacts": (SEQ, CONTACT, *contact_columns()),
     "frames": tuple(frame_columns()),
 }
-"""In the order in which they are written: what belongs to a frame of `frames` is there before it."""
+"""Tables in the order of writing: the rows that belong to a row of `frames` exist before it."""
 PART_ROWS = 200_000
-"""A part is written early when a table has so many rows: with some 20 numbers each they take 100 MB."""
+"""Number of rows of a table at which a part is written early: with some 20 numbers each, they take 100 MB."""
 BATCH_ROWS = 1000
-"""Rows are converted to Arrow by so many: all those of a part at once would hold up the other threads."""
+"""Number of rows converted to Arrow at a time: converting a whole part would block the other threads."""
 
 Rows = dict[str, list[tuple[Any, ...]]]
 """Name of a table -> its rows."""
@@ -46,37 +46,27 @@ Rows = dict[str, list[tuple[Any, ...]]]
 class Parquet(Sink):
     """Writes result messages to `path/frames/`, `path/contacts/` and `path/markers/`.
 
-    `frames` has a row for each frame, `contacts` one for each separate contact, `markers` one for each dot of
-    each frame. Each table is a folder of parts, `part-00000.parquet`, as pandas, pyarrow, Polars and DuckDB
-    read it. A part is written every `flush` seconds and at the end, and gets its name when it is complete:
-    if the process ends abruptly, at most the rows since the last part are lost.
+    `frames` has a row per frame, `contacts` one per separate contact, `markers` one per dot and frame. Each
+    table is a folder of parts, `part-00000.parquet`, which pandas, pyarrow, Polars and DuckDB read as one. A
+    part is written every `flush` seconds and at the end, and gets its name when it is complete: if the
+    process ends abruptly, at most the rows since the last part are lost.
     """
 
     threaded = True
     queue_capacity = 16
 
-    class Params(StageParams):
-        """Where to write, and what to do with existing tables."""
+    class Params(AppendParams):
+        """Destination."""
 
         path: str = Field(
             "results", min_length=1, description="folder, relative to the current directory; created"
         )
-        overwrite: bool = Field(False, description="remove existing tables")
-        append: bool = Field(False, description="add parts to existing tables")
-        flush: float = Field(
-            10.0, gt=0, description="longest time that rows wait before they are written as a part, s"
-        )
-
-        @model_validator(mode="after")
-        def _exclusive(self) -> Parquet.Params:
-            if self.overwrite and self.append:
-                raise ValueError("overwrite and append exclude each other")
-            return self
+        flush: float = Field(10.0, gt=0, description="longest time that rows are buffered, s")
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is opened yet.
 
-        sensor, control : whose results they are, and the run, for the metadata.
+        sensor, control : name of the sensor and the run, for the metadata.
         """
         super().__init__(params)
         self._folder = expanded(params.path)
@@ -92,12 +82,11 @@ class Parquet(Sink):
     @classmethod
     def outputs(cls, params: Parquet.Params) -> Sequence[Output]:
         """The folder."""
-        keeps = not (params.overwrite or params.append)
-        return (Output(expanded(params.path), "folder", "path", refuses_existing=keeps),)
+        return (Output(expanded(params.path), "folder", "path", params.refuses_existing),)
 
     @classmethod
     def on_restart(cls, params: Parquet.Params) -> Parquet.Params:
-        """It appends to its tables."""
+        """Append to the tables."""
         return params.changed(overwrite=False, append=True)
 
     def open(self) -> None:
@@ -109,7 +98,7 @@ class Parquet(Sink):
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
             raise StageError(problem)
-        # Now, and not in the middle of the run; the first array imports pandas, where that is installed.
+        # Now rather than in the middle of the run; the first array imports pandas if it is installed.
         import pyarrow.parquet  # type: ignore[import-untyped]
 
         pyarrow.array([0])
@@ -126,13 +115,13 @@ class Parquet(Sink):
         self._flushed = time.monotonic()
 
     def counters(self) -> Mapping[str, int]:
-        """frames : in complete parts. parts : of each table."""
+        """frames : in complete parts. parts : per table."""
         return self._counts
 
     def write(self, result: Result) -> None:
-        """Keep one frame, and write a part when it is time.
+        """Buffer one frame, and write a part when it is due.
 
-        Raises StageError if the part cannot be written, as on a full disk. The parts before stay.
+        Raises StageError if the part cannot be written, as on a full disk. Earlier parts stay.
         """
         message = orjson.loads(encode_message(result, detail=True))
         for name, rows in _rows(message).items():
@@ -146,15 +135,15 @@ class Parquet(Sink):
         self._flush()
 
     def _check_existing(self) -> None:
-        """Refuse existing tables, remove them, or continue behind them."""
+        """Refuse existing tables, remove them, or continue them."""
         present = [part for name in TABLES for part in (self._folder / name).glob("part-*.parquet")]
-        if present and not (self.params.overwrite or self.params.append):
+        if present and self.params.refuses_existing:
             raise StageError(
-                f"{self._folder}: holds tables already; set overwrite: true to replace them, append: true to "
-                "add to them, or give another folder"
+                f"{self._folder}: already holds tables; set overwrite: true to replace them, append: true to "
+                "extend them, or choose another folder"
             )
         if self.params.overwrite:
-            # Frames first, so that none is left without its rows of the other tables.
+            # Frames first, so that none remains without its rows in the other tables.
             for part in reversed(present):
                 part.unlink()
             present = []
@@ -171,13 +160,13 @@ class Parquet(Sink):
             return
         try:
             for name, schema in self._schemas.items():
-                # Its name begins with a dot until it is complete: readers of folders leave such files out.
+                # Until it is complete, its name begins with a dot, so that readers of the folder ignore it.
                 part = self._folder / name / f"part-{self._next:05d}.parquet"
-                # A folder that somebody removed is an error, not made anew.
+                # A folder that was removed meanwhile is an error.
                 with completed(part, make_parent=False) as unfinished, unfinished.open("wb") as file:
                     pq.write_table(_table(rows[name], schema), file, compression="zstd")
                     file.flush()
-                    # On the disk before it gets its name, so that a power cut leaves no empty part.
+                    # Sync before renaming, so that a power cut leaves no empty part.
                     os.fsync(file.fileno())
         except OSError as error:
             hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
@@ -223,7 +212,7 @@ def _make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
 
 
 def _rows(message: Mapping[str, Any]) -> Rows:
-    """The rows of each table that one parsed result message gives."""
+    """The rows of each table for one parsed result message."""
     seq, markers = message["seq"], message["markers"] or {"position": (), "origin": (), "status": ()}
     contacts = [
         (seq, index, *(column.value(contact) for column in contact_columns()))

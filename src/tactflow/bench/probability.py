@@ -14,7 +14,7 @@ from tactflow.system.terminal import table
 from tactflow.vision.arrays import Flags, Floats
 
 RIDGE: Final = 0.5
-"""Weight of the squares of the weights: so that what tells all places of a few labs apart stays finite."""
+"""Ridge penalty: without it, evidence that separates the places of few labs would get infinite weights."""
 STEPS: Final = (0, 0.25, 0.5, 0.8, 0.9, 0.95, 0.99, 1)
 """Probabilities between which the truth is counted."""
 

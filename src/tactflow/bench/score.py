@@ -1,4 +1,4 @@
-"""Compares answers with the truth of a simulated scene, frame by frame."""
+"""Compare results with the truth of a simulated scene, frame by frame."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
 
 DIRECTED = 2.0
-"""Ratio of a contact's axes from which on its direction is judged. Chosen by hand."""
+"""Minimum ratio of the axes of a contact whose direction is judged. Chosen by hand."""
 
 _ROUND = 100
-"""Pixels from which on a contact is large enough to be called round. Chosen by hand."""
+"""Minimum number of pixels of a contact whose roundness is judged. Chosen by hand."""
 
 
 def add_decision(tally: Tally, touching: bool, truth: Truth, deep: bool) -> bool:

@@ -4,3 +4,16 @@
 ball in results, `photometric` learns from them which slope of the gel has which colour, and `force` how the
 force follows from a contact. Nothing here runs a pipeline: results come in, numbers go out.
 """
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+KINDS: Final = Path(__file__).parent / "kinds"
+"""Folder of the default calibrations, one for each kind of sensor, that come with the package."""
+
+
+def kinds() -> list[str]:
+    """Names of the kinds of sensors that the package has a default calibration for."""
+    return sorted(path.stem for path in KINDS.glob("*.yaml"))

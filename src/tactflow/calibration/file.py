@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveFloat, ValidationError
 
 from tactflow import __version__
-from tactflow.calibration.stored import MAX_ARRAYS, stored_arrays, stored_text
 from tactflow.engine.errors import ConfigError
+from tactflow.recording.calibration import MAX_ARRAYS, stored_arrays, stored_text
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import ending_held_back
@@ -36,8 +36,8 @@ from tactflow.vision.types import Scale
 LOOK: Final = (16, 12)
 """Columns and rows of the small picture of the untouched gel that is kept. Chosen by hand."""
 MOVED: Final = 1.0
-"""How far a corner of the processed frame may lie from where it was in the raw frame, raw px. Chosen by hand:
-what rounding in a pipeline file does is less."""
+"""Largest shift of a corner of the processed frame in the raw frame, raw px. Chosen by hand: rounding in a
+pipeline file shifts it less."""
 UNLIKE: Final = 0.1
 """Difference of the untouched gel, relative to its brightness and after its light was scaled channel by
 channel, above which the gel counts as different. Chosen by hand: presses of one session differ by 0.01."""
@@ -53,7 +53,7 @@ KIND_SCALE: Final = 0.05
 """Relative standard error of the scale on another sensor of the kind: the authors of FOTS measured 19.6 and
 21.1 pixels per mm on two DIGITs."""
 KIND_ERRORS: Final = {"normal_error": 2.6, "sphere_rms": 0.006, "depth_stderr": 0.102, "volume_stderr": 0.125}
-"""What another sensor of the kind adds to the errors, as two other Minis do to those of one:
+"""Additional errors on another sensor of the kind, measured on two other Minis by
 benchmarks/default_calibrations.py."""
 TERMS: Final = PLACE_TERMS * COLOUR_TERMS
 """Coefficients of one part of the normal."""
@@ -107,8 +107,7 @@ class PhotometricEntry(_Entry):
 
     def errors(self) -> SurfaceErrors:
         """The basis of the standard errors of heights."""
-        own = math.sqrt(max(self.depth_stderr**2 - self.between**2, 0))
-        return SurfaceErrors(own, self.volume_stderr, self.steepest, self.between)
+        return SurfaceErrors(self.steepest, self.between)
 
 
 class DarknessEntry(_Entry):

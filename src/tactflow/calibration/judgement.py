@@ -1,4 +1,4 @@
-"""Whether presses can give a calibration, and whether what they gave is one."""
+"""Checks of the presses before a fit, and of its errors after it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ FEWEST_PRESSES: Final = 8
 SPREAD: Final = 0.15
 """Part of the picture's width and height that the presses must span at least. Chosen by hand."""
 TOO_LARGE: Final = 2.0
-"""Radius of a contact over that of the ball that no ball can make. More than 1 is what outlines add to it:
-on five gels it is 0.46 to 1.55 in the median."""
+"""Radius of a contact, relative to that of the ball, that no ball can cause. Outlines are wider than the
+contact: the median is 0.46 to 1.55 on five gels."""
 LEAST_EXPLAINED: Final = 0.7
 """Median share of the slopes of presses that a fit to others must explain. Two faces of an edge can explain
 0.36 of the slopes of a ball, as (E|x|)^2 / E(x^2 + y^2) on a disc. Balls on five gels have 0.94 to 0.99,
@@ -26,11 +26,11 @@ edges of a cube 0.53 by a fit of their own and 0.26 by that of a ball."""
 LARGEST_ERROR: Final = 0.35
 """Relative error of depth above which a fit is refused. By hand: balls on five gels have 0.04 to 0.14."""
 SHALLOW: Final = 0.4
-"""Radius of the contacts over that of the ball, in the median, below which it is asked whether the diameter
-was given. Balls on five gels have 0.46 to 1.55, and half of it where the diameter is given."""
+"""Median radius of the contacts, relative to that of the ball, below which the user is asked whether the
+diameter was given. Balls on five gels have 0.46 to 1.55, and half of that if the diameter is given."""
 OTHER_RADIUS: Final = 2**0.5
-"""Factor between the radius of a ball as given and as another sensor of the kind sees it, from which on it is
-asked: half way to a diameter. Balls on two Minis and a DIGIT have 0.9 to 1.3, one by one."""
+"""Factor between the given radius and the one that another sensor of the kind measures, above which the user
+is asked: half way to a diameter. Single presses on two Minis and a DIGIT have 0.9 to 1.3."""
 
 
 def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) -> None:
@@ -74,8 +74,8 @@ def check_explained(explained: float) -> None:
     if explained < LEAST_EXPLAINED:
         raise ConfigError(
             f"calibrate: the colours explain {100 * explained:.0f} % of the slopes that a ball would "
-            f"have ({100 * LEAST_EXPLAINED:.0f} % required): what presses is no ball, nothing "
-            "touches the gel, or this gel does not answer to slopes with colour"
+            f"have ({100 * LEAST_EXPLAINED:.0f} % required): the object is not a ball, nothing "
+            "touches the gel, or its colour does not depend on the slope"
         )
 
 
@@ -94,7 +94,7 @@ def doubt(session: Session, scale: Scale, ball_radius: float, apparent: float | 
 
     ball_radius : mm, as given. apparent : mm, `apparent_radius`, where there is a calibration of the kind.
     """
-    ask = f"is {ball_radius:g} mm the radius of the ball, and not its diameter, or of another ball?"
+    ask = f"is {ball_radius:g} mm the radius of this ball, and not its diameter?"
     if apparent is not None:
         if max(apparent / ball_radius, ball_radius / apparent) < OTHER_RADIUS:
             return None

@@ -1,4 +1,4 @@
-"""Presses of a ball in the results of a pipeline, and how a session in which it is pressed goes."""
+"""Find presses of a ball in the results of a pipeline."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Picture = NDArray[np.uint8]
 NEEDED: Final = {"image": "preprocess", "contact": "hull"}
 """Ports that a pipeline must have -> the stage that gives them."""
 SAME: Final = 0.03
-"""RMS difference of the untouched gel, relative to its brightness, up to which presses belong to one session.
-Chosen by hand, between what presses of one session differ by (0.01) and what a calibration bears (0.1)."""
+"""Largest RMS difference of the untouched gel within a session, relative to its brightness. Chosen by hand,
+between the scatter within a session (0.01) and the limit for using a calibration (0.1)."""
 MOVED_ON: Final = 0.5
-"""How far a contact lies from the press so far, in its radii, to be another press. Chosen by hand."""
+"""Distance from the current press, in its radii, beyond which a contact is a new press. Chosen by hand."""
 MOVED_ALONE: Final = 0.1
-"""The same for pictures that were taken one by one, also of the change of its radius. Chosen by hand."""
+"""The same for pictures that were taken one by one, and for the change of the radius. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,8 +50,8 @@ class Press:
 class Session:
     """What a recording shows that a calibration needs.
 
-    untouched : (H, W, 3) uint8, mean of the reference frames without markers; of those that were taken last,
-        where a new reference was taken meanwhile. mapping : of the pixels.
+    untouched : (H, W, 3) uint8, mean of the latest reference frames, without markers. mapping : from raw to
+        processed pixels.
     presses : in order. dots : (N, 2) float64, markers of the untouched gel, px; empty without markers.
     frames : how many there were.
     """
@@ -69,14 +69,13 @@ class PressFinder:
     A press lasts as long as something touches at about one place; of each, the frame with the largest contact
     is kept.
 
-    pictures : the frames were taken one by one, so that every one whose contact has moved or changed its size
-    is a press of its own, even at about the place of the one before.
+    pictures : the frames were taken one by one, so that each one whose contact has moved or changed its size
+    is a new press, even near the previous one.
 
     Attributes
     ----------
-    presses : so far; one that is over may be taken out. frames : how many results were added.
-    lasts : whether the last press is not over. renewed : how often the presses so far were dropped, because a
-    new reference showed another look of the gel.
+    presses : so far; finished ones may be removed. frames : number of results that were added.
+    lasts : whether the last press is still going on.
     """
 
     def __init__(self, pictures: bool = False) -> None:
@@ -84,7 +83,6 @@ class PressFinder:
         self.presses: list[Press] = []
         self.frames = 0
         self.lasts = False
-        self.renewed = 0
         self._reference: list[Picture] = []
         self._before: Picture | None = None
         self._epoch = 0
@@ -129,7 +127,6 @@ class PressFinder:
                 len(self.presses),
             )
             self.presses.clear()
-            self.renewed += 1
 
     def _add(self, press: Press) -> None:
         """A press of its own, or another moment of the last one."""

@@ -16,8 +16,8 @@ FEWEST_LINKS: Final = 8
 POINTED: Final = 0.5
 """Standard error of an edge of the picture, px. Chosen by hand."""
 LONGER: Final = 1.35
-"""How much longer than the typical one a distance between neighbours may be: less than the diagonal of a
-square, 1.41."""
+"""Largest distance between neighbours, relative to the typical one: less than the diagonal of a square,
+1.41."""
 
 
 def centre(size: tuple[int, int]) -> tuple[float, float]:

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the cameras; returns the exit code, 0 also where there is none."""
+    """List the cameras; returns the exit code, which is 0 even without a camera."""
     if not sys.platform.startswith("linux"):
         say(NO_NAMES)
         return 0

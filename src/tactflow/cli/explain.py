@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tactflow.cli.options import add_json, add_pipeline, load_plan
 from tactflow.cli.progress import END_WORDS
-from tactflow.cli.statistics import Statistics, milliseconds
+from tactflow.cli.statistics import Statistics
 from tactflow.engine.contract import Sink
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
@@ -49,9 +49,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _whole_run(run: Statistics) -> str:
-    latency = f"latency p50 {milliseconds(run.latency_ms.p50)}, p99 {milliseconds(run.latency_ms.p99)}"
+    times = ((name, getattr(run.latency_ms, name)) for name in ("p50", "p99"))
+    latency = ", ".join(f"{name} unknown" if ms is None else f"{name} {ms:.3g} ms" for name, ms in times)
     frames = f"{run.frames} frames in {run.wall_s:.1f} s, {run.dropped} dropped"
-    return f"the run: {frames}, {latency}, ended: {END_WORDS.get(run.end, run.end)}"
+    return f"the run: {frames}, latency {latency}, ended: {END_WORDS.get(run.end, run.end)}"
 
 
 def _facts(

@@ -31,7 +31,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "warmup": ("pipelines", "compile what `run` would compile on its first use"),
     "batch": ("batch", "run a pipeline over many recordings; a second call does what is missing"),
     "record": ("run", "run a pipeline and record its frames and results"),
-    "export": ("recordings", "make a dataset from recordings: LeRobot, Diffusion Policy"),
+    "export": ("recordings", "make a dataset from recordings: HDF5, Zarr, LeRobot and others"),
     "repair": ("recordings", "copy what is intact in a damaged or unfinished recording, with an index"),
     "calibrate": ("calibrate", "make a sensor's calibration file, or check whether it still fits"),
     "detect": ("detect", "find the dots of a gel, and show what was found and why in one picture"),
@@ -77,11 +77,11 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
 
 
 def _check_environment() -> None:
-    """Refuse limits that OpenCV cannot read: importing it would abort the process."""
+    """Refuse limits that are not numbers: importing OpenCV would abort the process."""
     for name in ("PIXELS", "WIDTH", "HEIGHT"):
         variable = f"OPENCV_IO_MAX_IMAGE_{name}"
         value = os.environ.get(variable, "1")
-        if not re.fullmatch(r"\d+(MB|Mb|mb|KB|Kb|kb)?", value, re.ASCII):
+        if not (value.isascii() and value.isdecimal()):
             raise ConfigError(f"the environment variable {variable} is {value!r}; required: a number")
 
 

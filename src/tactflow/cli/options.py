@@ -1,4 +1,4 @@
-"""Options that several commands share, the types of their values, and how they are read."""
+"""Options that several commands share, and how they are read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan, make_plan
-from tactflow.system.outputs import cannot_write
+from tactflow.outputs import cannot_write
 from tactflow.system.terminal import say
 
 

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the name of each shipped pipeline and what it is for, or one of them as it is."""
+    """Print the name of each shipped pipeline and what it is for, or one of the files."""
     if args.name is not None:
         print(find_pipeline(args.name).read_text(encoding="utf-8"), end="")
     elif args.json:

@@ -32,7 +32,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "format",
         help="hdf5 or zarr (all frames and numbers as plain arrays), lerobot (a dataset of layout v3.0), "
-        "replay-buffer (Zarr, for Diffusion Policy), or that of a plug-in",
+        "or that of a plug-in",
     )
     parser.add_argument(
         "recordings",

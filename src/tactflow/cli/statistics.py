@@ -30,20 +30,18 @@ class NodeStatistics(BaseModel):
         frames = self.runs + sum(self.skips.values())
         if not frames:
             return "never reached by a frame"
-        text = f"ran {share(self.runs, frames)}"
-        skips = sorted(self.skips.items(), key=lambda item: -item[1])
-        reasons = [f"{share(count, frames)} {reason.replace('_', ' ')}" for reason, count in skips if count]
+        text = f"ran {100 * self.runs / frames:.3g} %"
+        skips = sorted(((n, reason) for reason, n in self.skips.items() if n), reverse=True)
+        reasons = [f"{100 * n / frames:.3g} % {reason.replace('_', ' ')}" for n, reason in skips]
         if reasons:
             text += f", skipped {', '.join(reasons)}"
-        if not self.runs:
+        if not self.runs or self.p50_ms is None or self.p99_ms is None:
             return text
         mean = self.total_ms / self.runs
-        p50, p99 = milliseconds(self.p50_ms), milliseconds(self.p99_ms)
-        text += f"; a run: mean {milliseconds(mean)}, p50 {p50}, p99 {p99}"
-        saved = mean * sum(count for reason, count in skips if reason not in _FAILURES)
+        text += f"; a run: mean {mean:.3g} ms, p50 {self.p50_ms:.3g} ms, p99 {self.p99_ms:.3g} ms"
+        saved = mean * sum(n for n, reason in skips if reason not in _FAILURES)
         if saved:
-            of = milliseconds((saved + self.total_ms) / frames)
-            text += f"; saved {milliseconds(saved / frames)} of {of} a frame"
+            text += f"; saved {saved / frames:.3g} ms of {(saved + self.total_ms) / frames:.3g} ms a frame"
         return text
 
 
@@ -76,26 +74,3 @@ class Statistics(BaseModel):
             raise ConfigError(
                 f"--stats {path}: not a statistics file; tactflow run --stats writes one"
             ) from None
-
-
-def share(part: int, whole: int) -> str:
-    """A share in percent; 0 % and 100 % only where that is exact.
-
-    >>> share(1, 1000), share(0, 7), share(999, 1000)
-    ('<1 %', '0 %', '>99 %')
-    """
-    percent = 100 * part / whole if whole > 0 else 0
-    if 0 < percent < 1:
-        return "<1 %"
-    return ">99 %" if 99 < percent < 100 else f"{percent:.0f} %"
-
-
-def milliseconds(value: float | None) -> str:
-    """A time with three digits.
-
-    >>> milliseconds(0.25), milliseconds(12.3456)
-    ('0.250 ms', '12.3 ms')
-    """
-    if value is None:
-        return "unknown"
-    return f"{value:.{3 if value < 1 else 2 if value < 10 else 1}f} ms"

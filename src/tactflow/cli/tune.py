@@ -10,9 +10,8 @@ from pathlib import Path
 from tactflow.cli.options import add_json, add_overwrite, add_sensor, refuse_output, writing
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
-from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.errors import StageError
 from tactflow.system.arguments import number
-from tactflow.system.extras import missing
 from tactflow.system.files import completed
 from tactflow.system.terminal import notes, printable, say, show, show_json, typed
 
@@ -46,10 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
     )
-    parser.add_argument(
-        "--html", type=Path, metavar="FILE", help="also write a report with a plot of time against error"
-    )
-    add_overwrite(parser, "these files")
+    add_overwrite(parser)
     add_json(parser)
 
 
@@ -62,10 +58,6 @@ def run(args: argparse.Namespace) -> int:
         If the options are wrong, or the recording cannot be used.
     """
     refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
-    if args.html is not None:
-        refuse_output("--html", args.html, overwrite=args.overwrite)
-        if problem := missing("plots", "plot", ["matplotlib"]):
-            raise ConfigError(f"--html: {problem}")
     # Imported here: the simulator and the bench take their time.
     from tactflow.tune import report
     from tactflow.tune.recording import take
@@ -86,8 +78,6 @@ def run(args: argparse.Namespace) -> int:
         show_json(report.as_json(tuned))
     else:
         show(report.lines(tuned))
-    if args.html is not None:
-        report.write_page(args.html, tuned)
     if tuned.chosen is None:
         say(impossible(tuned))
         return StageError.exit_code

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from tactflow.calibration.stored import KINDS, kinds
+from tactflow.calibration import KINDS, kinds
 from tactflow.config import sensors, wiring
 from tactflow.config.document import Document, described, dotted, read_document
 from tactflow.config.files_used import file_id, files_named, files_written
@@ -190,14 +189,11 @@ def _check_files(
         if draft.section == "stages" and draft.params is not None:
             reader = f"what {dotted(draft.keys)} reads"
             readers |= {file_id(path): reader for path in files_named(draft.params, pipeline.parent)}
-        module = sys.modules[draft.component.cls.__module__] if draft.component else None
-        if path := vars(module).get("__file__") if module else None:
-            readers[file_id(path)] = f"the code of {draft.id}"
     writers: dict[str, Draft] = {}
     for draft in drafts:
-        for path in (
-            files_written(draft.component.cls, draft.params) if draft.component and draft.params else ()
-        ):
+        if draft.component is None or draft.params is None:
+            continue
+        for path in files_written(draft.component.cls, draft.params):
             writer = writers.setdefault(path, draft)
             identity = file_id(path)
             if writer is not draft:

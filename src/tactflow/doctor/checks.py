@@ -229,18 +229,6 @@ def _banding(observed: Observation) -> Measured | str:
     )
 
 
-# JPEG qualities of about 30 and 10: the step is 11.5 at quality 50 (ITU-T T.81, table K.1).
-@check("compression", "grey levels", warning=18.0, fault=55.0)
-def _compression(observed: Observation) -> Measured:
-    step = observed.jpeg_step or 0.0
-    return Measured(
-        step,
-        f"JPEG with steps of {step:.0f} grey levels" if step else "no trace of JPEG",
-        "displacements of dots are less exact; outlines are quantised to blocks of 8 px",
-        "a higher quality, or an uncompressed format (YUYV); record losslessly with tactflow record",
-    )
-
-
 # Real grids have up to 13 % empty positions, including perspective views; chosen by hand.
 @check("dots", "% missing", warning=15.0, fault=40.0)
 def _dots(observed: Observation) -> Measured | str:

@@ -7,7 +7,6 @@ from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import MAD_TO_SIGMA, ColorImage
@@ -18,8 +17,6 @@ Gray = NDArray[np.float32]
 
 TILE: Final = 16
 """Side of the tiles for noise estimates, px: 256 samples each."""
-BLOCK: Final = 8
-"""Side of a JPEG block, px."""
 BLACK: Final = 4
 """Highest grey level of the black surround of the gel."""
 DIM: Final = 25
@@ -161,29 +158,6 @@ def _slope(gray: Gray) -> Gray:
     x = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
     y = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
     return np.asarray(cv2.magnitude(x, y), np.float32)
-
-
-def jpeg_step(gray: Gray) -> float | None:
-    """JPEG quantisation step of the lowest frequency, grey levels; None without JPEG.
-
-    gray : (H, W) float32, whole grey levels of one frame, not cropped. The coefficients of its blocks are
-    multiples of the step (Z. Fan and R. L. de Queiroz, "Identification of bitmap compression history", IEEE
-    Trans. Image Processing 12, 2003).
-    """
-    height, width = (side - side % BLOCK for side in gray.shape)
-    blocks = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
-    coefficients = scipy.fft.dctn(blocks, axes=(1, 3), norm="ortho")
-    # The lowest horizontal and vertical frequency.
-    waves = np.concatenate([coefficients[:, 0, :, 1].ravel(), coefficients[:, 1, :, 0].ravel()])
-    found = None
-    for step in np.arange(2.0, 100.0, 0.25):
-        larger = waves[np.abs(waves) > step / 2]
-        if len(larger) < 100:
-            break
-        # 1 for exact multiples, 0 for random values; measured: up to 0.2 without JPEG, 0.8 and more with it.
-        if np.cos(2 * np.pi * larger / step).mean() > 0.5:
-            found = float(step)
-    return found
 
 
 def bands(frames: Sequence[Gray]) -> tuple[float, str]:

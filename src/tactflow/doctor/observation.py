@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from tactflow.doctor.measures import REGULAR, Gray, Pair, exposure, grey, jpeg_step
+from tactflow.doctor.measures import REGULAR, Gray, Pair, exposure, grey
 from tactflow.engine.errors import SourceError
 from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.devices import Camera
@@ -73,13 +73,6 @@ class Observation:
     def exposures(self) -> list[tuple[float, float]]:
         """Level, grey levels, and clipped share of the kept frames (`measures.exposure`)."""
         return [exposure(pair.image) for pair in self.pairs]
-
-    @cached_property
-    def jpeg_step(self) -> float | None:
-        """JPEG quantisation step, grey levels, if at least half of the frames show one."""
-        frames = self.grays[::4]
-        steps = [step for gray in frames if (step := jpeg_step(gray)) is not None]
-        return float(np.median(steps)) if steps and 2 * len(steps) >= len(frames) else None
 
     @cached_property
     def typical(self) -> Gray:

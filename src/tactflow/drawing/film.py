@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import StageError
-from tactflow.system.outputs import create, refuse_interference
+from tactflow.outputs import create, refuse_interference
 
 log = logging.getLogger("tactflow")
 

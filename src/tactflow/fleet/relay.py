@@ -55,7 +55,7 @@ def _forward(publisher: Publisher, upstream: Sequence[str], backlog: int, stop: 
         back.linger = 0
         # As in the sink: a slow reader must not lag by seconds.
         back.rcvhwm = backlog
-        # A full queue would lose subscriptions: while a sensor is busy, somebody may make thousands of them.
+        # A full queue would lose subscriptions: a client may make thousands of them while a sensor is busy.
         back.sndhwm = 0
         for source in upstream:
             back.connect(source)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Self, get_type_hints
 import numpy as np
 import orjson
 
+from tactflow.engine.check import read_only
 from tactflow.engine.frame import NO_PICTURE, Frame, Tick
 from tactflow.message.decoding import decode_values
 from tactflow.message.encoding import SCHEMA, encode
@@ -162,9 +163,7 @@ def _is_picture(value: Any) -> bool:
 def _read_only(value: Any) -> Any:
     """The value with read-only arrays: an array, or a dataclass with arrays."""
     if isinstance(value, np.ndarray):
-        view = value.view()
-        view.flags.writeable = False
-        return view
+        return read_only(value)
     if isinstance(value, tuple) and type(value) is tuple:
         return tuple(map(_read_only, value))
     if not is_dataclass(value) or isinstance(value, type):

@@ -1,1 +1,1 @@
-"""What other programs connect to, and with what: results, commands, keys."""
+"""Connections of other programs over ZeroMQ: results, commands, keys."""

@@ -13,8 +13,8 @@ import numpy as np
 import yaml
 
 from tactflow import __version__
-from tactflow.calibration.stored import stored_arrays, stored_text
 from tactflow.engine.control import Control
+from tactflow.recording.calibration import stored_arrays, stored_text
 from tactflow.system.redaction import without_secrets
 
 log = logging.getLogger("tactflow")

@@ -12,12 +12,10 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from tactflow.engine.control import Control
 from tactflow.message.schema import message_schema
-from tactflow.recording import provenance
+from tactflow.outputs import cannot_write, create, refuse_interference
 from tactflow.recording.frames import RawFrame
 from tactflow.recording.schemas import channel_type, channel_types
-from tactflow.system.outputs import cannot_write, create, refuse_interference
 
 MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".npz": "application/octet-stream"}
 NEVER = 1 << 62
@@ -43,7 +41,7 @@ class RecordingWriter:
     """Writes a recording. After each `write`, all data has been passed to the operating system.
 
     path : the file; its folder is created. sensor : names the channels. overwrite : replace an existing file.
-    control : the run, whose versions, source, pipeline and calibration are attached; or None.
+    facts : name -> text, for the metadata. files : name -> content, to be attached.
     frames, bytes : written so far. begins : log time of the first frame, ns.
 
     Raises
@@ -53,7 +51,13 @@ class RecordingWriter:
     """
 
     def __init__(
-        self, path: Path, sensor: str, control: Control | None = None, *, overwrite: bool = False
+        self,
+        path: Path,
+        sensor: str,
+        *,
+        facts: Mapping[str, str] | None = None,
+        files: Mapping[str, bytes] | None = None,
+        overwrite: bool = False,
     ) -> None:
         self.path = path
         self.frames = self.begins = self.bytes = 0
@@ -62,19 +66,19 @@ class RecordingWriter:
         self._writer = Writer(self._file, chunk_size=NEVER, compression=CompressionType.NONE)
         self._writer.start(profile="", library="tactflow")
         with self._errors():
-            self._describe(sensor, control)
+            self._describe(sensor, facts or {}, files or {})
             self._flush()
 
-    def _describe(self, sensor: str, control: Control | None) -> None:
+    def _describe(self, sensor: str, facts: Mapping[str, str], files: Mapping[str, bytes]) -> None:
         writer = self._writer
         raw = channel_type(RawFrame)
         self._channels: dict[str, int] = {}
         for name, kind in {"frames": raw, "references": raw, **channel_types()}.items():
             schema = writer.register_schema(kind.name, *kind.schema)
             self._channels[name] = writer.register_channel(f"/{sensor}/{name}", kind.packing, schema)
-        writer.add_metadata("tactflow", provenance.facts(sensor, control))
-        attached = {"message.schema.json": json.dumps(message_schema(), indent=1).encode()}
-        for name, data in {**attached, **provenance.kept_files(control)}.items():
+        writer.add_metadata("tactflow", dict(facts))
+        schema_file = {"message.schema.json": json.dumps(message_schema(), indent=1).encode()}
+        for name, data in {**schema_file, **files}.items():
             writer.add_attachment(0, 0, name, MEDIA_TYPES[Path(name).suffix], data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:

@@ -7,7 +7,6 @@ Everything is closed-form or solved to machine precision, so that truth can be m
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -21,6 +20,8 @@ Points = NDArray[np.float64]
 
 SIZE = (800, 600)
 """Width and height of every scene's frames, px."""
+FPS = 60.0
+"""Frames per second of every scene."""
 CENTER = ((SIZE[0] - 1) / 2.0, (SIZE[1] - 1) / 2.0)
 HALF_DIAGONAL = math.hypot(*SIZE) / 2.0
 """Centre of a frame, (x, y), and distance of its corners from it, px."""
@@ -150,19 +151,3 @@ def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     """An image (H, W, 3) uint8 after a JPEG round trip; quality 1 to 100."""
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), dtype=np.uint8)
-
-
-def delivered_frames(count: int, dropped: float, repeated: float, seed: int) -> Sequence[int]:
-    """Moment of the scene that each of `count` frames shows.
-
-    dropped : fraction of moments that are missing. repeated : fraction of frames that are delivered twice,
-    bit for bit.
-    """
-    if not dropped and not repeated:
-        return range(count)
-    draw = np.random.default_rng([seed, 0x6472]).random((count, 2))
-    steps = np.ones(count, dtype=np.int64)
-    steps[draw[:, 0] < dropped] = 2
-    steps[draw[:, 1] < repeated] = 0
-    steps[0] = 0
-    return [int(moment) for moment in np.cumsum(steps)]

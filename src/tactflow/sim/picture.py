@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.sim import camera as optics
 from tactflow.sim import gel, light, markers
-from tactflow.sim.camera import CENTER, HALF_DIAGONAL, SIZE, Camera
+from tactflow.sim.camera import CENTER, FPS, HALF_DIAGONAL, SIZE, Camera
 from tactflow.sim.settings import Settings
 
 FIXED_POINT = markers.FIXED_POINT
@@ -30,8 +30,6 @@ _LAMP_AT = 0.475
 """Fraction of a recording after which the lamp is on: between the two contacts."""
 _BRIGHT_MARKER = 225.0
 """Grey level of a bright marker; chosen by hand, below saturation."""
-_FPS = 60.0
-"""Frames per second, for drift and flicker of the light."""
 
 
 class Painter:
@@ -82,7 +80,7 @@ class Painter:
 
     def _gain(self, moment: int) -> float:
         settings = self._settings
-        seconds = moment / _FPS
+        seconds = moment / FPS
         warm = 1.0 + settings.drift * (1.0 - float(np.exp(-seconds / 5.0)))
         return warm * (1.0 + settings.flicker * float(np.sin(2 * np.pi * 100.0 * seconds)))
 

@@ -159,7 +159,6 @@ SCENES: dict[str, Recipe] = {
         _PRESS,
         {"noise": 6.0, "shot": 3.0, "hot": 40, "jpeg": 70, "blur": 1.0},
     ),
-    "stutter": Recipe("a camera that drops and repeats frames", _PRESS, {"dropped": 0.1, "repeated": 0.1}),
     "strong_shear": Recipe(
         "a ball that moves markers by up to 1.5 pitches",
         Programme(_SPHERE, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2),

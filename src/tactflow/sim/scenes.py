@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim import gel, markers, motion, shapes
-from tactflow.sim.camera import SIZE, Camera, delivered_frames
+from tactflow.sim.camera import FPS, SIZE, Camera
 from tactflow.sim.picture import Painter
 from tactflow.sim.recipes import SCENES
 from tactflow.sim.settings import Settings, parse_query
@@ -14,8 +14,6 @@ from tactflow.sim.truth import Truth
 from tactflow.system.spelling import did_you_mean
 from tactflow.vision.geometry import PixelMapping, Preprocessor
 
-FPS = 60.0
-"""Frames per second of every scene."""
 _STALE_FRAMES = 300
 """Number of frames searched for the deepest contact, which stale frames show; enough for a few contacts."""
 
@@ -72,10 +70,7 @@ class Scene:
             make(bend=settings.bend) if make is shapes.cable else make()
             for make in (programme.indenters if programme else ())
         )
-        self._delivered = delivered_frames(len(self), settings.dropped, settings.repeated, settings.seed)
-        # Contacts and the lamp are timed by the moments that passed, not by the frames that were delivered.
-        self._timed = settings.model_copy(update={"frames": self._delivered[-1] + 1})
-        self._painter = Painter(self._timed, self.camera, self.layout)
+        self._painter = Painter(settings, self.camera, self.layout)
         self._stale = 0
         if settings.stale:
             self._stale = max(range(min(len(self), _STALE_FRAMES)), key=self._depth)
@@ -118,10 +113,10 @@ class Scene:
         return (self._vanishing < self.settings.vanish) & (cycle >= 0)
 
     def _moment(self, index: int) -> int:
-        """Moment that frame `index` shows: stale frames show an earlier contact, others may be dropped."""
+        """Moment that frame `index` shows: stale frames show an earlier contact."""
         if not 0 <= index < len(self):
             raise IndexError(f"required a frame in [0, {len(self) - 1}], got {index}")
-        return self._stale if index < self.settings.stale else self._delivered[index]
+        return self._stale if index < self.settings.stale else index
 
     def _depth(self, moment: int) -> float:
         return max((press.depth for press in self._contact(moment)[0]), default=0.0)
@@ -131,5 +126,5 @@ class Scene:
         if self._programme is None:
             return (), -1
         return motion.presses(
-            self._programme, self._shapes, moment, self._timed, size=SIZE, pitch=self.layout.pitch
+            self._programme, self._shapes, moment, self.settings, size=SIZE, pitch=self.layout.pitch
         )

@@ -75,8 +75,6 @@ class Settings(BaseModel):
     jpeg: int = _number(0, 0, 100, "quality of a JPEG round trip; 0 for none")
     gain: float = _number(0, 0, 0.5, "amplitude of bands of gain that roll over the frame, relative")
     hot: int = _number(0, 0, 10_000, "number of hot pixels")
-    dropped: float = _number(0, 0, 0.9, "fraction of moments that the camera misses")
-    repeated: float = _number(0, 0, 0.9, "fraction of frames that are delivered twice")
     perspective: float = _number(
         0, 0, 0.4, "tilt of the camera: how far the lower corners move in, of half the width"
     )

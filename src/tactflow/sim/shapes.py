@@ -177,9 +177,6 @@ def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, l
 
     def gap(x: Array, y: Array) -> Array:
         beyond = np.maximum(np.abs(x) - np.float32(half_length), 0)
-        if not lean:
-            away = np.sqrt(beyond * beyond + y * y + np.float32(9.0)) - np.float32(3.0)
-            return np.asarray(away * np.float32(slope), dtype=np.float32)
         across = y + np.float32(lowest)
         away = np.sqrt(beyond * beyond + across * across + np.float32(9.0)) - np.float32(rise)
         return np.asarray((away + across * np.float32(lean)) * np.float32(slope), dtype=np.float32)

@@ -1,8 +1,7 @@
-"""Report the result of a search: as text, page, JSON, and pipeline file with comments."""
+"""Report the result of a search: as text, JSON, and pipeline file with comments."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,13 @@ from typing import Any
 import yaml
 
 from tactflow.engine.errors import ConfigError
-from tactflow.report import COLORS, Section, Table, figure, markdown, picture, write_report
+from tactflow.report import Section, Table, markdown
 from tactflow.tune.measure import CHECKS, ERRORS, Interval
 from tactflow.tune.search import Tuned
-from tactflow.tune.space import ORIGINAL
 
 
-def sections(tuned: Tuned) -> list[Section]:
-    """How the pipelines were measured, a table of them, and the chosen one on the recording."""
+def lines(tuned: Tuned) -> Iterator[str]:
+    """How the pipelines were measured, a table of them, and the chosen one on the recording, as Markdown."""
     facts = [
         f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}",
         "errors: px of the camera image, simulated; time: CPU of a frame with contact, on the recording",
@@ -40,12 +38,7 @@ def sections(tuned: Tuned) -> list[Section]:
         checks = [[CHECKS[name], f"{value:.3g}"] for name, value in tuned.chosen.checks.items()]
         table = Table(["check", "value"], checks)
         parts.append(Section("The chosen pipeline on the recording", tables=[table]))
-    return parts
-
-
-def lines(tuned: Tuned) -> Iterator[str]:
-    """The sections as lines of text."""
-    return markdown(sections(tuned))
+    return markdown(parts)
 
 
 def _cell(interval: Interval | None, digits: int) -> str:
@@ -117,35 +110,3 @@ def _set(document: dict[str, Any], key: str, value: Any) -> None:
     document[last] = value
     if value is None:
         del document[last]
-
-
-def write_page(path: Path, tuned: Tuned) -> Path:
-    """Write a page with a plot of time against error and the sections. Raises ConfigError without
-    matplotlib."""
-    text = "The largest error of each pipeline. Bars are 90 % intervals."
-    plot = Section("The choice", text, [picture(_plot(tuned))])
-    return write_report(path, f"Pipelines for {tuned.recording.source}", [plot, *sections(tuned)])
-
-
-def _plot(tuned: Tuned) -> Any:
-    """Plot time against error on logarithmic axes."""
-    drawing, axes = figure(size=(7.2, 4.4))
-    axes.set(xscale="log", yscale="log")
-    axes.set_xlabel("CPU time of a frame with contact, ms")
-    axes.set_ylabel("error, px of the camera image")
-    for trial in tuned.trials:
-        ms, error = trial.ms, trial.error
-        if trial.failure or not 0 < error.value < math.inf or not ms.value > 0:
-            continue
-        named = trial is tuned.chosen or trial.name == ORIGINAL
-        color = COLORS[2] if trial is tuned.chosen else COLORS[1] if named else COLORS[6]
-        bars = [[[i.value - i.low], [i.high - i.value]] for i in (error, ms)]
-        axes.errorbar(ms.value, error.value, *bars, fmt="o", color=color, elinewidth=1)
-        if named:
-            place = (ms.value, error.value)
-            axes.annotate(trial.name, place, (5, 5), textcoords="offset points", fontsize=8)
-    if tuned.goal.max_ms is not None:
-        axes.axvline(tuned.goal.max_ms, color="black", linestyle="--")
-    if tuned.goal.max_error is not None:
-        axes.axhline(tuned.goal.max_error, color="black", linestyle="--")
-    return drawing

@@ -14,9 +14,6 @@ class Session(Protocol):
     state: Mapping[str, Any]
     """Next step and progress, for the page; replaced as a whole."""
 
-    def undo(self) -> None:
-        """Undo the last step."""
-
 
 class Guiding(Sink):
     """A sink that can show a guided session."""

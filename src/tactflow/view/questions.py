@@ -1,4 +1,4 @@
-"""Questions that are answered in the terminal or on the live page, beside the picture that they are about."""
+"""Questions that are answered in the terminal or on the live page, next to their picture."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ class Questions:
         self._answers.put((int(number), str(answer)))
 
     def _read_terminal(self) -> None:
-        # Not by `sys.stdin`, whose lock a thread that waits would hold when the program ends.
+        # Without `sys.stdin`: a waiting thread would hold its lock at the end of the program.
         with suppress(OSError, ValueError):
             while text := os.read(sys.stdin.fileno(), 4096):
                 for line in text.decode(errors="replace").splitlines():
                     self._answers.put((None, line.strip()))
 
     def close(self) -> None:
-        """Serve the page no more."""
+        """Stop serving the page."""
         if self._server is not None:
             self._server.close()
 
@@ -113,7 +113,7 @@ class Questions:
             self.show(self._shown)
 
     def poll(self) -> str | None:
-        """The answer to the question, or None as long as there is none.
+        """The answer to the question; None before there is one.
 
         Raises ConfigError if there is neither a page nor a terminal.
         """

@@ -98,7 +98,7 @@ class Server:
             connections.add(connection)
             return connection
 
-        # What is wrong with a request is the business of who sent it.
+        # Invalid requests concern only their senders.
         quiet = logging.getLogger("tactflow.view.websockets")
         quiet.setLevel(logging.CRITICAL + 1)
         async with serve(
@@ -123,7 +123,7 @@ class Server:
                 if not self.hub.pages:
                     break
                 await asyncio.sleep(0.02)
-            # Who does not read, or sends no request, would keep a connection open.
+            # Clients that neither read nor send a request would keep their connections open.
             for connection in connections:
                 connection.transport.abort()
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.markers import selection
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers, to_gray
 from tactflow.vision.markers.lattice import neighbour_graph
 from tests.vision.dots import grid, match, rectified, render
@@ -423,14 +422,6 @@ def test_a_real_gel_without_marks_is_recognised(shared_data: Path, name: str, fr
     video.release()
     with pytest.raises(NoMarkersError):
         detect_markers(np.asarray(image, np.uint8))
-
-
-def test_spots_of_which_none_belongs_to_a_lattice_in_the_end_are_no_marks(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(selection, "_in_lattice", lambda marks: marks.at(np.zeros(len(marks.points), bool)))
-    with pytest.raises(NoMarkersError, match="0 markers found"):
-        detect_markers(render((160, 200), grid(5, 6, 30.0, corner=(20, 20)), 4.0))
 
 
 def test_a_spot_that_does_not_look_like_the_marks_is_improbable() -> None:

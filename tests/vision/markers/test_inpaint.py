@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.vision.markers.inpaint import RADIUS, InpaintMethod, remove_markers
+from tactflow.vision.markers.inpaint import InpaintMethod, remove_markers
 from tactflow.vision.markers.mask import find_dot, marker_mask
 
 Image = NDArray[np.uint8]
@@ -161,16 +161,6 @@ def test_normalized_is_what_float64_gives_rounded(size: tuple[int, int], radius:
         error = np.abs(remove_markers(image, mask, radius=radius) - expected)[mask > 0]
         # Half a level of rounding, and what float32 leaves of 255 after some ten operations: 1.5e-4.
         assert error.max(initial=0) <= 0.5 + 2e-4
-
-
-def test_single_precision_costs_the_filling_of_a_pressed_gel_at_most_a_rounding() -> None:
-    recording = open_scene("press?frames=60")
-    dot = find_dot(recording.frame(0))
-    assert dot is not None
-    image = recording.frame(25)
-    mask = marker_mask(image, dot)
-    error = np.abs(remove_markers(image, mask) - _normalized(image, mask, RADIUS))[mask > 0]
-    assert error.max() <= 0.5 + 2e-4
 
 
 def test_misfits_are_refused_with_what_came() -> None:

@@ -23,18 +23,6 @@ def test_of_several_grids_each_has_its_largest_component() -> None:
     np.testing.assert_array_equal(under_test.largest_component(seen, strain), expected)
 
 
-def test_strain_is_the_difference_of_displacements_over_the_distance() -> None:
-    rng = np.random.default_rng(3)
-    origin = grid(4, 5, 12.0, corner=(10.0, 10.0))
-    edges = neighbour_graph(origin, 30.0)
-    moved = rng.normal(0, 2, origin.shape)
-    one, other = edges.T
-    expected = np.linalg.norm(moved[one] - moved[other], axis=1) / np.linalg.norm(
-        origin[one] - origin[other], axis=1
-    )
-    np.testing.assert_allclose(MarkerGraph(origin, edges).strain(origin + moved), expected, rtol=1e-9)
-
-
 def test_edges_to_marks_that_are_not_there_are_refused() -> None:
     with pytest.raises(ValueError, match="required edges between marks 0 to 1"):
         MarkerGraph(np.zeros((2, 2)), np.array([[0, 2]]))

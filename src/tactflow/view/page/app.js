@@ -181,7 +181,6 @@ function drawPresses(guide) {
   set("guide-last", last);
   put($("guide-last").dataset, "good", String(good));
   put($("guide-progress"), "value", share);
-  put($("undo"), "disabled", guide.presses.length === 0 || link !== "open");
 }
 
 // Unit of lengths: millimetres only with a scale.
@@ -377,14 +376,13 @@ const actions = {
   reference: () => { command("reference"); note("the next frames become the reference"); },
   record: () => command("record", !sensors.get(current)?.state?.recording),
   stop: () => command("stop"),
-  undo: () => command("undo"),
 };
 let orderedUnit = null;
 function orderLayers() {
   orderedUnit = unit();
   order("layers", { layers, magnify: magnification, rise, unit: orderedUnit });
 }
-const keys = { " ": "pause", s: "step", n: "reference", r: "record", q: "stop", backspace: "undo" };
+const keys = { " ": "pause", s: "step", n: "reference", r: "record", q: "stop" };
 for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
 
 for (const layer of LAYERS) {

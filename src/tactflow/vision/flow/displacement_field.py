@@ -46,6 +46,8 @@ OVERSHOOT: Final = 0.5
 POOR: Final = 3.0
 """Times the median standard error from which on a marker's own error has its weight. Chosen by hand."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
+SIDE: Final = 4
+"""Of `Samples.place`: the side of the square that counts around a cell, px."""
 
 
 class Grid(NamedTuple):
@@ -269,7 +271,14 @@ class DisplacementField:
         mask : (H, W) uint8, 255 inside, else 0. Raises ValueError if it is not.
         """
         check_mask(mask)
-        return self._sums(mask, cv2.boundingRect(mask), self._model.fine)[0]
+        side = int(self._model.fine.place[SIDE])
+        left, top, width, height = cv2.boundingRect(mask)
+        left, top = max(left - side, 0), max(top - side, 0)
+        part = mask[top : top + height + 2 * side, left : left + width + 2 * side]
+        covered = cv2.blur(part, (side, side), borderType=cv2.BORDER_CONSTANT)
+        now = (self.grid.points + self.displacement - (left, top)).astype(np.float32)
+        shares = cv2.remap(covered, now, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+        return np.asarray(shares, np.float64) / 255
 
     def motion(self, mask: Mask) -> GelMotion | None:
         """How the gel inside a region has moved, each bit of it counted by its area at rest.
@@ -286,13 +295,13 @@ class DisplacementField:
         box = cv2.boundingRect(mask)
         large = box[2] * box[3] >= MANY * self.grid.spacing**2
         samples = self._model.coarse if large else self._model.fine
-        _, sums = self._sums(mask, box, samples)
+        sums = self._sums(mask, box, samples)
         return _motion(sums.tolist(), samples.grid.spacing) if sums[0] > 0 else None
 
-    def _sums(self, mask: Mask, box: Sequence[int], samples: Samples) -> tuple[Floats, Floats]:
-        """Shares and sums of a region in a box, see `sum_region`."""
+    def _sums(self, mask: Mask, box: Sequence[int], samples: Samples) -> Floats:
+        """Sums over a region in a box, see `sum_region`."""
         left, top, width, height = box
-        shares, sums = np.zeros(samples.grid.shape), np.zeros(26)
+        sums = np.zeros(26)
         covered = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
         model = self._model
         sum_region(
@@ -305,10 +314,9 @@ class DisplacementField:
             samples.between,
             model.inverse,
             self._removed,
-            shares,
             sums,
         )
-        return shares, sums
+        return sums
 
 
 def matern(distance: Floats) -> Floats:

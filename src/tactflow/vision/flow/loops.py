@@ -207,7 +207,7 @@ def _remove(
 
 @kernel(
     "void(int32[:, ::1], int64, int64, float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1],"
-    " float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1])"
+    " float64[:, ::1], float64[:, ::1], float64[::1])"
 )
 def sum_region(
     covered: Sums,
@@ -219,10 +219,9 @@ def sum_region(
     between: Floats,
     inverse: Floats,
     removed: Floats,
-    shares: Floats,
     sums: Floats,
 ) -> None:
-    """How much of each cell is in a region, and sums over these cells.
+    """Sums over the cells of a region.
 
     covered : (h + 1, w + 1), sums over the pixels above and to the left in a part of a mask with 255 inside.
     They may overflow: differences are right. left, top : where that part begins, px.
@@ -231,26 +230,24 @@ def sum_region(
     planes, inverse, removed : of `weigh_markers`; of the last, the rows that are filled.
     to_markers : (R, C, N), kernel between cells and markers. between : (2 R - 1, 2 C - 1), kernel between two
     cells, by how many rows and columns they are apart.
-    shares : (R, C) of 0, filled: how much of each cell is in the region, 0 to 1.
-    sums : (26,) of 0, filled: the shares; then, of cells weighted by their share in the region: mean m (x,
-    y); a a' (xx, xy, yy), a r' (xx, xy, yx, yy) and r r', where a is the way from the middle to a cell and r
-    what its motion is beyond the mean; of cells at the outline r^2 (x, y); over pairs of cells, the kernel
-    times 1, and times a a' of the two (xx, xy, yy); at the end those of `_sum_markers`. All are 0 without a
-    cell."""
+    sums : (26,) of 0, filled: how much of each cell is in the region; then, of cells weighted by their share
+    in the region: mean m (x, y); a a' (xx, xy, yy), a r' (xx, xy, yx, yy) and r r', where a is the way from
+    the middle to a cell and r what its motion is beyond the mean; of cells at the outline r^2 (x, y); over
+    pairs of cells, the kernel times 1, and times a a' of the two (xx, xy, yy); at the end those of
+    `_sum_markers`. All are 0 without a cell."""
     # The cells whose gel may be in the part.
     least_x, most_x = _extent(planes[MOVED_X], place[3])
     least_y, most_y = _extent(planes[MOVED_Y], place[3])
     height, width = covered.shape[0] - 1, covered.shape[1] - 1
-    row = _within((top - place[1] - most_y) / place[2], shares.shape[0])
-    column = _within((left - place[0] - most_x) / place[2], shares.shape[1])
-    rows = _within((top + height - place[1] - least_y) / place[2] + 2, shares.shape[0]) - row
-    columns = _within((left + width - place[0] - least_x) / place[2] + 2, shares.shape[1]) - column
+    row = _within((top - place[1] - most_y) / place[2], to_markers.shape[0])
+    column = _within((left - place[0] - most_x) / place[2], to_markers.shape[1])
+    rows = _within((top + height - place[1] - least_y) / place[2] + 2, to_markers.shape[0]) - row
+    columns = _within((left + width - place[0] - least_x) / place[2] + 2, to_markers.shape[1]) - column
     cells, begin = np.empty((6, rows, columns)), (row, column)
     x, y = place[0] + column * place[2] - left, place[1] + row * place[2] - top
     _sample_cells(covered, x, y, place[2], int(place[4]), planes, to_markers, begin, cells)
     for i in range(rows):
         for j in range(columns):
-            shares[row + i, column + j] = cells[SHARE, i, j]
             sums[0] += cells[SHARE, i, j]
     if sums[0] > 0:
         to_region = np.empty((3, planes.shape[1]))

@@ -1,12 +1,13 @@
 """The printed markers of a gel: detection, mask, removal and tracking.
 
-Once for each reference, `detection` finds them: `scale_space` looks for spots of every size, and `selection`
-tells which of them are marks by the `lattice` that they form and by how much they look like each other.
+Find: once for each reference, `spots` are looked for at every size, and `selection` tells which of them are
+marks by the `lattice` that they form and by how much they look like each other; `detection` puts it together.
 
-In each frame, `mask` tells where markers cover the gel, and `inpaint` fills these places. `tracking` follows
-the markers: `template` aligns each one from where it was last. Where a marker is missing or does not move
-like its neighbours, `spots` finds spots of the markers' size, `matching` chooses one for each marker, and
-`interpolation` places those that are not seen.
+Match and refine: in each frame, `tracking` aligns each mark with its `template`, from where it was last.
+Where one is missing or does not move like its neighbours, `matching` grows the smooth part of the field over
+the spots of the frame, and places the marks that are not seen. `motion` tells which do not move with the gel.
+
+`mask` tells where markers cover the gel, and `inpaint` fills these places.
 """
 
 from tactflow.vision.markers.detection import Candidate, Detection, NoMarkersError, detect_markers

@@ -13,8 +13,8 @@ from scipy.ndimage import map_coordinates
 
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.lattice import LONGEST_LINK, corners, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 from tactflow.vision.markers.selection import Group, Sign, evidence, groups, links, marks_of, probability
+from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, SIGMA_STEP, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
 
@@ -30,13 +30,6 @@ most, in the better one of two directions: dashes may touch in the other one. Th
 diagonal, 0.7 of the way to the middle of a cell, where another lattice may have its marks. Two waves that
 cross, as in a weave, have 0.37 if they are alike, 0.16 if one is twice as strong. Marks of 18 sensors, and
 of 164 simulated ones, have at most 0.00 (measured)."""
-
-MANY_SPOTS: Final = 30
-"""Spots from which on a picture without a lattice is called a texture; fewer are dust. Chosen by hand."""
-
-TEXTURE_STRENGTH: Final = 5.0
-"""Median response of spots that are called a texture, grey levels, at least; fainter ones are noise. Chosen
-by hand."""
 
 CLOSE: Final = 0.75
 """Score of the next best group over that of the best, from which on the choice was close. Chosen by hand."""
@@ -65,11 +58,7 @@ SURROUNDINGS: Final = (1.4, 1.9)
 is 1.5 px wider. Chosen by hand."""
 
 CENTROID_ROUNDS: Final = 4
-"""Steps of a centroid's window, at most. Chosen by hand."""
-
-CENTROID_CONVERGED: Final = 1e-3
-"""Step of all windows, px, below which they have converged. Chosen by hand: a tenth of a
-marker's error."""
+"""Steps of a centroid's window: each is a fraction of the one before."""
 
 _NO_MARKERS: Final = (
     "0 markers found: is the sensor marker-less? then use the pipeline markerless, or one that is made for "
@@ -268,15 +257,13 @@ def _require_lattice(found: list[Group]) -> None:
     if found[0].score >= LEAST_SCORE:
         return
     best = max(found, key=lambda other: float(other.spots.strength.sum()))
-    count = len(best.spots.points)
-    if count >= MANY_SPOTS and float(np.median(best.spots.strength)) >= TEXTURE_STRENGTH:
-        raise NoMarkersError(
-            f"{_NO_MARKERS} ({count} {best.polarity} spots of radius {best.sigma * RADIUS_PER_SIGMA:.1f} px "
-            f"form no lattice: {100 * best.share:.0f} % of their parallelograms close, of a grid's 80 %; if "
-            "they are marks and no random texture, give their radius in pixels)",
-            _candidate(best),
-        )
-    raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(found[0]))
+    raise NoMarkersError(
+        f"{_NO_MARKERS} ({len(best.spots.points)} {best.polarity} spots of radius "
+        f"{best.sigma * RADIUS_PER_SIGMA:.1f} px form no lattice: {100 * best.share:.0f} % of their "
+        "parallelograms close, of a grid's 80 %; if they are marks, and no dust or random texture, give "
+        "their radius in pixels)",
+        _candidate(best),
+    )
 
 
 def _require_gel_between(gray: NDArray[np.float32], best: Group, spots: Spots) -> None:
@@ -400,8 +387,6 @@ def refine_centers(gray: NDArray[np.float32], centers: Floats, radius: float) ->
         move[good, 0] = (darkness * x).sum(axis=1)[good] / total[good]
         move[good, 1] = (darkness * y).sum(axis=1)[good] / total[good]
         result += np.clip(move, -radius, radius)
-        if np.abs(move).max(initial=0) < CENTROID_CONVERGED:
-            break
     return result
 
 

@@ -1,4 +1,4 @@
-"""Which spot of a frame is which mark: neighbours move alike."""
+"""Which spot of a frame is which mark, and where a mark is that is not seen: neighbours move alike."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
-from tactflow.vision.markers.interpolation import Interpolator
-from tactflow.vision.markers.lattice import components
+from tactflow.vision.markers.lattice import components, nearest
 
 LINKED_STRAIN: Final = 0.3
 """Strain of a link below which its two marks move together. Chosen by hand."""
@@ -17,6 +16,10 @@ LINKED_STRAIN: Final = 0.3
 REACH: Final = 0.4
 """Distance, pitches, of a spot from where the marks around predict a mark, at most: with 0.3 three times as
 many marks of wedge_roll are not seen, with 0.5 some take a shadow half a pitch away (measured)."""
+
+STEPS: Final = 2
+"""Steps in which this distance is reached: with one, strong shear between two frames costs identities."""
+
 
 LEAST_SHARE: Final = 0.15
 """Share, by weight, of the marks around that are known where they predict a mark: one alone is not enough.
@@ -26,11 +29,23 @@ of others in 2 % of all cases (measured)."""
 AGREEMENT: Final = 0.2
 """Distance from a common displacement within which a mark agrees, pitches: the scatter of the field."""
 
-LEAST_VOTES: Final = 0.75
-"""Fraction of the marks that have to agree on a jump. Chosen by hand."""
+NEIGHBOURS: Final = 24
+"""Marks around a mark that a fit uses, at most: the two rings of a square grid, 8 + 16."""
 
-LEAST_LEAD: Final = 0.05
-"""Lead over the next displacement, as a fraction of the marks. Chosen by hand."""
+WEIGHT_SIGMA: Final = 1.1
+"""Width of the Gaussian by which a mark's weight falls with its distance, pitches: 0.66 at one pitch. Chosen
+by hand."""
+
+LEAST_WEIGHT: Final = 0.02
+"""Weight below which a mark does not count, which is 3.1 pitches away. Chosen by hand."""
+
+LEAST_SUPPORT: Final = 0.6
+"""Sum of the weights of the seen marks around a mark that is placed: one neighbour is enough. Below, the mark
+is lost."""
+
+RIDGE: Final = np.diag([1e-9, 0.05, 0.05, 0.3, 0.3, 0.3])
+"""Ridge of the fit's coefficients 1, x, y, x^2, x y, y^2. It turns a quadratic fit into a plane, and a plane
+into a mean, where there is too little to fit it. Chosen by hand."""
 
 
 class MarkerGraph:
@@ -65,9 +80,6 @@ class MarkerGraph:
             raise ValueError(f"required edges between marks 0 to {count - 1}, got {self.edges.tolist()}")
         self._origin = origin
         self.length = np.linalg.norm(origin[self.edges[:, 0]] - origin[self.edges[:, 1]], axis=1)
-        degree = np.bincount(self.edges.ravel(), minlength=count)
-        self.border = degree < np.sort(degree)[count // 2]
-        """(N,) bool, marks with fewer neighbours than most."""
         self._grid = components(self.edges, count)
         self.grids = [np.flatnonzero(self._grid == grid) for grid in np.unique(self._grid)]
         """The marks of each grid without links to others."""
@@ -87,6 +99,60 @@ class MarkerGraph:
         best = np.zeros(len(seen))
         np.maximum.at(best, self._grid, rank)
         return np.asarray(seen & (rank == best[self._grid]))
+
+
+class Interpolator:
+    """Places marks by those around them.
+
+    origin : (N, 2) float64, marks in the reference, px. pitch : px.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.arange(5.0), np.arange(5.0))
+    >>> origin = 10 * np.column_stack([x.ravel(), y.ravel()])
+    >>> position = origin + 3
+    >>> found = np.ones(25, bool)
+    >>> found[12], position[12] = False, 0.0
+    >>> placed = Interpolator(origin, 10.0).place(position, found)
+    >>> placed.tolist(), (position[12] - origin[12]).round(2).tolist()
+    ([12], [3.0, 3.0])
+    """
+
+    def __init__(self, origin: Floats, pitch: float) -> None:
+        self._origin, self._pitch = origin, pitch
+        self._around, self._weight = surroundings(origin, pitch)
+
+    def place(self, position: Floats, found: Flags, share: float = 0.0) -> Indices:
+        """Place the marks that are not found, where enough of those around them are.
+
+        position : (N, 2) float64, px, finite, changed in place. found : (N,) bool.
+        share : of the weight of all marks around, that those found have at least, 0 to 1.
+        Returns the numbers of the marks that are placed; the positions of others stay.
+        """
+        missing = np.flatnonzero(~found)
+        around = self._around[missing]
+        weight = self._weight[missing] * found[around]
+        offset = (self._origin[around] - self._origin[missing][:, None]) / self._pitch
+        moved = (position - self._origin)[around]
+        x, y = offset[..., 0], offset[..., 1]
+        basis = np.empty((*x.shape, 6))
+        for number, term in enumerate((1.0, x, y, x * x, x * y, y * y)):
+            basis[..., number] = term
+        weighted = (basis * weight[:, :, None]).transpose(0, 2, 1)
+        fitted = np.linalg.solve(weighted @ basis + RIDGE, weighted @ moved)[:, 0]
+        total = weight.sum(axis=1)
+        supported = (total > LEAST_SUPPORT) & (total > share * self._weight[missing].sum(axis=1))
+        placed = np.asarray(missing[supported], np.int64)
+        position[placed] = self._origin[placed] + fitted[supported]
+        return placed
+
+
+def surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
+    """For each mark up to 24 nearest others, and their weights: two (N, n) arrays."""
+    away, near = nearest(origin, NEIGHBOURS)
+    weight = np.exp(-(away**2) / (2 * (WEIGHT_SIGMA * pitch) ** 2))
+    weight[weight < LEAST_WEIGHT] = 0.0
+    return near, weight
 
 
 def grow(
@@ -118,7 +184,7 @@ def grow(
     position, known = last.copy(), known.copy()
     choice, free = np.full(len(last), -1, np.int64), np.arange(len(spots))
 
-    def take(asked: Indices) -> bool:
+    def take(asked: Indices, reach: Floats) -> bool:
         nonlocal free
         away, nearest = map(np.asarray, KDTree(spots[free]).query(position[asked]))
         order = np.argsort(away, kind="stable")
@@ -130,21 +196,20 @@ def grow(
         free = np.delete(free, taken)
         return len(first) > 0
 
-    while len(free) and len(asked := interpolator.place(position, known, LEAST_SHARE)) and take(asked):
-        pass
+    step = 1
+    while len(free) and step <= STEPS and len(asked := interpolator.place(position, known, LEAST_SHARE)):
+        # Sure choices come first: those nearest to the prediction.
+        step = 1 if take(asked, reach * step / STEPS) else step + 1
     left = np.flatnonzero(~known)
     position[left] = last[left]
     if len(free) and len(left):
-        take(left)
+        take(left, reach)
     marks = np.flatnonzero(choice >= 0)
     return marks, choice[marks]
 
 
-def common_displacement(position: Floats, spots: Floats, *, pitch: float, farthest: float) -> Floats | None:
-    """The displacement that nearly all marks share, if there is clearly one.
-
-    Every pair of a mark and a spot votes for its displacement. Only this tells a jump of the whole grid by
-    nearly a pitch from a small one the other way, which all marks but those of one side would agree with.
+def common_displacement(position: Floats, spots: Floats, pitch: float, farthest: float) -> Floats:
+    """The displacement that most marks share: every pair of a mark and a spot votes for its own.
 
     Parameters
     ----------
@@ -154,8 +219,7 @@ def common_displacement(position: Floats, spots: Floats, *, pitch: float, farthe
 
     Returns
     -------
-    displacement : (2,) float64, px; None where fewer than three quarters of the marks agree, or nearly as
-        many agree with another.
+    displacement : (2,) float64, px; zero where no spot is near enough.
 
     References
     ----------
@@ -168,18 +232,11 @@ def common_displacement(position: Floats, spots: Floats, *, pitch: float, farthe
     >>> common_displacement(position, position + [4.0, -3.0], pitch=10.0, farthest=13.0).round(6)
     array([ 4., -3.])
     """
-    if len(spots) == 0:
-        return None
     votes = (spots - position[:, None]).reshape(-1, 2)
     votes = votes[np.hypot(*votes.T) < farthest]
     if len(votes) == 0:
-        return None
+        return np.zeros(2)
     tree = KDTree(votes)
-    counts = np.asarray(tree.query_ball_point(votes, AGREEMENT * pitch, return_length=True))
-    best = int(counts.argmax())
-    # Nearer than half a pitch are votes of the same peak.
-    rivals = counts[np.hypot(*(votes - votes[best]).T) > pitch / 2]
-    if counts[best] < max(LEAST_VOTES, rivals.max(initial=0) / len(position) + LEAST_LEAD) * len(position):
-        return None
+    best = np.asarray(tree.query_ball_point(votes, AGREEMENT * pitch, return_length=True)).argmax()
     agree = tree.query_ball_point(votes[best], AGREEMENT * pitch)
     return np.asarray(votes[agree].mean(axis=0), np.float64)

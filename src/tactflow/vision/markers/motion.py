@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Floats32
-from tactflow.vision.markers.interpolation import LEAST_SUPPORT, surroundings
+from tactflow.vision.markers.matching import LEAST_SUPPORT, surroundings
 
 BEST_AGREEMENT: Final = 0.25
 """Difference of a mark's displacement from the mean of those around it, over this mean, that is always

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import lattice
 from tactflow.vision.markers.lattice import LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, Spots, joined
+from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, Spots, joined
 
 Sign = Literal["dark", "bright"]
 
 LEAST_STRENGTH: Final = 0.35
-"""Response of a mark over that of the typical one of its scale, at least. Chosen by hand: dirt and grain are
-a tail."""
+"""Response of a mark over that of the typical one of its scale, at least: dirt and grain are a tail. With
+0.25, grain between marks that are 3 px apart takes their places (sts_torque160)."""
 
 BETWEEN: Final = 0.55
 """Distance, pitches, below which the weaker of two spots lies between marks. Chosen by hand."""
@@ -38,10 +38,6 @@ LONG_LINK: Final = 1.8
 """Length of a link of the lattice, over the median one at either end, at most: longer ones lead to something
 else. Chosen on tactip_video, whose pins have a bright rim around them."""
 
-MOST_SCALES: Final = 2.1
-"""Radius of a mark over that of most of them, and its inverse, at most: painted marks and those far off in
-perspective. Chosen on handmade_dots and sts_640."""
-
 APART: Final = 0.9
 """Distance of two marks, sums of their radii, at least. Chosen by hand."""
 
@@ -53,15 +49,14 @@ CLEAR: Final = 0.55
 """Clearance of a spot that is a mark where a single corner or line of the lattice wants one. Chosen on
 sts_640."""
 
-ALIKE_STRENGTH: Final = (0.6, 1.7)
-"""Response of such spots, over that of the marks around. Chosen by hand."""
+ALIKE: Final = 1.7
+"""Ratio of the responses of such a spot and of the marks around, either way, at most."""
 
-NEAR_STRENGTH: Final = (0.3, 3.0)
-"""Response of a spot where the lattice wants a mark, over that of the marks around. Chosen by hand: light and
-dirt weaken marks, and the rim of a lamp is stronger."""
+NEAR: Final = 3.2
+"""The same, of a spot where the lattice wants a mark: light and dirt weaken marks."""
 
-NEAR_RADIUS: Final = (0.65, 1.5)
-"""Radius of such a spot, over those of the marks around. Chosen by hand."""
+NEAR_RADIUS: Final = 1.5
+"""Ratio of the radii of such a spot and of the marks around, either way, at most."""
 
 LEAST_BEND: Final = 0.15
 """Bend of a mark over that of most marks, at least: a piece of an edge or a line has 0. Of the dots marked on
@@ -73,16 +68,13 @@ LEAST_SUPPORT: Final = 2
 RING_CONTRAST: Final = 0.3
 """Clearance of a spot that is more than a piece of an edge, a line or a texture, at least. Chosen by hand."""
 
-ALIKE: Final = 0.64
+LIKENESS: Final = 0.64
 """Likeness of a spot to the marks around, at least, to be one of them where the lattice wants one and other
 marks are too near for the ring to tell. Chosen on pictures of eight sensors, shrunk until their marks were 3
 to 8 px apart: 0.6 finds 0.2 % more of them and 0.2 % more that are none."""
 
 MARKS_AROUND: Final = 4
 """Nearest marks that are compared with such a spot. Chosen by hand."""
-
-MOST_ROWS: Final = 12
-"""Rows by which a lattice grows. Chosen by hand."""
 
 LEAST_CLUSTER: Final = 6
 """Marks of a lattice beside a larger one, at least: four or five spots form a parallelogram by chance
@@ -99,12 +91,6 @@ was left out."""
 WINDOW: Final = 2.6
 """Radius of the discs that are compared, in radii of the marks: they hold the gaps to the neighbours, too.
 Chosen on sts_640 and sts_torque160, where glare correlates less with marks than with 1.9 radii."""
-
-LEAST_WINDOW: Final = 2.0
-"""Radius of these discs at least, px: smaller ones hold too few pixels to differ. Chosen by hand."""
-
-SAMPLES: Final = 4
-"""Samples along the radius of a disc. Chosen by hand."""
 
 
 class Group(NamedTuple):
@@ -143,9 +129,8 @@ def marks_of(gray: NDArray[np.float32], group: Group, by_scale: Mapping[float, S
 
     gray : (H, W) float32, grey levels. by_scale : the spots of the group's polarity.
     """
-    least = NEAR_STRENGTH[0] * float(np.percentile(group.spots.strength, 10))
-    near = [s for s in by_scale if 1 / MOST_SCALES <= s / group.sigma <= MOST_SCALES]
-    spots = joined(*(by_scale[s].at(by_scale[s].strength > least) for s in near))
+    least = 1 / NEAR * float(np.percentile(group.spots.strength, 10))
+    spots = joined(*(spots.at(spots.strength > least) for spots in by_scale.values()))
     larger = spots.at((spots.radius > 1.01 * group.sigma * RADIUS_PER_SIGMA) & (spots.clear > RING_CONTRAST))
     covers = np.any(_distances(larger.points, group.spots.points) < larger.radius[:, None], axis=1)
     either = joined(group.spots, larger.at(covers))
@@ -229,25 +214,17 @@ def _alike(spots: Spots) -> Spots:
 
 def _in_lattice(marks: Spots) -> Spots:
     """The marks that are part of a lattice, or stand alone on even ground."""
-    for _ in range(3):
-        if len(marks.points) < 4:
-            break
-        share, cluster = lattice.own_shares(marks.points, links(marks.points))
-        member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE)
-        strength = marks.strength / np.median(marks.strength)
-        alike = (strength > ALIKE_STRENGTH[0]) & (strength < ALIKE_STRENGTH[1])
-        kept = member | (alike & (marks.clear > ALONE))
-        if kept.all():
-            break
-        marks = marks.at(kept)
-    return marks
+    if len(marks.points) < 4:
+        return marks
+    share, cluster = lattice.own_shares(marks.points, links(marks.points))
+    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE)
+    alike = _ratio(marks.strength, np.median(marks.strength)) < ALIKE
+    return marks.at(member | (alike & (marks.clear > ALONE)))
 
 
 def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     """The marks, and spots where their lattice wants one, a row at a time."""
-    for _ in range(MOST_ROWS):
-        if len(marks.points) < MARKS_AROUND:
-            break
+    while len(marks.points) >= MARKS_AROUND:
         touching = APART * (spots.radius[:, None] + marks.radius)
         spots = spots.at(np.all(_distances(spots.points, marks.points) > touching, axis=1))
         new = _wanted(gray, marks, spots)
@@ -264,17 +241,20 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     away = _distances(wanted.points, marks.points)
     around = np.argsort(away, axis=1, kind="stable")[:, :MARKS_AROUND]
     usual = np.median(marks.radius[around], axis=1)
-    radius = wanted.radius / usual
-    strength = wanted.strength / np.median(marks.strength[around], axis=1)
-    bend = np.median(marks.bend[around], axis=1)
-    fits = (wanted.bend > LEAST_BEND * bend) & (radius > NEAR_RADIUS[0]) & (radius < NEAR_RADIUS[1])
-    fits &= (strength > NEAR_STRENGTH[0]) & (strength < NEAR_STRENGTH[1])
-    sure = (wanted.clear > CLEAR) & (strength > ALIKE_STRENGTH[0]) & (strength < ALIKE_STRENGTH[1])
+    radius = _ratio(wanted.radius, usual)
+    strength = _ratio(wanted.strength, np.median(marks.strength[around], axis=1))
+    fits = (radius < NEAR_RADIUS) & (strength < NEAR)
+    sure = (wanted.clear > CLEAR) & (strength < ALIKE)
     chosen = (wanted.clear > RING_CONTRAST) & ((support >= LEAST_SUPPORT) | sure)
     left = np.flatnonzero(fits & ~chosen)
-    chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > ALIKE
-    rank = wanted.strength * np.minimum(radius, 1 / radius)
+    chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > LIKENESS
+    rank = wanted.strength / radius
     return _apart(wanted.at(fits & chosen), rank[fits & chosen])
+
+
+def _ratio(one: Floats, other: Floats | np.float64) -> Floats:
+    """How many times larger the larger of two is, (n,)."""
+    return np.asarray(np.maximum(one / other, other / one), np.float64)
 
 
 def expected_marks(points: Floats) -> Corners:
@@ -341,7 +321,7 @@ def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: 
     count, compared = others.shape[:2]
     if not count:
         return np.zeros(0)
-    reach = np.maximum(WINDOW * radius, LEAST_WINDOW)
+    reach = WINDOW * radius
     own = _surroundings(gray, points, reach)
     theirs = _surroundings(gray, others.reshape(-1, 2), np.repeat(reach, compared))
     return np.asarray(np.einsum("np,nkp->nk", own, theirs.reshape(count, compared, -1)).mean(axis=1))
@@ -349,7 +329,7 @@ def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: 
 
 def _surroundings(gray: NDArray[np.float32], points: Floats, reach: Floats) -> Floats:
     """The levels of the discs around points (n, 2) without their mean and slope, as unit vectors (n, P)."""
-    axis = np.linspace(-1, 1, 2 * SAMPLES + 1)
+    axis = np.linspace(-1, 1, 9)
     x, y = (part.ravel() for part in np.meshgrid(axis, axis))
     inside = x * x + y * y <= 1
     x, y = x[inside], y[inside]

@@ -1,76 +1,223 @@
-"""Spots of the marks' size, anywhere in a frame."""
+"""Spots of one scale: peaks of a difference of Gaussians that differ from what lies around them."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, Literal, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats, Floats32
-from tactflow.vision.markers.detection import Detection
-from tactflow.vision.markers.scale_space import RADIUS_PER_SIGMA, blurred, find_peaks, shrunk
+from tactflow.vision.arrays import Floats
 
-LARGEST_RADIUS: Final = 2.3
-"""Radius of a mark, px, from which the frame is halved: less is needed to find it than to measure it. Chosen
-by hand."""
+SCALE_RATIO: Final = 1.6
+"""Width of the wider Gaussian of a difference of Gaussians over that of the narrower: closest to the
+Laplacian of a Gaussian (Marr and Hildreth 1980)."""
 
-LEAST_SIGMA: Final = 0.8
-"""Width of the narrower Gaussian, px, at least: below it is no filter of its own. Chosen by hand."""
+RADIUS_PER_SIGMA: Final = 1.83
+"""Radius of the disc that such a difference answers most strongly, over the narrower width. Measured on
+rendered discs of radius 2 to 12 px."""
 
-PEAK_REACH: Final = 0.7
-"""Half the side of the square in which a peak is the highest, in radii of a mark. Chosen by hand."""
+LEAST_SIGMA: Final = 0.75
+"""Smallest scale that is looked at, px: marks of radius 1.4. Chosen by hand."""
 
-MARGIN: Final = 3.0
-"""Frame around a searched window that is filtered too, in radii of a mark: the reach of the filter."""
+SIGMA_STEP: Final = 1.2
+"""Ratio of neighbouring scales. Chosen by hand."""
+
+LARGEST_MARK: Final = 1 / 16
+"""Largest scale that is looked at, over the shorter side of the image. Chosen by hand."""
+
+FULL_SIZE_SIGMA: Final = 4.0
+"""Scales from here on are looked at in a smaller picture, px: it gives the same peaks at a cost that does not
+grow."""
+
+LEAST_STRENGTH: Final = 2.0
+"""Response of a spot, grey levels, at least: below it is rounding and noise. Chosen by hand."""
+
+MOST_PEAKS: Final = 3000
+"""Peaks of one scale, the strongest ones: bounds the time on a textured picture."""
+
+RING: Final = 1.9
+"""Radius of the ring around a spot that is compared with it, in radii of the spot. Chosen by hand."""
+
+RING_POINTS: Final = 16
+"""Points of that ring. Chosen by hand."""
+
+RING_MISSES: Final = 2
+"""Points of the ring that need not differ from the spot: what touches it there. Chosen by hand."""
+
+OVERLAP: Final = 1.3
+"""Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
+
+TOUCHING: Final = 0.7
+"""The same where marks may touch, as under pressure."""
+
+BORDER_MARGIN: Final = 0.8
+"""Distance of a mark from the border of the image at least, in radii: others are cut by it."""
 
 
-class SpotFinder:
-    """Finds spots of the marks' size: peaks of a difference of Gaussians at low resolution.
+class Spots(NamedTuple):
+    """Spots of some size.
 
-    reference : (H, W) uint8, grey levels of the untouched gel. detection : its marks.
+    points : (N, 2) float64, px. radius : (N,) float64, of discs of that scale, px. strength : (N,) float64,
+    response, grey levels. clear : (N,) float64, least contrast with the ring around over the median, at most
+    1; 1 is a spot alone on even ground. bend : (N,) float64, how fast the response falls in the direction
+    in which it falls least, grey levels per squared scale.
+    """
+
+    points: Floats
+    radius: Floats
+    strength: Floats
+    clear: Floats
+    bend: Floats
+
+    def at(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> Spots:
+        """Some of the spots, by their numbers or by (N,) bool."""
+        return Spots(*(values[which] for values in self))
+
+
+def joined(*parts: Spots) -> Spots:
+    """All spots of several."""
+    return Spots(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def sigmas(dot_radius: float | None, shortest: int) -> list[float]:
+    """Scales to look at, px: of one radius, or of all that fit a picture of that shorter side."""
+    if dot_radius is not None:
+        return [dot_radius / RADIUS_PER_SIGMA]
+    largest = max(SIGMA_STEP, shortest * LARGEST_MARK)
+    count = 1 + int(np.floor(np.log(largest / LEAST_SIGMA) / np.log(SIGMA_STEP)))
+    return [LEAST_SIGMA * SIGMA_STEP**step for step in range(count)]
+
+
+def find_spots(
+    gray: NDArray[np.float32],
+    sigma: float,
+    polarity: Literal["dark", "bright"],
+    valid: NDArray[np.uint8] | None = None,
+) -> Spots:
+    """Spots of one scale and polarity, strongest first, without those that the border cuts.
+
+    Edges and lines also answer to a difference of Gaussians, but are as dark along themselves: `clear` tells
+    whether a spot differs from (almost) the whole ring around it, `bend` whether it is part of no line.
+
+    gray : (H, W) float32, grey levels. sigma : px. valid : (H, W) uint8, not 0 where there is gel.
 
     References
     ----------
-    Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60 (2004).
+    Lindeberg, "Feature detection with automatic scale selection", IJCV 30 (1998); Lowe, "Distinctive image
+    features from scale-invariant keypoints", IJCV 60 (2004), for the difference of Gaussians.
     """
+    factor, smooth, response = _respond(gray, sigma, polarity)
+    fine, radius = sigma / factor, sigma * RADIUS_PER_SIGMA
+    # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
+    peaks, strength = _peaks(response, LEAST_STRENGTH, OVERLAP * radius / factor)
+    strongest = np.argsort(-strength, kind="stable")[:MOST_PEAKS]
+    peaks, strength = peaks[strongest], strength[strongest]
+    clear = _clearance(smooth, peaks, radius / factor)
+    points = peaks * factor + (factor - 1) / 2
+    spots = Spots(points, np.full(len(points), radius), strength, clear, fine**2 * _bend(response, peaks))
+    margin, (height, width) = BORDER_MARGIN * radius, gray.shape
+    inside = ((points >= margin) & (points <= np.array([width, height]) - 1 - margin)).all(axis=1)
+    spots = spots.at(np.flatnonzero(inside))
+    return spots if valid is None else spots.at(_on_gel(valid, spots.points, radius))
 
-    def __init__(self, reference: NDArray[np.uint8], detection: Detection) -> None:
-        self._factor = 1
-        while detection.dot_radius / self._factor >= LARGEST_RADIUS:
-            self._factor *= 2
-        radius = detection.dot_radius / self._factor
-        self._sigma = max(radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
-        self._dark = detection.polarity == "dark"
-        self._reach = max(1, round(PEAK_REACH * radius))
-        self._margin = MARGIN * detection.dot_radius + 2 * self._factor
-        response = self._response(reference)
-        shrunk = (detection.centers - (self._factor - 1) / 2) / self._factor
-        limits = np.array([response.shape[1] - 1, response.shape[0] - 1])
-        column, row = np.clip(np.rint(shrunk).astype(np.int64), 0, limits).T
-        self._typical = max(float(np.median(response[row, column])), 1.0)
 
-    def find(
-        self, image: NDArray[np.uint8], least: float, low: Floats, high: Floats
-    ) -> tuple[Floats, Floats]:
-        """Spots between two corners.
+def find_peaks(
+    gray: NDArray[np.float32], sigma: float, polarity: Literal["dark", "bright"], least: float
+) -> tuple[Floats, Floats]:
+    """Peaks (M, 2) float64, px, of at least that response, whatever lies around them, and their responses.
 
-        image : (H, W, 3) uint8 BGR or (H, W) uint8. least : strength of a spot, 1 for a
-        typical mark. low, high : (2,), corners of the window, px.
-        Returns spots (M, 2) float64, px, and their strengths (M,) float64.
-        """
-        factor = self._factor
-        left, top = (max(int((side - self._margin) // factor) * factor, 0) for side in low.tolist())
-        right, bottom = (max(int(side + self._margin), 0) for side in high.tolist())
-        image = image[top:bottom, left:right]
-        if min(image.shape[:2]) < 3 * factor:
-            return np.zeros((0, 2)), np.zeros(0)
-        gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-        points, strength = find_peaks(self._response(gray), least * self._typical, self._reach)
-        return points * factor + ((factor - 1) / 2 + left, (factor - 1) / 2 + top), strength / self._typical
+    gray : (H, W) float32, grey levels. sigma : px. least : grey levels. Returns (M, 2), (M,) float64.
+    """
+    factor, _, response = _respond(gray, sigma, polarity)
+    peaks, strength = _peaks(response, least, TOUCHING * RADIUS_PER_SIGMA * sigma / factor)
+    return peaks * factor + (factor - 1) / 2, strength
 
-    def _response(self, gray: NDArray[np.uint8]) -> Floats32:
-        """Difference of Gaussians at low resolution, positive on marks."""
-        narrow, wide = blurred(shrunk(gray, self._factor).astype(np.float32), self._sigma)
-        return np.asarray(wide - narrow if self._dark else narrow - wide, np.float32)
+
+def _respond(
+    gray: NDArray[np.float32], sigma: float, polarity: Literal["dark", "bright"]
+) -> tuple[int, NDArray[np.float32], NDArray[np.float32]]:
+    """By which factor the picture is shrunk; the shrunk picture at the scale, with dark marks; and its
+    difference of Gaussians, positive on marks."""
+    factor = 1
+    while sigma >= factor * FULL_SIZE_SIGMA:
+        factor *= 2
+    height, width = gray.shape[0] // factor, gray.shape[1] // factor
+    if factor > 1:
+        whole = gray[: height * factor, : width * factor]
+        gray = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    fine = sigma / factor
+    narrow = cv2.GaussianBlur(gray, (0, 0), fine, borderType=cv2.BORDER_REPLICATE)
+    step = fine * float(np.sqrt(SCALE_RATIO**2 - 1.0))
+    wide = cv2.GaussianBlur(narrow, (0, 0), step, borderType=cv2.BORDER_REPLICATE)
+    sign = np.float32(1 if polarity == "dark" else -1)
+    return factor, np.asarray(sign * narrow), np.asarray(sign * (wide - narrow))
+
+
+def _peaks(response: NDArray[np.float32], least: float, reach: float) -> tuple[Floats, Floats]:
+    """Pixels above `least` that are the highest in a square that extends `reach` px from them, at least one.
+
+    Returns (M, 2) float64, each the vertex of a parabola along each axis, at most half a pixel away, and the
+    response (M,) float64.
+    """
+    side = 2 * max(1, round(reach)) + 1
+    highest = cv2.dilate(response, np.ones((side, side), np.uint8))
+    peak = (response >= highest) & (response > np.float32(least))
+    peak[[0, -1]] = False
+    peak[:, [0, -1]] = False
+    rows, columns = np.nonzero(peak)
+    value = response[rows, columns].astype(np.float64)
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    for axis, (step_y, step_x) in enumerate(((0, 1), (1, 0))):
+        before = response[rows - step_y, columns - step_x]
+        after = response[rows + step_y, columns + step_x]
+        bend = np.minimum(before + after - 2 * value, -1e-6)
+        points[:, axis] += np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+    return points, value
+
+
+def _bend(response: NDArray[np.float32], peaks: Floats) -> Floats:
+    """How fast the response falls from its peaks (N, 2), px, where it falls least: (N,), grey levels per px².
+
+    It is the lesser eigenvalue of minus the matrix of second derivatives, and 0 along an edge or a line.
+    """
+    limits = np.array([response.shape[1] - 2, response.shape[0] - 2])
+    columns, rows = np.clip(np.rint(peaks).astype(np.int64), 1, limits).T
+
+    def at(down: int, right: int) -> Floats:
+        return np.asarray(response[rows + down, columns + right], np.float64)
+
+    peak = 2 * at(0, 0)
+    across, down = peak - at(0, -1) - at(0, 1), peak - at(-1, 0) - at(1, 0)
+    mixed = (at(-1, -1) + at(1, 1) - at(-1, 1) - at(1, -1)) / 4
+    return np.asarray((across + down - np.hypot(across - down, 2 * mixed)) / 2, np.float64)
+
+
+def _clearance(smooth: NDArray[np.float32], peaks: Floats, radius: float) -> Floats:
+    """Contrast of dark peaks with all but `RING_MISSES` points of the ring around, over the median one."""
+    if len(peaks) == 0:
+        return np.zeros(0)
+    angles = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
+    ring = peaks[:, None] + RING * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    limits = np.array([smooth.shape[1] - 1, smooth.shape[0] - 1])
+    ring = np.rint(ring).astype(np.int64)
+    column, row = np.clip(ring, 0, limits).transpose(2, 0, 1)
+    own_column, own_row = np.clip(np.rint(peaks).astype(np.int64), 0, limits).T
+    above = smooth[row, column] - smooth[own_row, own_column][:, None]
+    # What the ring meets beyond the border is not known, and says nothing.
+    inside = ((ring >= 0) & (ring <= limits)).all(axis=2)
+    above = np.sort(np.where(inside, above, np.float32(np.inf)), axis=1)
+    half = np.maximum(inside.sum(axis=1) // 2, RING_MISSES)
+    median = np.take_along_axis(above, half[:, None], axis=1)[:, 0]
+    median = np.where(np.isfinite(median), median, 0.0)
+    return np.asarray(np.where(median > 0, above[:, RING_MISSES] / np.maximum(median, 1e-3), 0.0), np.float64)
+
+
+def _on_gel(valid: NDArray[np.uint8], points: Floats, radius: float) -> NDArray[np.bool_]:
+    """Which points have gel in at least half of the square around them."""
+    side = 2 * round(RING * radius) + 1
+    share = cv2.boxFilter((valid > 0).astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE)
+    limits = np.array([valid.shape[1] - 1, valid.shape[0] - 1])
+    column, row = np.clip(np.rint(points).astype(np.int64), 0, limits).T
+    return np.asarray(share[row, column] >= 0.5)

@@ -111,20 +111,22 @@ class MarkerTemplates:
         grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
         disc = np.hypot(grid_x, grid_y) <= extent
         pixels, count = int(disc.sum()), len(origin)
-        steps = ((np.arange(PHASES) + 0.5) / PHASES - 0.5).tolist()
         # Of 16 bits, since reading the weights of all marks is what takes most of the time.
         weights = np.empty((PHASES, PHASES, count, 5, pixels), np.int16)
         terms = np.empty((PHASES, PHASES, count, 15), np.float32)
-        sampler = _Sampler(reference, origin, reach, disc)
         scaled = np.array([grid_x[disc], grid_y[disc]]) / radius
-        for row, phase_y in enumerate(steps):
-            for column, phase_x in enumerate(steps):
-                model = _normal_equations(*sampler.with_slopes(phase_x, phase_y), scaled, dark)
-                unit = np.maximum(np.abs(model[0]).max(axis=2), np.finfo(np.float32).tiny) / LARGEST_LEVEL
-                weights[row, column] = np.rint(model[0] / unit[:, :, None])
-                terms[row, column, :, 10:] = unit
-                terms[row, column, :, :9] = model[1].reshape(count, 9)
-                terms[row, column, :, 9] = model[2] / max(pixels - 6, 1)
+        # From one phase before the first to one after the last, for the slopes.
+        steps = (np.arange(-1, PHASES + 1) + 0.5) / PHASES - 0.5
+        shifted = [[_interpolate(reference, origin - (x, y), reach)[:, disc] for x in steps] for y in steps]
+        for y, x in np.ndindex(PHASES, PHASES):
+            slope_x = (shifted[y + 1][x + 2] - shifted[y + 1][x]) * (PHASES / 2)
+            slope_y = (shifted[y + 2][x + 1] - shifted[y][x + 1]) * (PHASES / 2)
+            model = _normal_equations(shifted[y + 1][x + 1], slope_x, slope_y, scaled, dark)
+            unit = np.maximum(np.abs(model[0]).max(axis=2), np.finfo(np.float32).tiny) / LARGEST_LEVEL
+            weights[y, x] = np.rint(model[0] / unit[:, :, None])
+            terms[y, x, :, 10:] = unit
+            terms[y, x, :, :9] = model[1].reshape(count, 9)
+            terms[y, x, :, 9] = model[2] / max(pixels - 6, 1)
         self._all = np.arange(count)
         self._weights = weights.reshape(PHASES * PHASES * count, 5, pixels)
         self._terms = terms.reshape(PHASES * PHASES * count, 15)
@@ -184,29 +186,6 @@ class TemplateGroups:
                 for whole, values in zip(found, part, strict=True):
                     whole[those] = values
         return Alignment(*found)
-
-
-class _Sampler:
-    """Templates at sub-pixel shifts, each interpolated once. Shifts are binary fractions, so most serve as
-    the template of one phase and as neighbours, for the slope, of others."""
-
-    def __init__(self, reference: Floats32, origin: Floats, reach: int, disc: NDArray[np.bool_]) -> None:
-        self._reference, self._origin, self._reach, self._disc = reference, origin, reach, disc
-        self._known: dict[tuple[float, float], Floats] = {}
-
-    def at(self, right: float, down: float) -> Floats:
-        """(N, p) float64, templates of marks that lie so far right of and below a pixel's centre, px."""
-        if (right, down) not in self._known:
-            patches = _interpolate(self._reference, self._origin - (right, down), self._reach)
-            self._known[right, down] = patches[:, self._disc]
-        return self._known[right, down]
-
-    def with_slopes(self, right: float, down: float) -> tuple[Floats, Floats, Floats]:
-        """The template, and its central differences along x and y over the phases on either side."""
-        half = 1 / PHASES
-        slope_x = (self.at(right + half, down) - self.at(right - half, down)) / (2 * half)
-        slope_y = (self.at(right, down + half) - self.at(right, down - half)) / (2 * half)
-        return self.at(right, down), slope_x, slope_y
 
 
 def _normal_equations(

@@ -20,11 +20,10 @@ from tactflow.vision.markers.detection import (
     require_image,
     to_gray,
 )
-from tactflow.vision.markers.interpolation import Interpolator
-from tactflow.vision.markers.matching import REACH, MarkerGraph, common_displacement, grow
+from tactflow.vision.markers.matching import REACH, Interpolator, MarkerGraph, common_displacement, grow
 from tactflow.vision.markers.motion import MotionEvidence
-from tactflow.vision.markers.selection import expected_marks
-from tactflow.vision.markers.spots import SpotFinder
+from tactflow.vision.markers.selection import LEAST_STRENGTH, expected_marks
+from tactflow.vision.markers.spots import LEAST_SIGMA, RADIUS_PER_SIGMA, find_peaks
 from tactflow.vision.markers.template import Alignment, TemplateGroups
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -46,22 +45,11 @@ SEARCH_INTERVAL: Final = 10
 MAX_DISPLACEMENT: Final = 1.3
 """Farthest a mark goes between two frames unless said otherwise, pitches. Chosen by hand."""
 
-BORDER_SEEN: Final = 0.85
-"""Fraction of the marks at the grid's border below which a jump of the whole grid is looked for. Chosen by
-hand."""
-
-HALF_PITCH: Final = 0.5
-"""Displacement of a grid, pitches, from which on it might be a pitch off; and distance from all marks from
-which on a spot is another one."""
-
 REST: Final = 0.1
 """Distance of a mark from its rest within which it rests, pitches. Chosen by hand."""
 
 WHOLE: Final = 0.95
 """Fraction of the marks of a grid that rest and are seen, beyond which the grid rests. Chosen by hand."""
-
-SPOT_STRENGTH: Final = 0.25
-"""Strength of a spot that may be a mark, against a typical one. Chosen by hand."""
 
 SAME_SPOT: Final = 0.3
 """Distance within which a mark is at a spot, pitches. Chosen by hand."""
@@ -157,7 +145,10 @@ class MarkerTracker:
         if len(grays) > 1:
             self._origin = refine_centers(mean if dark else 255 - mean, self._origin, self._radius)
         self._templates = TemplateGroups(mean, self._origin, _radii(detection), dark)
-        self._spots = SpotFinder(np.rint(mean).astype(np.uint8), detection)
+        self._sigma = max(self._radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
+        peaks, strength = find_peaks(mean, self._sigma, self._polarity, 0.0)
+        usual = strength[KDTree(peaks).query(self._origin)[1]] if len(peaks) else np.ones(1)
+        self._least = LEAST_STRENGTH * float(np.median(usual))
         self._know(self._origin, detection.edges)
         self.reset()
 
@@ -240,7 +231,7 @@ class MarkerTracker:
         joins = (found.probability > JOINING_PROBABILITY) & (
             lattice.support(found.centers, expected_marks(self._position)) > 0
         )
-        joins &= _are_apart(found.centers, self._position, HALF_PITCH * self._pitch)
+        joins &= _are_apart(found.centers, self._position, self._pitch / 2)
         if not joins.any():
             return False
         centers, known = found.centers[joins], np.arange(self._count + int(joins.sum())) < self._count
@@ -269,20 +260,19 @@ class MarkerTracker:
 
     def _search(self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats) -> _Result:
         """Spots for the marks outside the largest smooth component of the field."""
-        jumped = self._jumps(image, seen)
-        if jumped is not None:
-            found = self._templates.align(image, jumped)
-            found.gain[self._left] = 0
-            seen = trusted(found.gain, found.r_squared)
-            strain = self._graph.strain(found.position)
-        inliers = self._graph.largest_component(seen, strain)
+        gray = to_gray(image).astype(np.float32)
+        spots, _ = find_peaks(gray, self._sigma, self._polarity, self._least)
+        found, inliers = self._best_start(image, found, seen, strain, spots)
         result = _Result(found.position.copy(), inliers.copy(), found.stderr.copy())
         result.position[~inliers] = self._position[~inliers]
         settled = inliers.copy()
         settled[self._left] = True
         if settled.all():
             return result
-        spots = self._candidates(image, found, inliers, seen & ~inliers)
+        # Where a mark is seen without being an inlier is a spot like any other.
+        own = found.position[trusted(found.gain, found.r_squared) & ~inliers]
+        spots = np.concatenate([spots, own[_are_apart(own, spots, SAME_SPOT * self._pitch)]])
+        spots = spots[_are_apart(spots, found.position[inliers], SAME_SPOT * self._pitch)]
         reach = np.minimum(REACH * self._apart, self._farthest)
         marks, chosen = grow(result.position, inliers, spots, self._interpolator, reach)
         marks, chosen = marks[~settled[marks]], chosen[~settled[marks]]
@@ -292,54 +282,37 @@ class MarkerTracker:
             result.found[marks] = trusted(aligned.gain, aligned.r_squared)
         return result
 
-    def _jumps(self, image: NDArray[np.uint8], seen: Flags) -> Floats | None:
-        """Where the marks (N, 2) are, px, if a whole grid jumped; None if none.
+    def _best_start(
+        self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats, spots: Floats
+    ) -> tuple[Alignment, Flags]:
+        """Alignment of the marks and its inliers, the largest smooth component of those seen, (N,).
 
-        A grid apart from the others that is off by a pitch is as smooth as before. What tells is its border,
-        where a row of marks is missing on one side, and that more of it is seen at its rest.
+        A grid that jumped by a pitch, or was let go from afar, is as smooth as before where it is not: what
+        tells is how many of its marks are there. So each grid begins where most of its marks are inliers:
+        where it was last, at its rest, or displaced by what most pairs of a mark and a spot say.
         """
-        border, spots, jumped = self._graph.border, None, self._position.copy()
+        inliers = self._graph.largest_component(seen, strain)
+        if seen.all():
+            return found, inliers
+        jumped = self._position.copy()
         for grid in self._graph.grids:
-            if seen[grid].all():
-                continue
-            if self._is_at_rest(image, grid, seen):
-                jumped[grid] = self._origin[grid]
-            elif np.count_nonzero((border & seen)[grid]) < BORDER_SEEN * np.count_nonzero(border[grid]):
-                if spots is None:
-                    corner = np.array(self._shape[::-1], float)
-                    spots, _ = self._spots.find(image, SPOT_STRENGTH, np.zeros(2), corner)
-                start = self._position[grid]
-                jump = common_displacement(start, spots, pitch=self._pitch, farthest=self._farthest)
-                if jump is not None:
-                    jumped[grid] += jump
-        return jumped if (jumped != self._position).any() else None
-
-    def _is_at_rest(self, image: NDArray[np.uint8], grid: Indices, seen: Flags) -> bool:
-        """Whether a grid that was half a pitch away or farther is seen whole, and better, where it rests."""
-        moved = _median(self._position[grid] - self._origin[grid])
-        if np.hypot(*moved) < HALF_PITCH * self._pitch:
-            return False
-        found = self._templates.align(image, self._origin[grid], grid)
-        near = _lengths(found.position - self._origin[grid]) < REST * self._pitch
-        there = int(np.count_nonzero(trusted(found.gain, found.r_squared) & near))
-        return there > int(np.count_nonzero(seen[grid])) and there > WHOLE * len(grid)
-
-    def _candidates(
-        self, image: NDArray[np.uint8], found: Alignment, inliers: Flags, outliers: Flags
-    ) -> Floats:
-        """Spots (M, 2), px, around the marks that no inlier is at.
-
-        outliers : (N,), marks that are seen without being inliers; where they are is a spot like any other.
-        """
-        around = self._position.copy()
-        self._infer(around, inliers)
-        expected = np.concatenate([self._position[~inliers], around[~inliers]])
-        low, high = expected.min(axis=0) - self._farthest, expected.max(axis=0) + self._farthest
-        spots, _ = self._spots.find(image, SPOT_STRENGTH, low, high)
-        own = np.flatnonzero(outliers)
-        own = own[_are_apart(found.position[own], spots, SAME_SPOT * self._pitch)]
-        spots = np.concatenate([spots, found.position[own]])
-        return spots[_are_apart(spots, found.position[inliers], SAME_SPOT * self._pitch)]
+            jumped[grid] += common_displacement(jumped[grid], spots, self._pitch, self._farthest)
+        for start in (self._origin, jumped):
+            other = self._templates.align(image, start)
+            other.gain[self._left] = 0
+            seen = trusted(other.gain, other.r_squared)
+            there = self._graph.largest_component(seen, self._graph.strain(other.position))
+            better = np.zeros(self._count, np.bool_)
+            for grid in self._graph.grids:
+                better[grid] = np.count_nonzero(there[grid]) > np.count_nonzero(inliers[grid])
+            inliers = np.where(better, there, inliers)
+            found = Alignment(
+                np.where(better[:, None], other.position, found.position),
+                np.where(better, other.gain, found.gain),
+                np.where(better, other.r_squared, found.r_squared),
+                np.where(better, other.stderr, found.stderr),
+            )
+        return found, inliers
 
     def _infer(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that were not found, in place, and return those; others stay where they were."""
@@ -369,23 +342,11 @@ def _probability(log_odds: Floats) -> Floats:
     return np.asarray(1 / (1 + np.exp(-log_odds)), np.float64)
 
 
-def _median(vectors: Floats) -> Floats:
-    """Of each coordinate, (2,); zero for none. A fifth of the time of `np.median` for a hundred vectors."""
-    if len(vectors) == 0:
-        return np.zeros(2)
-    ordered = np.sort(vectors, axis=0)
-    return np.asarray((ordered[(len(vectors) - 1) // 2] + ordered[len(vectors) // 2]) / 2, np.float64)
-
-
 def _are_apart(points: Floats, others: Floats, distance: float) -> Flags:
     """(n,) which points (n, 2) are farther than a distance, px, from all others (m, 2)."""
     if not (len(points) and len(others)):
         return np.ones(len(points), bool)
     return np.asarray(KDTree(others).query(points)[0] > distance)
-
-
-def _lengths(vectors: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)), np.float64)
 
 
 def trusted(gain: Any, r_squared: Any) -> Any:

@@ -17,16 +17,19 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from tactflow.vision.arrays import Floats, Indices
+from tactflow.vision.arrays import Floats, Floats32, Indices
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.pose.imprint import BLOCKS, PATCH, Imprint, Template
 from tactflow.vision.pose.rigid import rigid, vector
 
 STEPS: Final = 12
 """Steps of Gauss-Newton at most."""
-CONVERGED: Final = 0.1
+CONVERGED: Final = 0.3
 """Length of a step after which it ends, in standard errors."""
 FREE: Final = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
 """Standard deviation of a motion of which nothing is seen, mm and radians."""
+PRIOR: Final = np.diag(FREE**-2.0)
+"""Information on the motion before anything is seen."""
 NORMAL_NOISE: Final = 0.02
 """Standard deviation of what is common to the normals of a patch, 1 degree: weighs the parts before residuals
 are known. Normals on other sensors of a kind err by 1 to 4 degrees, most of it alike in both imprints."""
@@ -124,35 +127,32 @@ def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> A
         found.shown * template.every / now.area,
         misfit,
         math.sqrt(misfit / (2 * total)),
-        math.sqrt(template.normals.var(axis=0).mean()),
+        template.signal,
     )
 
 
 def _compared(template: Template, now: Imprint, motion: Floats, gel: Gel | None) -> _Comparison | None:
     """Both imprints at a motion; None where they do not overlap."""
-    turn, shift = motion[:3, :3], motion[:3, 3]
-    moved = template.points @ turn.T + shift
-    planes = now.at(moved[:, :2] + template.center[:2])
-    share = template.weights * planes[:, 3]
-    shown = int(np.count_nonzero(share))
+    count = len(template.points)
+    error, weight = np.zeros((count, 2)), np.zeros(count)
+    by_normals, gradient, height, totals = np.zeros((6, 6)), np.zeros(6), np.zeros(8), np.zeros(3)
+    first = now.first - template.center[:2]
+    compare_points(
+        now.planes, first, now.cell, motion, template.points, template.by, template.center[2],
+        error, weight, by_normals, gradient, height, totals,
+    )  # fmt: skip
+    shown = int(totals[0])
     if shown < FEWEST:
         return None
-    share /= share.sum()
-    normals = planes[:, :3].copy()
-    normals[:, 2] = np.sqrt(1 - (planes[:, :2] ** 2).sum(axis=1))
-    error = normals @ turn[:, :2] - template.normals
     patches = min(BLOCKS**2, shown * template.every / PATCH**2)
-    weight = share * (patches / NORMAL_NOISE**2)
-    by, weights = template.by_normal, np.repeat(weight, 2)
-    by_normals = (by.T * weights) @ by
+    unit = patches / (NORMAL_NOISE**2 * totals[1])
+    weight *= unit
+    by_normals *= unit
     free = vector(motion)
-    information, gradient = (
-        by_normals + np.diag(FREE**-2.0),
-        by.T @ (weights * error.ravel()) + free / FREE**2,
-    )
-    cost = float(weights @ error.ravel() ** 2 + np.sum((free / FREE) ** 2))
-    moved[:, 2] = planes[:, 2] - template.center[2]
-    parts = [_height_part(template, share, moved - shift, turn, now.error)]
+    information = by_normals + PRIOR
+    gradient = unit * gradient + PRIOR @ free
+    cost = unit * totals[2] + float(free @ PRIOR @ free)
+    parts = [_height_part(height / totals[1], now.error)]
     parts += [] if gel is None else [_gel_part(template, now, gel, motion)]
     for part in parts:
         weighted = part.by.T * part.weight
@@ -162,14 +162,84 @@ def _compared(template: Template, now: Imprint, motion: Floats, gel: Gel | None)
     return _Comparison(shown, error, weight, by_normals, information, gradient, cost / 2)
 
 
-def _height_part(template: Template, share: Floats, seen: Floats, turn: Floats, relative: float) -> _Part:
-    """The mean height. seen : (N, 3), the points as now seen, before they are turned back. relative : error
-    of all heights."""
-    before = template.points[:, 2]
-    error = share @ (seen @ turn[:, 2] - before)
-    sunk = share @ (seen[:, 2] - before)
-    variance = HEIGHT_NOISE**2 + (relative * sunk) ** 2
-    return _Part((share @ template.by_height)[None], np.array([error]), np.array([1 / variance]))
+@kernel(
+    "void(float32[:, :, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], "
+    "float64[:, :, ::1], float64, float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], "
+    "float64[::1], float64[::1])"
+)
+def compare_points(
+    planes: Floats32,
+    first: Floats,
+    cell: Floats,
+    motion: Floats,
+    points: Floats,
+    by: Floats,
+    middle: float,
+    error: Floats,
+    weight: Floats,
+    information: Floats,
+    gradient: Floats,
+    height: Floats,
+    totals: Floats,
+) -> None:
+    """Compare an imprint with the points of a template at a motion (4, 4).
+
+    planes, cell : of the imprint. first : (2,), its first cell from the centre of the template, mm. points,
+    by : of the template. middle : height of its centre, mm.
+    error : (N, 2) of 0, filled: of the normals. weight : (N,) of 0, filled. Both stay 0 where the imprint
+        does not show a point.
+    information, gradient, height, totals : (6, 6), (6,), (8,) and (3,) of 0, to which sums over weighted
+        points are added: of the normals; of the derivatives of the height, of its error, and of how far
+        points have sunk; how many points are shown, their weights, the squares of the normals' errors.
+    """
+    seen = np.empty(4)
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        moved_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z
+        moved_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z
+        column = (moved_x + motion[0, 3] - first[0]) / cell[0]
+        row = (moved_y + motion[1, 3] - first[1]) / cell[1]
+        if not (0 <= column < planes.shape[1] - 1 and 0 <= row < planes.shape[0] - 1):
+            continue
+        _interpolate(planes, column, row, seen)
+        share = points[n, 5] * seen[3]
+        if share <= 0:
+            continue
+        upright = math.sqrt(max(1 - seen[0] * seen[0] - seen[1] * seen[1], 0.0))
+        for k in range(2):
+            back = motion[0, k] * seen[0] + motion[1, k] * seen[1] + motion[2, k] * upright
+            error[n, k] = back - points[n, 3 + k]
+            totals[2] += share * error[n, k] * error[n, k]
+            for i in range(6):
+                weighted = share * by[n, k, i]
+                gradient[i] += weighted * error[n, k]
+                for j in range(6):
+                    information[i, j] += weighted * by[n, k, j]
+        depth = seen[2] - middle - motion[2, 3]
+        for i in range(6):
+            height[i] += share * by[n, 2, i]
+        height[6] += share * (motion[0, 2] * moved_x + motion[1, 2] * moved_y + motion[2, 2] * depth - z)
+        height[7] += share * (depth - z)
+        weight[n] = share
+        totals[0] += 1
+        totals[1] += share
+
+
+@helper
+def _interpolate(planes: Floats32, column: float, row: float, values: Floats) -> None:
+    """Fill values (4,) with those of the planes between four cells, bilinearly."""
+    left, top = int(column), int(row)
+    right, low = column - left, row - top
+    for k in range(4):
+        above = (1 - right) * planes[top, left, k] + right * planes[top, left + 1, k]
+        below = (1 - right) * planes[top + 1, left, k] + right * planes[top + 1, left + 1, k]
+        values[k] = (1 - low) * above + low * below
+
+
+def _height_part(mean: Floats, relative: float) -> _Part:
+    """The mean height. mean : (8,), `height` of `compare_points`. relative : error of all heights."""
+    variance = HEIGHT_NOISE**2 + (relative * mean[7]) ** 2
+    return _Part(mean[None, :6], mean[6:7], np.array([1 / variance]))
 
 
 def _gel_part(template: Template, now: Imprint, gel: Gel, motion: Floats) -> _Part:

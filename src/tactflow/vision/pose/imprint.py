@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import cv2
@@ -47,12 +48,6 @@ class Imprint(NamedTuple):
     height: float
     error: float
 
-    def at(self, points: Floats) -> Floats:
-        """(N, 4): the planes at points (N, 2), mm; weight 0 outside."""
-        places = ((points - self.first) / self.cell).astype(np.float32)
-        x, y = np.ascontiguousarray(places.T[:, :, None])
-        return cv2.remap(self.planes, x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
-
 
 def imprint_of(heights: Floats32, mask: Mask, scale: Scale, error: float) -> Imprint | None:
     """The imprint in a frame; None without a cell in contact.
@@ -72,13 +67,12 @@ def imprint_of(heights: Floats32, mask: Mask, scale: Scale, error: float) -> Imp
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 3)[1:-1, 1:-1]
     cell = np.array([scale.x, scale.y]) * STEP
     depth = np.asarray(cv2.resize(heights[part], size, interpolation=cv2.INTER_AREA), np.float32)
-    slope = _gradient(depth, cell)
-    planes = np.empty((rows, columns, 4), np.float32)
-    planes[..., :2] = slope / np.sqrt(np.sum(slope * slope, axis=2, keepdims=True) + 1)
-    planes[..., 2] = -depth
+    across, down = _gradient(depth, cell)
+    length = np.sqrt(across * across + down * down + 1)
     clings = np.clip(depth / max(LEAVES * float(depth.max()), 1e-9) - 1, 0, 1)
-    planes[..., 3] = np.clip((distance - 1) / RIM, 0, 1) ** 2 * clings
-    area = int(np.count_nonzero(planes[..., 3]))
+    weight = np.clip((distance - 1) / RIM, 0, 1) ** 2 * clings
+    planes = np.asarray(cv2.merge((across / length, down / length, -depth, weight)), np.float32)
+    area = int(np.count_nonzero(weight))
     middle = (STEP - 1) / 2
     first = np.array(scale.point((left + middle, top + middle)))
     if not area:
@@ -87,22 +81,23 @@ def imprint_of(heights: Floats32, mask: Mask, scale: Scale, error: float) -> Imp
     return Imprint(planes, first, cell, area, -float(sunk), error)
 
 
-def _gradient(values: Floats32, cell: Floats) -> Floats32:
-    """(h, w, 2): change of values (h, w) to the right and down, per mm."""
+def _gradient(values: Floats32, cell: Floats) -> tuple[Floats32, Floats32]:
+    """Change of values (h, w) to the right and down, per mm, (h, w) each."""
     scale = 1 / (8 * cell)
     border = cv2.BORDER_REPLICATE
     across = cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=scale[0], borderType=border)
     down = cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=scale[1], borderType=border)
-    return np.asarray(np.stack([across, down], axis=2), np.float32)
+    return np.asarray(across, np.float32), np.asarray(down, np.float32)
 
 
 class Template(NamedTuple):
     """An imprint that others are compared with; lengths in mm from `center`.
 
     imprint : it. center : (3,), mean of its points. every : cells per point.
-    points : (N, 3). normals : (N, 2), x and y. weights : (N,). blocks : (N,), the patch of each point.
-    by_normal : (2 N, 6), by_height : (N, 6): by how much a small motion of the object changes what is seen
-        of each point: x and y of its normal, and the height.
+    points : (N, 6): where each is, x and y of its normal, its weight. blocks : (N,), the patch of each.
+    by : (N, 3, 6): by how much a small motion of the object changes what is seen of each point: x and y of
+        its normal, and the height.
+    signal : standard deviation of x and y of the normals.
     levers : (6, 6), mean square of how far a small motion moves the points along the gel.
     """
 
@@ -110,11 +105,9 @@ class Template(NamedTuple):
     center: Floats
     every: int
     points: Floats
-    normals: Floats
-    weights: Floats
     blocks: Indices
-    by_normal: Floats
-    by_height: Floats
+    by: Floats
+    signal: float
     levers: Floats
 
 
@@ -133,19 +126,18 @@ def template_of(imprint: Imprint) -> Template:
     moved[:, :3] = np.eye(3)
     moved[:, 3:] = skew(points)
     along = moved[..., :2]
-    by_normal = np.empty((len(rows), 2, 6))
+    by = np.empty((len(rows), 3, 6))
     for axis in (0, 1):
-        gradient = _gradient(np.ascontiguousarray(planes[..., axis]), cell)[rows, columns]
-        by_normal[:, axis] = (along @ gradient[..., None])[..., 0]
-    by_normal[..., 3:] -= skew(normals)[..., :2].swapaxes(1, 2)
-    by_height = (along @ (-normals[:, :2] / normals[:, 2:])[..., None])[..., 0] - moved[..., 2]
+        gradient = _gradient(np.ascontiguousarray(planes[..., axis]), cell)
+        by[:, axis] = sum(along[..., k] * gradient[k][rows, columns, None] for k in (0, 1))
+    by[:, :2, 3:] -= skew(normals)[..., :2].swapaxes(1, 2)
+    by[:, 2] = (along @ (-normals[:, :2] / normals[:, 2:])[..., None])[..., 0] - moved[..., 2]
     weighted = along.swapaxes(1, 2).reshape(-1, 6)
     levers = (weighted.T * np.repeat(weights / weights.sum(), 2)) @ weighted
     blocks = _part(rows) * BLOCKS + _part(columns)
-    seen = normals[:, :2].copy()
-    return Template(
-        imprint, center, every, points, seen, weights, blocks, by_normal.reshape(-1, 6), by_height, levers
-    )  # fmt: skip
+    signal = math.sqrt(normals[:, :2].var(axis=0).mean())
+    table = np.column_stack([points, normals[:, :2], weights])
+    return Template(imprint, center, every, table, blocks, by, signal, levers)
 
 
 def _part(places: Indices) -> Indices:

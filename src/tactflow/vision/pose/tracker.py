@@ -76,6 +76,7 @@ class PoseTracker:
     def __init__(self, scale: Scale) -> None:
         self._scale = scale
         self._mm = np.array([scale.x, scale.y])
+        self._relative = np.array(scale.stderr) / self._mm
         self.reset()
 
     def reset(self) -> None:
@@ -190,10 +191,10 @@ class PoseTracker:
 
     def _pose(self, status: Literal["tracked", "lost"], motion: Floats, covariance: Floats) -> Pose:
         """For people: in the sensor's axes, in mm and degrees, with the error of the scale."""
-        axes = np.kron(np.eye(2), motion[:3, :3])
+        axes = np.zeros((6, 6))
+        axes[:3, :3] = axes[3:, 3:] = motion[:3, :3]
         stated = axes @ covariance @ axes.T
-        relative = np.array(self._scale.stderr) / self._mm
-        stated[[0, 1], [0, 1]] += (relative * motion[:2, 3]) ** 2
+        stated[[0, 1], [0, 1]] += (self._relative * motion[:2, 3]) ** 2
         stated *= np.outer(_TO_DEGREES, _TO_DEGREES)
         cx, cy, cz = self._origin.tolist()
         x, y, z, rx, ry, rz = (vector(motion) * _TO_DEGREES).tolist()

@@ -1,11 +1,11 @@
-"""Which presses of a session are good, and where the next one is wanted."""
+"""Guides a person through a session: which presses are good, and where to press next."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from tactflow.calibration.presses import Press, usual_radius
+from tactflow.calibration.presses import Press, PressFinder, usual_radius
 from tactflow.vision.geometry.region import measure_region
 
 LIGHT: Final = 0.5
@@ -14,13 +14,13 @@ ROUND: Final = 1.7
 """Longer over shorter axis of a contact above which it is not a ball's. Chosen by hand: presses of a ball on
 a real gel (mini_ball) reach 1.57."""
 PARTS: Final = 3
-"""Columns and rows of parts of the gel that should each have presses. Chosen by hand."""
+"""The gel is divided into so many columns and rows of parts, each of which needs presses. Chosen by hand."""
 _ROWS: Final = ("upper", "middle", "lower")
 _COLUMNS: Final = ("left", "centre", "right")
 _FIRST: Final = ((1, 1), (0, 0), (2, 2), (0, 2), (2, 0), (0, 1), (2, 1), (1, 0), (1, 2))
 """The parts in the order in which they are asked for."""
 _DEPTHS: Final = ("firmly", "lightly", "half as deep")
-"""How to press after zero, one, two presses at a place: a calibration wants several depths."""
+"""How to press after zero, one, two presses in a part: a calibration needs several depths."""
 
 
 def fault(press: Press, usual: float) -> str | None:
@@ -54,7 +54,7 @@ def part(press: Press) -> tuple[int, int]:
 
 
 def part_name(row: int, column: int) -> str:
-    """What a part of the gel is called.
+    """The name of a part of the gel.
 
     >>> part_name(0, 2)
     'upper right'
@@ -99,3 +99,41 @@ def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str,
             for press, wrong in zip(presses, faults, strict=True)
         ],
     }
+
+
+class Guide:
+    """Reports whether each press was good, and where to press next.
+
+    wanted : number of presses that are enough. say : shows a line.
+
+    `state` (see `progress`) may be read from any thread: that is what the live page does.
+    """
+
+    def __init__(self, wanted: int, say: Callable[[str], None]) -> None:
+        self._wanted = wanted
+        self._say = say
+        self._reported = 0
+        self._shown = (0, False)
+        self.state: Mapping[str, Any] = progress([], False, wanted)
+
+    def __call__(self, finder: PressFinder) -> bool:
+        """Report new presses; returns whether there are enough."""
+        presses, shown = finder.presses, (len(finder.presses), finder.lasts)
+        # A new reference may have dropped some.
+        self._reported = min(self._reported, len(presses))
+        for number in range(self._reported, len(presses) - finder.lasts):
+            self._report(presses[: number + 1])
+            self._reported += 1
+        if self._shown != shown:
+            self._shown = shown
+            self.state = progress(presses, finder.lasts, self._wanted)
+        return self._reported >= self._wanted
+
+    def _report(self, presses: Sequence[Press]) -> None:
+        """Report whether the last press was good, and what to do next."""
+        state, number = progress(presses, False, self._wanted), len(presses)
+        press = state["presses"][-1]
+        verdict = press["fault"] or f"good, radius {press['radius']:.0f} px"
+        # A recording may show more than are wanted.
+        of = f" of {self._wanted}" if number <= self._wanted else ""
+        self._say(f"press {number}{of}: {verdict}. {state['now']}")

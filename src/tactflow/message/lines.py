@@ -15,8 +15,8 @@ from typing import BinaryIO
 
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
+from tactflow.outputs import cannot_write, refuse_interference
 from tactflow.system.files import discard_output, expanded, make_folder
-from tactflow.system.outputs import cannot_write, refuse_interference
 
 log = logging.getLogger("tactflow")
 

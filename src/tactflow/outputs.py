@@ -1,12 +1,35 @@
-"""Output files of a run: creating them, and detecting interference."""
+"""Output files of a run: their parameters, creating them, and detecting interference."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Self
 
+from pydantic import Field, model_validator
+
+from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import StageError
 from tactflow.system.files import is_device, make_folder
+
+
+class AppendParams(StageParams):
+    """Parameters of a sink that can replace or continue its output."""
+
+    path: str = Field(min_length=1, description="relative to the current directory")
+    overwrite: bool = Field(False, description="replace existing output")
+    append: bool = Field(False, description="continue existing output")
+
+    @model_validator(mode="after")
+    def _exclusive(self) -> Self:
+        if self.overwrite and self.append:
+            raise ValueError("overwrite and append exclude each other")
+        return self
+
+    @property
+    def refuses_existing(self) -> bool:
+        """Whether existing output is an error."""
+        return not (self.overwrite or self.append)
 
 
 def cannot_write(path: Path | str, error: OSError, kept: str = "") -> StageError:
