@@ -19,8 +19,8 @@ markers leave less than 0.04; those beyond the last markers leave more, and ther
 pixels."""
 OUTLINE: Final = 0.31
 """Standard error of a contact's outline, over the radius of a disc of the same area. Gel that a wrong outline
-includes or leaves out moves otherwise than the contact. On labelled frames of nine labs, 79 % of the
-components of the mean lie within one standard error of those inside outlines by eye, and 95 % within two
+includes or leaves out moves otherwise than the contact. On labelled frames of nine labs, 77 % of the
+components of the mean lie within one standard error of those inside outlines by eye, and 96 % within two
 (`benchmarks/mean_flow.py`)."""
 _FLAT: Final = 1e-3
 """Spread of markers across a line over that along it, 1, up to which they do not span a plane. Chosen by
