@@ -12,6 +12,8 @@ from typing import Final, Literal, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median
+from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import lattice
@@ -39,7 +41,7 @@ LONG_LINK: Final = 1.8
 else. Chosen on tactip_video, whose pins have a bright rim around them."""
 
 APART: Final = 0.9
-"""Distance of two marks, sums of their radii, at least. Chosen by hand."""
+"""Distance of two marks, sums of their radii, at least: with 1, marks that crowd are lost (sts_torque160)."""
 
 ALONE: Final = 0.75
 """Clearance of a spot that needs no lattice to be a mark. Dots on even ground have 0.8 to 1, pieces of edges
@@ -49,14 +51,13 @@ CLEAR: Final = 0.55
 """Clearance of a spot that is a mark where a single corner or line of the lattice wants one. Chosen on
 sts_640."""
 
-ALIKE: Final = 1.7
-"""Ratio of the responses of such a spot and of the marks around, either way, at most."""
-
 NEAR: Final = 3.2
-"""The same, of a spot where the lattice wants a mark: light and dirt weaken marks."""
+"""Ratio of the responses of a spot and of the marks around, either way, at most, where the lattice
+wants a mark: light and dirt weaken marks."""
 
-NEAR_RADIUS: Final = 1.5
-"""Ratio of the radii of such a spot and of the marks around, either way, at most."""
+ALIKE: Final = 1.5
+"""Ratio of the radii of a spot and of the marks around, either way, at most; and of their responses, where
+only a clear ring or even ground says that it is a mark."""
 
 LEAST_BEND: Final = 0.15
 """Bend of a mark over that of most marks, at least: a piece of an edge or a line has 0. Of the dots marked on
@@ -132,7 +133,7 @@ def marks_of(gray: NDArray[np.float32], group: Group, by_scale: Mapping[float, S
     least = 1 / NEAR * float(np.percentile(group.spots.strength, 10))
     spots = joined(*(spots.at(spots.strength > least) for spots in by_scale.values()))
     larger = spots.at((spots.radius > 1.01 * group.sigma * RADIUS_PER_SIGMA) & (spots.clear > RING_CONTRAST))
-    covers = np.any(_distances(larger.points, group.spots.points) < larger.radius[:, None], axis=1)
+    covers = np.any(cdist(larger.points, group.spots.points) < larger.radius[:, None], axis=1)
     either = joined(group.spots, larger.at(covers))
     marks = _grown(gray, _in_lattice(_apart(either, either.strength)), spots)
     return marks.at(marks.bend > LEAST_BEND * np.median(marks.bend)) if len(marks.points) else marks
@@ -174,17 +175,8 @@ def links(points: Floats) -> NDArray[np.int64]:
         return np.zeros((0, 2), np.int64)
     edges = neighbour_graph(points, LONGEST_LINK * pitch_of(points))
     length = np.hypot(*(points[edges[:, 0]] - points[edges[:, 1]]).T)
-    usual = _median_of_links(edges, length, len(points))
+    usual = np.asarray(median(np.tile(length, 2), edges.T.ravel(), np.arange(len(points))))
     return np.asarray(edges[length < LONG_LINK * usual[edges].min(axis=1)], np.int64)
-
-
-def _median_of_links(edges: NDArray[np.int64], values: Floats, count: int) -> Floats:
-    """For each mark the (lower) median of the values (E,) of its links; infinity for a mark without."""
-    mark, value = edges.T.ravel(), np.tile(values, 2)
-    order = np.lexsort((value, mark))
-    degree = np.bincount(mark, minlength=count)
-    middle = np.cumsum(degree) - degree + (degree - 1) // 2
-    return np.where(degree > 0, np.append(value[order], np.inf)[np.where(degree > 0, middle, -1)], np.inf)
 
 
 def _alike(spots: Spots) -> Spots:
@@ -226,7 +218,7 @@ def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     """The marks, and spots where their lattice wants one, a row at a time."""
     while len(marks.points) >= MARKS_AROUND:
         touching = APART * (spots.radius[:, None] + marks.radius)
-        spots = spots.at(np.all(_distances(spots.points, marks.points) > touching, axis=1))
+        spots = spots.at(np.all(cdist(spots.points, marks.points) > touching, axis=1))
         new = _wanted(gray, marks, spots)
         if len(new.points) == 0:
             break
@@ -238,12 +230,12 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     """Of spots that touch no mark, those that go on with the lattice and are like the marks around."""
     support = lattice.support(spots.points, expected_marks(marks.points))
     wanted, support = spots.at(support > 0), support[support > 0]
-    away = _distances(wanted.points, marks.points)
+    away = cdist(wanted.points, marks.points)
     around = np.argsort(away, axis=1, kind="stable")[:, :MARKS_AROUND]
     usual = np.median(marks.radius[around], axis=1)
     radius = _ratio(wanted.radius, usual)
     strength = _ratio(wanted.strength, np.median(marks.strength[around], axis=1))
-    fits = (radius < NEAR_RADIUS) & (strength < NEAR)
+    fits = (radius < ALIKE) & (strength < NEAR)
     sure = (wanted.clear > CLEAR) & (strength < ALIKE)
     chosen = (wanted.clear > RING_CONTRAST) & ((support >= LEAST_SUPPORT) | sure)
     left = np.flatnonzero(fits & ~chosen)
@@ -283,13 +275,6 @@ def _apart(spots: Spots, rank: Floats) -> Spots:
             away = np.hypot(*(spots.points - spots.points[n]).T)
             left &= away > APART * (spots.radius + spots.radius[n])
     return spots.at(np.array(kept, np.int64))
-
-
-def _distances(points: Floats, others: Floats) -> Floats:
-    """(n, N) distances, px."""
-    x = points[:, :1] - others[:, 0]
-    y = points[:, 1:] - others[:, 1]
-    return np.asarray(np.sqrt(x * x + y * y), np.float64)
 
 
 def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: Floats) -> Floats:

@@ -49,9 +49,6 @@ RING_MISSES: Final = 2
 OVERLAP: Final = 1.3
 """Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
 
-TOUCHING: Final = 0.7
-"""The same where marks may touch, as under pressure."""
-
 BORDER_MARGIN: Final = 0.8
 """Distance of a mark from the border of the image at least, in radii: others are cut by it."""
 
@@ -128,10 +125,12 @@ def find_peaks(
 ) -> tuple[Floats, Floats]:
     """Peaks (M, 2) float64, px, of at least that response, whatever lies around them, and their responses.
 
+    Of those within a radius of each other, as of marks that touch under pressure, the highest one counts.
+
     gray : (H, W) float32, grey levels. sigma : px. least : grey levels. Returns (M, 2), (M,) float64.
     """
     factor, _, response = _respond(gray, sigma, polarity)
-    peaks, strength = _peaks(response, least, TOUCHING * RADIUS_PER_SIGMA * sigma / factor)
+    peaks, strength = _peaks(response, least, RADIUS_PER_SIGMA * sigma / factor)
     return peaks * factor + (factor - 1) / 2, strength
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats, Floats32, Indices
+from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
 from tactflow.vision.compiled import helper, kernel
 
 Bytes = NDArray[np.uint8]
@@ -47,15 +47,13 @@ LEAST_RESIDUAL: Final = np.float32(1e-3)
 """Sum of squares, grey levels^2, that always counts as unexplained: keeps r_squared below 1 and errors
 above 0."""
 
-LEAST_DIVISOR: Final = np.float32(0.15)
-"""Gain by which a step is divided at least: a step of a faint mark would be all noise. Chosen by hand."""
+LEAST_GAIN: Final = np.float32(0.2)
+"""Contrast of a mark that is seen, over that of its template, at least. A step is divided by no less: that
+of a faint mark would be all noise. Chosen by hand."""
 
-STEP_R_SQUARED: Final = np.float32(0.3)
-"""Another step is made only where the template explains this much: elsewhere it leads nowhere. Chosen by
-hand."""
-
-STEP_GAIN: Final = np.float32(0.2)
-"""Another step is made only where the contrast is this fraction of the template's. Chosen by hand."""
+LEAST_R_SQUARED: Final = np.float32(0.5)
+"""Fraction of its contrast that the template of a mark that is seen explains, at least. Another step is only
+made from there: elsewhere it leads nowhere. Chosen by hand."""
 
 
 class Alignment(NamedTuple):
@@ -70,6 +68,11 @@ class Alignment(NamedTuple):
     gain: Floats32
     r_squared: Floats32
     stderr: Floats32
+
+    @property
+    def seen(self) -> Flags:
+        """(n,) bool, which marks are seen, from how their templates fit."""
+        return np.asarray((self.gain > LEAST_GAIN) & (self.r_squared > LEAST_R_SQUARED))
 
 
 class MarkerTemplates:
@@ -323,7 +326,7 @@ def align_marks(
             gain, shift_x, shift_y, r_squared, rest = fit_template(
                 weights[which], terms[which], patch, varies
             )
-            safe = max(gain, LEAST_DIVISOR)
+            safe = max(gain, LEAST_GAIN)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
             next_x, next_y = nearest_phase(now_x, now_y, width, height)
@@ -333,7 +336,7 @@ def align_marks(
                 break
             x, y = now_x, now_y
             settled = next_x == phase_x and next_y == phase_y
-            if settled or not (r_squared > STEP_R_SQUARED and gain > STEP_GAIN):
+            if settled or not (r_squared > LEAST_R_SQUARED and gain > LEAST_GAIN):
                 break
             before_x, before_y, phase_x, phase_y = phase_x, phase_y, next_x, next_y
         position[n, 0], position[n, 1] = x, y

@@ -20,24 +20,20 @@ from tactflow.vision.markers.detection import (
     require_image,
     to_gray,
 )
-from tactflow.vision.markers.matching import REACH, Interpolator, MarkerGraph, common_displacement, grow
+from tactflow.vision.markers.matching import (
+    AGREEMENT,
+    MOST_STRAIN,
+    REACH,
+    Interpolator,
+    MarkerGraph,
+    common_displacement,
+    grow,
+)
 from tactflow.vision.markers.motion import MotionEvidence
 from tactflow.vision.markers.selection import LEAST_STRENGTH, expected_marks
 from tactflow.vision.markers.spots import LEAST_SIGMA, RADIUS_PER_SIGMA, find_peaks
-from tactflow.vision.markers.template import Alignment, TemplateGroups
+from tactflow.vision.markers.template import LEAST_GAIN, LEAST_R_SQUARED, Alignment, TemplateGroups
 from tactflow.vision.types import Markers, MarkerStatus
-
-LEAST_GAIN: Final = np.float32(0.2)
-"""Contrast of a mark that is seen, over that of its template, at least. Chosen by hand."""
-
-MOST_GAIN: Final = np.float32(3.0)
-"""The same at most. Chosen by hand."""
-
-LEAST_R_SQUARED: Final = np.float32(0.5)
-"""Fraction of its contrast that the template of a mark that is seen explains, at least. Chosen by hand."""
-
-STEEP_STRAIN: Final = 0.7
-"""Strain of a link that calls for a search. Chosen by hand."""
 
 SEARCH_INTERVAL: Final = 10
 """Frames between two searches for marks that stay missing. Chosen by hand."""
@@ -50,9 +46,6 @@ REST: Final = 0.1
 
 WHOLE: Final = 0.95
 """Fraction of the marks of a grid that rest and are seen, beyond which the grid rests. Chosen by hand."""
-
-SAME_SPOT: Final = 0.3
-"""Distance within which a mark is at a spot, pitches. Chosen by hand."""
 
 LEAVING_EVIDENCE: Final = 5.0
 """Evidence that a mark stays while those around it move, from which on it leaves: very strong (Kass and
@@ -270,16 +263,16 @@ class MarkerTracker:
         if settled.all():
             return result
         # Where a mark is seen without being an inlier is a spot like any other.
-        own = found.position[trusted(found.gain, found.r_squared) & ~inliers]
-        spots = np.concatenate([spots, own[_are_apart(own, spots, SAME_SPOT * self._pitch)]])
-        spots = spots[_are_apart(spots, found.position[inliers], SAME_SPOT * self._pitch)]
+        own = found.position[found.seen & ~inliers]
+        spots = np.concatenate([spots, own[_are_apart(own, spots, AGREEMENT * self._pitch)]])
+        spots = spots[_are_apart(spots, found.position[inliers], AGREEMENT * self._pitch)]
         reach = np.minimum(REACH * self._apart, self._farthest)
         marks, chosen = grow(result.position, inliers, spots, self._interpolator, reach)
         marks, chosen = marks[~settled[marks]], chosen[~settled[marks]]
         if len(marks):
             aligned = self._templates.align(image, spots[chosen], marks)
             result.position[marks], result.stderr[marks] = aligned.position, aligned.stderr
-            result.found[marks] = trusted(aligned.gain, aligned.r_squared)
+            result.found[marks] = aligned.seen
         return result
 
     def _best_start(
@@ -300,7 +293,7 @@ class MarkerTracker:
         for start in (self._origin, jumped):
             other = self._templates.align(image, start)
             other.gain[self._left] = 0
-            seen = trusted(other.gain, other.r_squared)
+            seen = other.seen
             there = self._graph.largest_component(seen, self._graph.strain(other.position))
             better = np.zeros(self._count, np.bool_)
             for grid in self._graph.grids:
@@ -349,11 +342,6 @@ def _are_apart(points: Floats, others: Floats, distance: float) -> Flags:
     return np.asarray(KDTree(others).query(points)[0] > distance)
 
 
-def trusted(gain: Any, r_squared: Any) -> Any:
-    """Whether a mark is seen, from how its template fits; of numbers or arrays."""
-    return (gain > LEAST_GAIN) & (gain < MOST_GAIN) & (r_squared > LEAST_R_SQUARED)
-
-
 @kernel(
     "boolean(float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1], float64[::1],"
     "boolean[::1], boolean[::1], float64[::1])"
@@ -373,12 +361,12 @@ def check_marks(
     marks that are seen is too steep."""
     doubt = False
     for n in range(len(position)):
-        seen[n] = gain[n] > LEAST_GAIN and gain[n] < MOST_GAIN and r_squared[n] > LEAST_R_SQUARED
+        seen[n] = gain[n] > LEAST_GAIN and r_squared[n] > LEAST_R_SQUARED
         doubt = doubt or (seen_before[n] and not seen[n])
     for e in range(len(edges)):
         one, other = edges[e, 0], edges[e, 1]
         x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
         y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
         strain[e] = np.sqrt(x * x + y * y) / length[e]
-        doubt = doubt or (strain[e] > STEEP_STRAIN and seen[one] and seen[other])
+        doubt = doubt or (strain[e] > MOST_STRAIN and seen[one] and seen[other])
     return doubt
