@@ -105,7 +105,7 @@ def find_spots(
     Lindeberg, "Feature detection with automatic scale selection", IJCV 30 (1998); Lowe, "Distinctive image
     features from scale-invariant keypoints", IJCV 60 (2004), for the difference of Gaussians.
     """
-    factor, smooth, response = _respond(gray, sigma, polarity)
+    factor, smooth, response = _respond(gray, sigma, polarity, FULL_SIZE_SIGMA)
     fine, radius = sigma / factor, sigma * RADIUS_PER_SIGMA
     # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
     peaks, strength = _peaks(response, LEAST_STRENGTH, OVERLAP * radius / factor)
@@ -129,18 +129,19 @@ def find_peaks(
 
     gray : (H, W) float32, grey levels. sigma : px. least : grey levels. Returns (M, 2), (M,) float64.
     """
-    factor, _, response = _respond(gray, sigma, polarity)
+    # At half the resolution of detection: where they are is measured by templates.
+    factor, _, response = _respond(gray, sigma, polarity, FULL_SIZE_SIGMA / 2)
     peaks, strength = _peaks(response, least, RADIUS_PER_SIGMA * sigma / factor)
     return peaks * factor + (factor - 1) / 2, strength
 
 
 def _respond(
-    gray: NDArray[np.float32], sigma: float, polarity: Literal["dark", "bright"]
+    gray: NDArray[np.float32], sigma: float, polarity: Literal["dark", "bright"], full_size: float
 ) -> tuple[int, NDArray[np.float32], NDArray[np.float32]]:
-    """By which factor the picture is shrunk; the shrunk picture at the scale, with dark marks; and its
-    difference of Gaussians, positive on marks."""
+    """By which factor the picture is shrunk, for scales from `full_size` px on; the shrunk picture at the scale,
+    with dark marks; and its difference of Gaussians, positive on marks."""
     factor = 1
-    while sigma >= factor * FULL_SIZE_SIGMA:
+    while sigma >= factor * full_size:
         factor *= 2
     height, width = gray.shape[0] // factor, gray.shape[1] // factor
     if factor > 1:

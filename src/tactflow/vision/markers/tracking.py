@@ -285,10 +285,12 @@ class MarkerTracker:
         where it was last, at its rest, or displaced by what most pairs of a mark and a spot say.
         """
         inliers = self._graph.largest_component(seen, strain)
-        if seen.all():
+        # Whoever is a pitch off misses a row, which of N marks has about the root of N.
+        torn = [grid for grid in self._graph.grids if 2 * np.count_nonzero(~inliers[grid]) > len(grid) ** 0.5]
+        if not torn:
             return found, inliers
         jumped = self._position.copy()
-        for grid in self._graph.grids:
+        for grid in torn:
             jumped[grid] += common_displacement(jumped[grid], spots, self._pitch, self._farthest)
         for start in (self._origin, jumped):
             other = self._templates.align(image, start)
@@ -296,7 +298,7 @@ class MarkerTracker:
             seen = other.seen
             there = self._graph.largest_component(seen, self._graph.strain(other.position))
             better = np.zeros(self._count, np.bool_)
-            for grid in self._graph.grids:
+            for grid in torn:
                 better[grid] = np.count_nonzero(there[grid]) > np.count_nonzero(inliers[grid])
             inliers = np.where(better, there, inliers)
             found = Alignment(
