@@ -138,8 +138,8 @@ def find_peaks(
 def _respond(
     gray: NDArray[np.float32], sigma: float, polarity: Literal["dark", "bright"], full_size: float
 ) -> tuple[int, NDArray[np.float32], NDArray[np.float32]]:
-    """By which factor the picture is shrunk, for scales from `full_size` px on; the shrunk picture at the scale,
-    with dark marks; and its difference of Gaussians, positive on marks."""
+    """By which factor the picture is shrunk, for scales from `full_size` px on; the shrunk picture at the
+    scale, with dark marks; and its difference of Gaussians, positive on marks."""
     factor = 1
     while sigma >= factor * full_size:
         factor *= 2
