@@ -41,13 +41,14 @@ FAINT: Final = 0.3
 Chosen by hand."""
 
 
-def contact_level(change: Floats32, core: Mask) -> Floats32:
+def contact_level(change: Floats32, core: Mask, sloping: bool = False) -> Floats32:
     """Level set of one contact's outline.
 
     Parameters
     ----------
     change : (h, w, 3) float32, of the contact's window, in standard deviations; 0 where nothing belongs to
-        the contact. core : (h, w) uint8, 1 where the contact surely is, else 0.
+        the contact. core : (h, w) uint8, 1 where the contact surely is, else 0. sloping : whether the light
+        is known to answer with slope; otherwise the change tells.
 
     Returns
     -------
@@ -64,7 +65,7 @@ def contact_level(change: Floats32, core: Mask) -> Floats32:
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
-    shows, border = _what_shows(change)
+    shows, border = _what_shows(change, sloping)
     level = np.asarray(shows / largest_nearby(shows) - np.float32(border), np.float32)
     inside = _around(np.asarray((level > 0) | (core > 0)), core)
     # What is filled in is as deep inside as what has changed most, what is left out as far outside.
@@ -72,13 +73,17 @@ def contact_level(change: Floats32, core: Mask) -> Floats32:
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
-def _what_shows(change: Floats32) -> tuple[Floats32, float]:
+def _what_shows(change: Floats32, sloping: bool) -> tuple[Floats32, float]:
     """What tells of the contact, (h, w), and the part of its largest value at which the contact ends."""
     blue, green, red = cv2.split(change)
     brightness = np.asarray((blue + green + red) * np.float32(1 / 3), np.float32)
     strength = np.asarray(cv2.magnitude(cv2.magnitude(blue, green), red), np.float32)
     whole = cv2.norm(strength, cv2.NORM_L2SQR)
-    if COLOURED * cv2.norm(brightness, cv2.NORM_L2SQR) <= whole or _sidedness(brightness) >= TWO_SIDED:
+    if (
+        sloping
+        or COLOURED * cv2.norm(brightness, cv2.NORM_L2SQR) <= whole
+        or _sidedness(brightness) >= TWO_SIDED
+    ):
         return strength, OUTER
     brighter = np.maximum(brightness, np.float32(0))
     darker = brighter - brightness

@@ -7,8 +7,10 @@ using integrability", CVPR 1997). So the two mixtures of the channels that diffe
 surface are the slopes, up to a factor, and that surface is the gel's (R. Frankot, R. Chellappa, "A method for
 enforcing integrability in shape from shading algorithms", PAMI 10, 1988).
 
-Where no mixtures are nearly integrable, the light answers otherwise: with depth, which brightens or darkens
-the contact as a whole, or to slopes of one direction. Then the size of the change stands for the shape.
+Where all channels change alike, as those of a gray camera do, there is one mixture, and it is the slope along
+the direction in which it differs least from that of a surface; or it answers with depth, which brightens or
+darkens the contact as a whole. Where it does, or no mixtures are nearly integrable, the size of the change
+stands for the shape.
 """
 
 from __future__ import annotations
@@ -33,6 +35,12 @@ what light from one side shows, misses 0.25 with nothing beside it; sensors with
 WEAKEST: Final = 0.01
 """Power of a mixture of channels, relative to the strongest one, from which on it tells of a slope: a tenth
 in size. Below is noise, in a faint contact that brightens as a whole."""
+CLEAR: Final = 2.0
+"""Size of a change that is more than noise, standard deviations."""
+ONE_WAY: Final = 1 / 3
+"""Part of the clear changes that is left when they are added up, from which on they are taken for depth: of
+slopes there are as many up as down. Gray pictures of sensors lit from several sides have 0.1 to 0.3, coatings
+0.4 to 0.9."""
 MORE: Final = 0.02
 """Part of all the power so far that a frame has at least to tell more: a sensor is known after fifty such
 frames."""
@@ -43,11 +51,12 @@ class Heights(NamedTuple):
 
     values : (h, w) float32, height of each cell above the gel at rest, in some unit, or how much it has
     changed. slopes : (2, 3) float32, mixtures of the channels that are slopes along x and y; None where no
-    mixtures are.
+    mixtures are. alike : whether all channels change alike, so that they are one and the same slope.
     """
 
     values: Floats32
     slopes: Floats32 | None
+    alike: bool = False
 
 
 class HeightModel:
@@ -67,7 +76,9 @@ class HeightModel:
 
     def __init__(self) -> None:
         self._missing, self._power = np.zeros((6, 6)), np.zeros((3, 3))
+        self._one_way = self._size = 0.0
         self._slopes: Floats32 | None = None
+        self._alike = False
         self._before = np.zeros((2, 3), np.float32)
 
     def __call__(self, change: Floats32) -> Heights:
@@ -82,7 +93,7 @@ class HeightModel:
         from_x, from_y = _integrals(*size)
         extended = fft.irfft2(from_x * along_x + from_y * along_y, size)
         rest = np.median(np.concatenate([extended[high], extended[-1]]))
-        return Heights(np.asarray(extended[:high, :wide] - rest, np.float32), self._slopes)
+        return Heights(np.asarray(extended[:high, :wide] - rest, np.float32), self._slopes, self._alike)
 
     def _learn(self, change: Floats32) -> None:
         """Add the power of a change, and what of it would be missing in a surface, if that tells more.
@@ -106,6 +117,10 @@ class HeightModel:
         missing[:3, :3] += np.outer(mean, mean)
         missing[3:, 3:] += np.outer(mean, mean)
         self._power += power
+        sizes = np.linalg.norm(flat, axis=0)
+        clear = sizes > CLEAR
+        self._one_way += float(np.linalg.norm(flat[:, clear].sum(axis=1)))
+        self._size += float(sizes[clear].sum())
         self._missing += missing / (size[0] * size[1])
         self._slopes = self._integrable()
         if self._slopes is not None:
@@ -117,12 +132,14 @@ class HeightModel:
         """Mixtures (2, 3) of the channels that are slopes along x and y; None where none are of a surface."""
         powers, directions = np.linalg.eigh(self._power)
         basis = np.kron(np.eye(2), directions[:, powers >= WEAKEST * powers[-1]])
-        if basis.shape[1] < 4:
+        self._alike = basis.shape[1] == 2
+        if self._alike and self._one_way >= ONE_WAY * self._size:
             return None
         power = basis.T @ np.kron(np.eye(2), self._power) @ basis
         missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
         mixtures = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
-        return None if missing[0] > INTEGRABLE else mixtures / np.linalg.norm(mixtures)
+        integrable = self._alike or missing[0] <= INTEGRABLE
+        return mixtures / np.linalg.norm(mixtures) if integrable else None
 
 
 @lru_cache(maxsize=4)
