@@ -7,10 +7,10 @@ x and y (mm) on every other grasp, and tested on the rest: correlation and RMS r
 the centre of the contact, the mean flow inside it, or both. The grip drags the gel along, which shows in the
 flow, and the object slides, which shows in the centre.
 
-`tactip_shear`: a flat surface, pushed in, tilted, sheared and turned in separate pictures. A linear model
-(ridge regression; its weight by leave-one-out errors of the training half) from every second picture to the
-rest: mean absolute error, of displacements of the tracked dots, of the density of all dots on a grid, which
-needs no dot's identity, and of chance (the mean of the other half).
+`tactip_shear`: a flat surface, pushed in, tilted, sheared and turned in separate pictures. From every second
+picture to the rest: mean absolute error of a linear model of displacements of the tracked dots (ridge
+regression), of a nonlinear one of the blurred picture, which needs no dot's identity (kernel ridge), and of
+chance (the mean of the other half). All weights are chosen by leave-one-out errors of the training half.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ import tactflow
 from tactflow.message.result import Result
 from tactflow.system.terminal import show, table
 from tactflow.vision.arrays import Floats
-from tactflow.vision.types import MarkerStatus
 
 OBJECTS = ("3D_printing_1", "gel")
 FEATURES = {"centre": slice(0, 2), "flow": slice(2, 4), "both": slice(0, 4)}
@@ -39,8 +38,8 @@ MOVED = {
     **{"shear_x": "mm", "shear_y": "mm", "shear_Rz": "deg"},
 }
 """Column of tactip_shear -> its unit."""
-BLUR, CELLS = 6.0, 42
-"""Of the density of dots: standard deviation, px, and cells along a side of its grid."""
+BLUR, CELLS, COMPONENTS = 6.0, 28, 20
+"""Of the blurred picture: standard deviation, px, cells along a side, and principal components."""
 
 
 def results(pictures: list[Path], untouched: Path, name: str = "default") -> Iterator[Result]:
@@ -67,17 +66,11 @@ def look(result: Result) -> list[float]:
     return [*center, *flow]
 
 
-def densities(dots: list[Floats], size: tuple[int, int]) -> Floats:
-    """(n, k): how many dots of (N, 2) px lie about each place of a grid. size : (width, height), px."""
-    fields = []
-    for points in dots:
-        picture = np.zeros(size[::-1], np.float32)
-        inside = ((points >= 0) & (points < np.array(size) - 0.5)).all(axis=1)
-        columns, rows = np.rint(points[inside]).astype(int).T
-        np.add.at(picture, (rows, columns), 1)
-        blurred = cv2.GaussianBlur(picture, (0, 0), BLUR)
-        fields.append(cv2.resize(blurred, (CELLS, CELLS), interpolation=cv2.INTER_AREA).ravel())
-    return np.array(fields, float)
+def blurred(path: Path) -> Floats:
+    """(k,): the picture so coarse that single dots do not show, but how dense they are everywhere."""
+    grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.float32)
+    coarse = cv2.resize(cv2.GaussianBlur(grey, (0, 0), BLUR), (CELLS, CELLS), interpolation=cv2.INTER_AREA)
+    return np.asarray(coarse, np.float64).ravel()
 
 
 def ridge(features: Floats, values: Floats, tested: Floats) -> Floats:
@@ -98,6 +91,31 @@ def ridge(features: Floats, values: Floats, tested: Floats) -> Floats:
     return predicted
 
 
+def kernel_ridge(features: Floats, values: Floats, tested: Floats) -> Floats:
+    """As `ridge`, with a Gaussian kernel of principal components, whose width is also by leave-one-out.
+
+    References
+    ----------
+    C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.25 and 5.12.
+    """
+    middle, mean = features.mean(axis=0), values.mean(axis=0)
+    axes = np.linalg.svd(features - middle, full_matrices=False)[2][:COMPONENTS].T
+    known, asked = (features - middle) @ axes, (tested - middle) @ axes
+    apart, away = (((part[:, None] - known) ** 2).sum(axis=2) for part in (known, asked))
+    predicted = np.tile(mean, (len(tested), 1))
+    least = np.full(values.shape[1], np.inf)
+    for width in np.median(apart) * np.logspace(-0.5, 1.5, 5):
+        spectrum, vectors = np.linalg.eigh(np.exp(-apart / (2 * width)))
+        for weight in np.logspace(-6, -1, 6):
+            inverse = (vectors / (spectrum + weight)) @ vectors.T
+            slopes = inverse @ (values - mean)
+            errors = ((slopes / np.diag(inverse)[:, None]) ** 2).sum(axis=0)
+            better = errors < least
+            least[better] = errors[better]
+            predicted[:, better] = (mean + np.exp(-away / (2 * width)) @ slopes)[:, better]
+    return predicted
+
+
 def judge_shear(folder: Path) -> list[list[str]]:
     """Rows: the features, and the mean absolute error of each number of the robot."""
     lines = list(csv.DictReader((folder / "labels.csv").read_text().splitlines()))
@@ -107,16 +125,14 @@ def judge_shear(folder: Path) -> list[list[str]]:
     paths = [folder / line["image"] for line in lines]
     found = [r.markers for r in results(paths, paths[rest], "tactip") if r.markers is not None]
     displaced = np.array([(dots.position - dots.origin).ravel() for dots in found])
-    tracked = [dots.position[dots.status == MarkerStatus.TRACKED] for dots in found]
-    height, width = cv2.imread(str(paths[0])).shape[:2]
     learned = slice(0, None, 2), slice(1, None, 2)
     rows = [["tactip_shear", *(f"{name}, {unit}" for name, unit in MOVED.items())]]
     tested = true[learned[1]]
     predicted = {
-        what: ridge(features[learned[0]], true[learned[0]], features[learned[1]])
-        for what, features in (
-            ("displacements", displaced),
-            ("density", densities(tracked, (width, height))),
+        what: method(features[learned[0]], true[learned[0]], features[learned[1]])
+        for what, method, features in (
+            ("displacements", ridge, displaced),
+            ("blurred picture", kernel_ridge, np.array([blurred(path) for path in paths])),
         )
     }
     predicted["chance"] = np.tile(true[learned[0]].mean(axis=0), (len(tested), 1))

@@ -1,4 +1,4 @@
-"""Stage `hold`: another signal, kept true for longer."""
+"""Stage `hold`: extends another signal in time."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from tactflow.ports import Held
 
 
 class Hold(Stage):
-    """Keeps a signal true for some frames after it fell, and makes it true now and then anyway.
+    """Keeps a signal true for some frames after its end, and makes it true at regular intervals.
 
-    For gates, which have no memory of their own: `when: held`. A stage that this closes gives the reason of
-    the signal that is held (`no_contact` for `touching`). Frames without the signal are not counted.
+    For gates, which have no memory: `when: held`. A stage closed by this gate reports the reason of the
+    extended signal (`no_contact` for `touching`). Frames without the signal are not counted.
 
     >>> hold = Hold(Hold.Params(hold=1))
     >>> [hold.process(signal) for signal in (False, True, False, False)]
@@ -22,7 +22,7 @@ class Hold(Stage):
     memory = "stateful"
 
     class Params(StageParams):
-        """For how long, and how often at least."""
+        """Duration, and minimum frequency."""
 
         hold: int = Field(0, ge=0, description="frames for which it stays true after the signal fell")
         at_least_every: int | None = Field(
@@ -40,7 +40,7 @@ class Hold(Stage):
         self._closed = 0
 
     def process(self, signal: bool) -> Held:
-        """Whether the signal is true, was so a short while ago, or a frame is due."""
+        """Whether the signal is true, was true recently, or a frame is due."""
         held = bool(signal) or self._left > 0
         self._left = self.params.hold if signal else max(0, self._left - 1)
         every = self.params.at_least_every

@@ -35,7 +35,7 @@ class Undistort(StageParams):
 
 
 class Homography(StageParams):
-    """Four points of the undistorted raw frame and where they go."""
+    """Four points of the undistorted raw frame and their destinations."""
 
     source: Corners = Field(alias="from", description="four points [x, y], undistorted raw px")
     destination: Corners = Field(alias="to", description="where they go, [x, y], px of the result")
@@ -50,12 +50,12 @@ class Homography(StageParams):
 logger = logging.getLogger("tactflow")
 
 _SHRUNK = {2: "halved", 4: "quartered", 8: "shrunk 8 times", 16: "shrunk 16 times"}
-"""Factor of `downsample` -> what it does, in words."""
+"""Description of `downsample` for messages, by its factor."""
 
 
 FEWEST_PIXELS = 160
-"""Shorter side of a processed picture, px, below which shrinking it deserves a hint. Chosen by hand: the
-smallest pictures of the sensors that the shipped pipelines are for."""
+"""Shorter side of a processed picture, px, below which a message warns of `downsample`. Chosen by hand: the
+smallest pictures of the sensors with shipped pipelines."""
 
 
 class Preprocessed(NamedTuple):
@@ -71,7 +71,7 @@ class Preprocess(Stage):
     memory = "pure"
 
     class Params(StageParams):
-        """The steps, in the order in which they are done; a step that is not given is left out."""
+        """The steps in their order; missing steps are skipped."""
 
         undistort: Undistort | None = Field(None, description="take out the lens")
         homography: Homography | None = Field(None, description="rectify: four points go to four points")
@@ -100,7 +100,7 @@ class Preprocess(Stage):
         return Preprocessed(self._preprocessor(frame.image), self._preprocessor.mapping)
 
     def _report(self, before: tuple[int, int], after: tuple[int, int]) -> None:
-        """Log how the picture is changed, once. before, after : (width, height), px."""
+        """Log the steps once. before, after : (width, height), px."""
         params = self.params
         steps = [
             *(["straightened"] if params.undistort else []),

@@ -1,4 +1,4 @@
-"""Stage `untouched`: what the gel looks like where nothing touches it."""
+"""Stage `untouched`: the picture of the untouched gel."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class UntouchedGel(Stage):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the reference; a new one follows."""
+        """Forget the reference."""
         self._sum: NDArray[np.float32] | None = None
         self._count = 0
         self._mean: Untouched | None = None
 
     def process(self, unmarked: Unmarked, frame: Frame) -> Untouched:
-        """The mean of all reference frames so far; the first frame serves where there is none."""
+        """The mean of all reference frames so far; without one, the first frame."""
         if self._mean is None or frame.reference:
             picture = unmarked.astype(np.float32)
             self._sum = picture if self._sum is None else self._sum + picture

@@ -1,4 +1,4 @@
-"""Stage `valid_area`: where the picture shows gel."""
+"""Stage `valid_area`: the part of the picture that shows gel."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ValidArea(Stage):
     memory = "stateful"
 
     class Params(StageParams):
-        """Where the gel is, if it need not be found."""
+        """The area, if it is known."""
 
         area: Polygon | str = Field(
             "auto",
@@ -35,17 +35,17 @@ class ValidArea(Stage):
         )
 
     def __init__(self, params: Params, directory: Path | None = None) -> None:
-        """Prepare. directory : where a relative path is looked for if not in the current directory."""
+        """Prepare. directory : searched for relative paths after the current directory."""
         super().__init__(params)
         self._directory = directory
         self._valid: Valid | None = None
 
     def reset(self) -> None:
-        """A new reference follows."""
+        """Forget the area; it is found again in the new reference."""
         self._valid = None
 
     def process(self, image: Image) -> Valid:
-        """255 where there is gel; the same array until a new reference comes."""
+        """255 where there is gel; the same array until the next reference."""
         if self._valid is None:
             self._valid = self._find(image)
         return self._valid

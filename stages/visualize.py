@@ -14,7 +14,7 @@ from tactflow.vision.flow import DisplacementField
 from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 
 _SHOWN = {"depth": ("depth", "scale"), "normals": ("normals",)}
-"""View -> the inputs that it alone shows."""
+"""Inputs that only one view shows, by view."""
 
 
 class Visualize(Stage):
@@ -24,7 +24,7 @@ class Visualize(Stage):
     on_demand = True
 
     class Params(StageParams):
-        """What is drawn."""
+        """Contents of the picture."""
 
         arrow_scale: float = Field(
             3.0, ge=0, le=1000, description="arrow length over displacement, 1; 1 ends it where the marker is"
@@ -74,7 +74,7 @@ class Visualize(Stage):
         scale: Scale | None = None,
         normals: Normals | None = None,
     ) -> Picture:
-        """A new picture; what is absent is not drawn."""
+        """A new picture; missing inputs are not drawn."""
         return self._annotator(
             image,
             contact=contact,

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     import pandas as pd  # type: ignore[import-untyped]
 
 _WHOLE = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1, "stages.capture.settle": 0}
-"""Settings of the default pipeline for pictures that are to be taken as they are, in this order."""
+"""Settings of the default pipeline that use pictures unchanged and in this order."""
 _NO_COLUMN = frozenset({"changed", "evidence", "touching"})
-"""Ports of built-in stages that tell nothing the other columns do not."""
+"""Ports of built-in stages that duplicate other columns."""
 
 
 def contact(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> Contact | None:
-    """Find what touches the gel in one picture, with the default pipeline.
+    """Find the contact in one picture, with the default pipeline.
 
     For many pictures of one sensor, `tactflow.stream(source=pictures)` prepares the reference only once.
 
@@ -35,11 +35,11 @@ def contact(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> Contact |
 
     Returns
     -------
-    The contact, in pixels of `image`; None where nothing touches.
+    The contact, in pixels of `image`; None without contact.
 
     Raises
     ------
-    ValueError : the pictures differ in shape. TactflowError : they are no pictures that the pipeline takes.
+    ValueError : the pictures differ in shape. TactflowError : the pipeline cannot process the pictures.
 
     Examples
     --------
@@ -56,7 +56,7 @@ def contact(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> Contact |
 
 
 def draw(result: Result, image: NDArray[np.uint8] | None = None, **options: Any) -> NDArray[np.uint8]:
-    """Draw what was found on the processed frame: outline and axis of the contact, arrows of the markers.
+    """Draw a result on the processed frame: outline and axis of the contact, arrows of the markers.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ def to_frame(results: Iterable[Result]) -> pd.DataFrame:
     """Results as a pandas DataFrame, one row per frame.
 
     Columns are the numbers of the result message with its standard errors (`contact_area`, `flow_mean_x`,
-    `flow_stderr_x`, ...), then the outputs of your own stages that are numbers, truth values or texts. A
-    column in which nothing is known is left out.
+    `flow_stderr_x`, ...), then the numbers, booleans and strings from your own stages. Empty columns are
+    omitted.
 
     results : from `stream`, or received.
 

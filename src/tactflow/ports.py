@@ -1,4 +1,4 @@
-"""The vocabulary of ports: what the built-in stages and sinks say to each other.
+"""The types of ports between the built-in stages and sinks.
 
 Besides these arrays and signals, `Frame` and the dataclasses of `tactflow.vision.types` (`Contact`,
 `Markers`, `Flow`, ...) are port types; their port is named after them: `frame`, `contact`, `markers`, `flow`.
@@ -50,10 +50,10 @@ Slipping = Annotated[bool, SignalPort("slipping", closed="no_slip")]
 """True while what touches the gel slides over it."""
 
 Changed = Annotated[bool, SignalPort("changed", closed="unchanged", otherwise="repeat")]
-"""True when anything may have moved by more than its tolerance since the last frame that was looked at."""
+"""True when anything may have moved by more than its tolerance since the last processed frame."""
 
 Suspect = Annotated[bool, SignalPort("suspect", closed="at_rest", otherwise="repeat")]
-"""True when the contact may be another one than in the last frame that was worked on in full."""
+"""True when the contact may differ from that in the last fully processed frame."""
 
 Held = Annotated[bool, SignalPort("held", closed=None)]
-"""Another signal, held true for longer."""
+"""Another signal, extended in time."""

@@ -1,4 +1,4 @@
-"""Results in the process that computes them: `for result in tactflow.stream("pipeline.yaml"): ...`."""
+"""Results of a run in the same process: `for result in tactflow.stream("pipeline.yaml"): ...`."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def stream(
 ) -> Generator[Result, None, None]:
     """Run a pipeline and iterate over its results.
 
-    The run goes on in the background while the loop works on a result. A recording waits for the loop, so
-    nothing is lost; of a live source the loop always gets the newest result. Leaving the loop ends the run.
+    The run continues in the background while the loop processes a result. A recording waits for the loop, so
+    nothing is lost; from a live source the loop always gets the newest result. Leaving the loop ends the run.
 
     Parameters
     ----------
     pipeline, source, settings, sensor, realtime : as for `tactflow.load`, or a loaded pipeline.
-    max_frames : stop after so many frames.
+    max_frames : stop after this many frames.
     images : keep the pictures in each result: `image`, `frame.image`, and every other (H, W, 3) uint8 array.
         Without them a list of results stays small.
-    sinks : let the pipeline's own sinks work too: files, ZeroMQ, the live page.
+    sinks : also run the pipeline's sinks: files, ZeroMQ, the live page.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def stream(
     link: Link[Result] = Link("tactflow.stream", 1, "block")
 
     def hand_over(result: Result) -> None:
-        # Of a live source only the newest result waits for the loop.
+        # From a live source only the newest result is kept for the loop.
         if runner.source is not None and runner.source.live:
             link.when_full = "latest"
         link.put(result.kept(pictures=images))

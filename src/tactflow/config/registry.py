@@ -167,11 +167,11 @@ def _load_file(folders: Sequence[Path], file: str) -> ModuleType:
     return module
 
 
-def _failure(what: str, error: BaseException, file: str | None = None) -> str:
+def _failure(module: str, error: BaseException, file: str | None = None) -> str:
     """Why a module cannot be loaded, with the location in the code."""
     if isinstance(error, SyntaxError):
-        return f"{error.filename}:{error.lineno}: cannot load {what}: {error.msg}"
-    text = f"cannot load {what}: {type(error).__name__}: {error}"
+        return f"{error.filename}:{error.lineno}: cannot load {module}: {error.msg}"
+    text = f"cannot load {module}: {type(error).__name__}: {error}"
     place = code_place(error.__traceback__, file)
     return f"{place}: {text}" if place else text
 
@@ -203,7 +203,7 @@ def _find_class(module: ModuleType, name: str, section: Section) -> type:
         raise ConfigError(f"{where} has no class {name}{did_you_mean(name, usable or public, 'it has ')}")
     if len(set(usable.values())) == 1:
         return next(iter(usable.values()))
-    wanted = "Sink" if section == "sinks" else "Stage or Source"
+    base = "Sink" if section == "sinks" else "Stage or Source"
     if usable:
         raise ConfigError(f"{where} has several classes ({', '.join(usable)}); name one, as in FILE:Class")
-    raise ConfigError(f"{where} has no public class that inherits from {wanted} of tactflow")
+    raise ConfigError(f"{where} has no public class that inherits from {base} of tactflow")

@@ -159,7 +159,7 @@ def _segment_for(node: Node, inputs: set[str], first: str, before: Mapping[str, 
     """
     if issubclass(node.component.cls, Sink) and node.component.cls.threaded:
         return node.id
-    last = {name for name in inputs if not any(name in _ancestors(other, before) for other in inputs)}
+    last = {name for name in inputs if not any(name in _ancestors(input_, before) for input_ in inputs)}
     if last == {first}:
         return COMPUTE
     return last.pop() if len(last) == 1 else node.id
@@ -182,17 +182,18 @@ def _circles(
     """Each cycle of segments, reported at a node that the file assigns to one of them."""
     reported: set[str] = set()
     for name in before:
-        if name in reported or name not in _ancestors(name, before):
+        ancestors = _ancestors(name, before)
+        if name in reported or name not in ancestors:
             continue
-        others = [o for o in before if name in _ancestors(o, before) and o in _ancestors(name, before)]
-        reported.update(others)
-        inside = [pipeline.nodes[id_] for other in others for id_ in members[other]]
-        placed = [node for node in inside if node.segment] or inside
-        held = "; ".join(f"{other} holds {', '.join(members[other])}" for other in others)
+        cycle = [s for s in before if s in ancestors and name in _ancestors(s, before)]
+        reported.update(cycle)
+        nodes = [pipeline.nodes[id_] for segment in cycle for id_ in members[segment]]
+        placed = [node for node in nodes if node.segment] or nodes
+        contents = "; ".join(f"{segment} holds {', '.join(members[segment])}" for segment in cycle)
         yield (
             placed[0].marks.get("segment", placed[0].mark),
-            f"{placed[0].id}: segments {', '.join(others)} feed each other in a circle, so none could start; "
-            f"{held}: move one of them to another segment",
+            f"{placed[0].id}: segments {', '.join(cycle)} feed each other in a circle, so none could start; "
+            f"{contents}: move one of them to another segment",
         )
 
 

@@ -240,17 +240,17 @@ def _outputs(annotation: Any) -> tuple[Port, ...]:
     return (Port(name, result, optional),)
 
 
-def _single_type(annotation: Any, what: str) -> tuple[Any, bool]:
+def _single_type(annotation: Any, place: str) -> tuple[Any, bool]:
     """X of `X | Absent | None`, and whether the value may be absent."""
     members = [member for member in _members(annotation) if member not in (Absent, type(None))]
     if len(members) != 1:
         raise _PortError(
-            f"{what}: required one type for one port, X or X | None; several outputs are a NamedTuple"
+            f"{place}: required one type for one port, X or X | None; several outputs are a NamedTuple"
         )
     origin = get_origin(members[0]) or members[0]
     if inspect.isclass(origin) and issubclass(origin, np.ndarray):
         raise _PortError(
-            f"{what}: a bare array does not say what it holds; use a type of tactflow.ports (Image, "
+            f"{place}: a bare array does not say what it holds; use a type of tactflow.ports (Image, "
             'ContactMask) or Annotated[NDArray[np.uint8], ArrayPort("name", ("H", "W"), "uint8", "unit")]'
         )
     return members[0], len(_members(annotation)) > 1

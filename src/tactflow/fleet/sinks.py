@@ -108,14 +108,14 @@ class Shared(NamedTuple):
 
 def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
     """Addresses shared by sinks of several sensors. pipelines : sensor -> its pipeline."""
-    found: dict[str, list[tuple[str, Node, Publication]]] = {}
+    by_address: dict[str, list[tuple[str, Node, Publication]]] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
             publication = node.component.cls.publishes(node.params)
             if publication is not None:
-                found.setdefault(publication.address, []).append((sensor, node, publication))
+                by_address.setdefault(publication.address, []).append((sensor, node, publication))
     shared = []
-    for address, sinks in found.items():
+    for address, sinks in by_address.items():
         if len(sinks) > 1:
             backlog = sum(publication.backlog for *_, publication in sinks)
             linger = max(publication.linger for *_, publication in sinks)

@@ -107,10 +107,10 @@ class MarkerOrder:
         neighbours = KDTree(first).query(first, [2])[0]
         self._is_missing = np.asarray(distance > np.median(neighbours) / 2)
         if nearest is None or 2 * self._is_missing.sum() > len(first):
-            found = int(len(first) - self._is_missing.sum())
+            matched = int(len(first) - self._is_missing.sum())
             raise StageError(
-                f"only {found} of {len(first)} markers are where those of the first recording were: was the "
-                "camera or the gel moved? Make two datasets"
+                f"only {matched} of {len(first)} markers are where those of the first recording were: was "
+                "the camera or the gel moved? Make two datasets"
             )
         self._nearest, self._aligned_origin = np.asarray(nearest), origin
 

@@ -65,8 +65,8 @@ class Connection:
         Raises PermissionError if the server rejects us.
         """
         while self._hang_ups < MOST_HANG_UPS:
-            left = max(until - time.monotonic(), 0.0)
-            ready = dict(self._poller.poll(None if math.isinf(left) else math.ceil(left * 1000)))
+            seconds = max(until - time.monotonic(), 0.0)
+            ready = dict(self._poller.poll(None if math.isinf(seconds) else math.ceil(seconds * 1000)))
             if self._handshakes not in ready:
                 return bool(ready)
             event = recv_monitor_message(self._handshakes)["event"]

@@ -81,8 +81,8 @@ class Publisher(BoundSocket):
     def wait_for(self, topic: bytes, seconds: float) -> bool:
         """Wait for a subscription to a topic; returns whether there is one."""
         end = time.monotonic() + seconds
-        while not self.is_subscribed(topic) and (left := end - time.monotonic()) > 0:
-            self.socket.poll(max(int(min(left, 0.1) * 1000), 1))
+        while not self.is_subscribed(topic) and (remaining := end - time.monotonic()) > 0:
+            self.socket.poll(max(int(min(remaining, 0.1) * 1000), 1))
         return self.is_subscribed(topic)
 
     def send(self, message: bytes) -> None:

@@ -107,17 +107,17 @@ def messages(
     """
     with path.open("rb") as file:
         has_index = read_summary(file) is not None
-        wanted: set[int] = set()
+        channels: set[int] = set()
         size = path.stat().st_size
         for record in intact_records(file):
             if isinstance(record, Damage):
                 if has_index or record.end < size:
                     raise ValueError(f"bytes {record.start} to {record.end} are not as they were written")
             elif isinstance(record, Channel) and record.topic in topics:
-                wanted.add(record.id)
+                channels.add(record.id)
             elif (
                 isinstance(record, Message)
-                and record.channel_id in wanted
+                and record.channel_id in channels
                 and (start is None or record.log_time >= start)
                 and (end is None or record.log_time < end)
             ):
