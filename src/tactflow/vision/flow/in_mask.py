@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Mask
@@ -17,11 +16,6 @@ UNKNOWN: Final = 0.1
 """Share of what the mean flow could be that markers may leave open. Simulated contacts within the grid of
 markers leave less than 0.04; those beyond the last markers leave more, and there the mean is wrong by
 pixels."""
-OUTLINE: Final = 0.31
-"""Standard error of a contact's outline, over the radius of a disc of the same area. Gel that a wrong outline
-includes or leaves out moves otherwise than the contact. On labelled frames of nine labs, 77 % of the
-components of the mean lie within one standard error of those inside outlines by eye, and 96 % within two
-(`benchmarks/mean_flow.py`)."""
 _FLAT: Final = 1e-3
 """Spread of markers across a line over that along it, 1, up to which they do not span a plane. Chosen by
 hand."""
@@ -109,7 +103,7 @@ def flow_of_field(
     Flow : its mean is the integral of the field over the contact, by area of the gel at rest; so a marker
         that enters makes no jump. None where no marker is inside, or where markers are too far away to tell.
         Rotation, divergence and shear are those of the affine motion nearest to the field. stderr of the mean
-        includes that the outline may be wrong (`OUTLINE`).
+        includes that the outline may be wrong.
 
     Raises
     ------
@@ -131,31 +125,13 @@ def flow_of_field(
     motion = field.motion(mask) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
-    outline = (motion.spread, motion.spread) if coarse else _outline_stderr(field, mask)
+    outline = (motion.spread, motion.spread) if coarse else motion.outline_stderr
     return _flow_of_motion(motion, count, outline)
 
 
 def _inside(markers: Markers, mask: Mask, dilate: float) -> Flags:
     """Which markers (N,), lost ones left out, lie inside the mask, or at most `dilate` px outside."""
     return np.asarray(inside_mask(markers.position, mask, dilate) & (markers.status != _LOST))
-
-
-def _outline_stderr(field: DisplacementField, mask: Mask) -> tuple[float, float]:
-    """What the error of the outline adds to that of the mean, px: how much the mean changes where the outline
-    is wider, and where it is narrower, by one standard error (`OUTLINE`)."""
-    share = field.share(mask)
-    inside = (2 * share >= share.max()).astype(np.uint8)
-    within, beyond = (cv2.distanceTransform(part, cv2.DIST_L2, 3) for part in (inside, 1 - inside))
-    # In cells, from the outline, which lies between two of them.
-    depth = within - beyond - inside + 0.5
-    wider = OUTLINE * math.sqrt(float(share.sum()) / math.pi)
-    means = []
-    for shift in (-wider, 0.0, wider):
-        weights = np.clip(depth + max(shift, 0.5 - float(depth.max())) + 0.5, 0, 1)
-        means.append(np.tensordot(weights, field.displacement) / weights.sum())
-    narrow, mean, wide = means
-    x, y = np.sqrt(((narrow - mean) ** 2 + (wide - mean) ** 2) / 2).tolist()
-    return x, y
 
 
 def _flow_of_motion(motion: GelMotion, count: int, outline: tuple[float, float]) -> Flow:

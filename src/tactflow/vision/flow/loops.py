@@ -230,11 +230,11 @@ def sum_region(
     planes, inverse, removed : of `weigh_markers`; of the last, the rows that are filled.
     to_markers : (R, C, N), kernel between cells and markers. between : (2 R - 1, 2 C - 1), kernel between two
     cells, by how many rows and columns they are apart.
-    sums : (26,) of 0, filled: how much of each cell is in the region; then, of cells weighted by their share
+    sums : (27,) of 0, filled: how much of each cell is in the region; then, of cells weighted by their share
     in the region: mean m (x, y); a a' (xx, xy, yy), a r' (xx, xy, yx, yy) and r r', where a is the way from
-    the middle to a cell and r what its motion is beyond the mean; of cells at the outline r^2 (x, y); over
-    pairs of cells, the kernel times 1, and times a a' of the two (xx, xy, yy); at the end those of
-    `_sum_markers`. All are 0 without a cell."""
+    the middle to a cell and r what its motion is beyond the mean; a times the slope of r along a (x, y); of
+    all cells share (1 - share); over pairs of cells, the kernel times 1, and times a a' of the two (xx, xy,
+    yy); at the end those of `_sum_markers`. All are 0 without a cell."""
     # The cells whose gel may be in the part.
     least_x, most_x = _extent(planes[MOVED_X], place[3])
     least_y, most_y = _extent(planes[MOVED_Y], place[3])
@@ -258,6 +258,16 @@ def sum_region(
                 # In the cell's own row, each pair comes twice.
                 _sum_pairs(cells, i, j, between[between.shape[0] // 2 + j - i], 1.0 if i == j else 2.0, sums)
         _sum_markers(to_region, inverse, removed, planes, sums)
+
+
+@helper
+def _outwards(values: Floats, row: int, column: int, across: float, down: float) -> float:
+    """How much a value changes along the way (across, down) from a cell, by its neighbours; in cells."""
+    left, right = max(column - 1, 0), min(column + 1, values.shape[1] - 1)
+    above, below = max(row - 1, 0), min(row + 1, values.shape[0] - 1)
+    along_x = (values[row, right] - values[row, left]) / max(right - left, 1)
+    along_y = (values[below, column] - values[above, column]) / max(below - above, 1)
+    return float(across * along_x + down * along_y)
 
 
 @helper
@@ -323,7 +333,6 @@ def _sum_cells(
             )
             if share == 0:
                 continue
-            edge = share * total * (1 - share * total)
             sums[3] += at_x * across
             sums[4] += at_x * down
             sums[5] += at_y * down
@@ -332,8 +341,9 @@ def _sum_cells(
             sums[8] += at_y * right
             sums[9] += at_y * below
             sums[10] += share * (right * right + below * below)
-            sums[11] += edge * right * right
-            sums[12] += edge * below * below
+            sums[11] += share * _outwards(cells[MOTION_X], row, column, across, down) / spacing
+            sums[12] += share * _outwards(cells[MOTION_Y], row, column, across, down) / spacing
+            sums[13] += share * total * (1 - share * total)
             near = to_markers[begin[0] + row, begin[1] + column]
             for n in range(near.size):
                 to_region[0, n] += share * near[n]
@@ -390,10 +400,10 @@ def _sum_pairs(cells: Floats, row: int, other: int, kernel_row: Floats, times: f
             with_one += ones[k] * near[k]
             with_x += along[k] * near[k]
             with_y += downwards[k] * near[k]
-        sums[13] += times * one * with_one
-        sums[14] += times * across * with_x
-        sums[15] += times * (across * with_y + down * with_x) / 2
-        sums[16] += times * down * with_y
+        sums[14] += times * one * with_one
+        sums[15] += times * across * with_x
+        sums[16] += times * (across * with_y + down * with_x) / 2
+        sums[17] += times * down * with_y
 
 
 @helper
@@ -425,15 +435,15 @@ def _sum_markers(to_region: Floats, inverse: Floats, removed: Floats, planes: Fl
         squares += to_region[0, i] * planes[PRECISION, i] * (x * x + y * y)
         near += to_region[0, i] if planes[PRECISION, i] > 0 else 0.0
         one, x, y = weights[0, i], weights[1, i], weights[2, i]
-        sums[18] += one * to_region[0, i]
-        sums[19] += x * to_region[1, i]
-        sums[20] += x * to_region[2, i]
-        sums[21] += y * to_region[2, i]
-        sums[22] += variance * one * one
-        sums[23] += variance * x * x
-        sums[24] += variance * x * y
-        sums[25] += variance * y * y
-    sums[17] = squares / max(near, _NOWHERE)
+        sums[19] += one * to_region[0, i]
+        sums[20] += x * to_region[1, i]
+        sums[21] += x * to_region[2, i]
+        sums[22] += y * to_region[2, i]
+        sums[23] += variance * one * one
+        sums[24] += variance * x * x
+        sums[25] += variance * x * y
+        sums[26] += variance * y * y
+    sums[18] = squares / max(near, _NOWHERE)
 
 
 @kernel("void(float64[:, ::1], Array(uint8, 2, 'C', readonly=True), boolean[::1])")

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Mask
-from tactflow.vision.flow.displacement_field import CELL, DisplacementField, Grid
-from tactflow.vision.flow.in_mask import OUTLINE, UNKNOWN
+from tactflow.vision.flow.displacement_field import CELL, OUTLINE, DisplacementField, Grid
+from tactflow.vision.flow.in_mask import UNKNOWN
 from tactflow.vision.flow.registration import CELL as PX
 from tactflow.vision.flow.registration import UNLIKE, Registration, Template, register, template_of
 from tactflow.vision.types import Slip
