@@ -35,10 +35,12 @@ what light from one side shows, misses 0.25 with nothing beside it; sensors with
 WEAKEST: Final = 0.01
 """Power of a mixture of channels, relative to the strongest one, from which on it tells of a slope: a tenth
 in size. Below is noise, in a faint contact that brightens as a whole."""
+ONE_SLOPE: Final = 3 / 8
+"""The same where all channels change alike: one slope of a round contact misses a quarter, depth a half."""
 CLEAR: Final = 2.0
 """Size of a change that is more than noise, standard deviations."""
 ONE_WAY: Final = 1 / 3
-"""Part of the clear changes that is left when they are added up, from which on they are taken for depth: of
+"""Part of the clear changes that is left when they are added up, from which on they are depth: of
 slopes there are as many up as down. Gray pictures of sensors lit from several sides have 0.1 to 0.3, coatings
 0.4 to 0.9."""
 MORE: Final = 0.1
@@ -138,7 +140,7 @@ class HeightModel:
         power = basis.T @ np.kron(np.eye(2), self._power) @ basis
         missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
         mixtures = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
-        integrable = self._alike or missing[0] <= INTEGRABLE
+        integrable = missing[0] <= (ONE_SLOPE if self._alike else INTEGRABLE)
         return mixtures / np.linalg.norm(mixtures) if integrable else None
 
 
