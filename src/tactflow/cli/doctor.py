@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         about = {
             "source": public_address(observation.source),
             "frames": observation.frames,
-            "size": observation.pairs[0].image.shape,
+            "size": observation.pairs[0].image.shape[1::-1],
         }
         show_json({**about, "verdict": verdict, "checks": findings, "versions": facts("", None)})
     else:

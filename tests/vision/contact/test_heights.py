@@ -102,6 +102,15 @@ def test_lines_lie_within_one_another_and_count_the_marked_cells(seed: int) -> N
             assert (labels == labels.flat[lines.inside[outer]])[inside].all()
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**16))
+def test_contacts_have_no_cell_in_common(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    bumps = [bump(*draw.uniform(5, 55, 2), draw.uniform(3, 15), draw.uniform(0.5, 1)) for _ in range(4)]
+    found = [core(region) for region in regions(Heights(np.asarray(sum(bumps), np.float32), None))]
+    assert np.sum(found, axis=0).max() == 1
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**16))
 def test_whatever_colours_answer_to_slopes_the_surface_is_found_up_to_a_factor(seed: int) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tactflow.sim import open_scene
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers, to_gray
 from tactflow.vision.markers.lattice import neighbour_graph
 from tests.vision.dots import grid, match, rectified, render
@@ -473,3 +474,27 @@ def test_who_writes_to_an_answer_does_not_change_the_next_one() -> None:
     again = detect_markers(picture)
     assert np.array_equal(again.centers, centers)
     assert np.array_equal(again.edges, edges)
+
+
+@pytest.mark.parametrize("dot_radius", [None, 3.5])
+def test_dots_between_pixels_have_one_peak_each(dot_radius: float | None) -> None:
+    """Each is as high at two or four pixels."""
+    rows, columns = np.mgrid[:120, :140]
+    away = np.hypot((columns - 20.5) % 20 - 10, (rows - 20.5) % 20 - 10)
+    picture = np.asarray(180 - 120 * np.clip(4 - away, 0, 1), np.uint8)
+    detection = detect_markers(picture, dot_radius=dot_radius)
+    assert detection.pitch == pytest.approx(20)
+    assert len(np.unique(np.rint(detection.centers), axis=0)) == len(detection.centers) >= 24
+
+
+def test_one_square_is_no_grid_of_marks() -> None:
+    picture = np.full((200, 200), 180, np.uint8)
+    picture[100:104, 100:104] = 60
+    with pytest.raises(NoMarkersError):
+        detect_markers(picture)
+
+
+def test_marks_that_are_never_probable_enough_are_none() -> None:
+    picture = open_scene("press").frame(0)
+    with pytest.raises(NoMarkersError):
+        detect_markers(picture, least_probability=1.0)

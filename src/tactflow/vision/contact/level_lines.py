@@ -100,7 +100,7 @@ class ContactFinder:
         self._bumps = 0.0
 
     def __call__(self, heights: Heights, changed: Flags) -> list[ContactRegion]:
-        """Regions that do not overlap, the most salient one first.
+        """Regions whose lines do not overlap, the most salient one first.
 
         heights : of the gel's cells. changed : (h, w) bool, cells of which each contact encloses some.
         """
@@ -127,29 +127,32 @@ def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
     lines = level_lines(heights, changed)
     regions: list[ContactRegion] = []
     left, first, slope = lines.salience.copy(), 0.0, 0.0
-    while left.any() and left.max() >= LESSER * first:
+    free = np.ones(left.size, np.bool_)
+    while (salience := float(left.max(initial=0))) > 0 and salience >= LESSER * first:
         steepest = int(left.argmax())
-        outwards = _outwards(lines, steepest)
+        outwards = _outwards(lines, steepest, free)
         wide = outwards[-1]
         if not lines.encloses[wide]:
             left[steepest] = 0
             continue
         if not regions:
-            first, slope = float(left[steepest]), float(lines.slope[steepest])
+            first, slope = salience, float(lines.slope[steepest])
         # The gel is steepest between the steepest line and the next one.
         core, near = (_inside(lines, line) for line in (outwards[:2][-1], wide))
         regions.append(_region(core, near))
-        left[: wide + 1][near.ravel()[lines.inside[: wide + 1]] > 0] = 0
+        # Lines within one another are of one contact.
+        free[: wide + 1][near.ravel()[lines.inside[: wide + 1]] > 0] = False
         while wide >= 0:
-            left[wide] = 0
+            free[wide] = False
             wide = lines.outer[wide]
+        left *= free
     return _Contacts(regions, slope)
 
 
-def _outwards(lines: LevelLines, steepest: int) -> list[int]:
-    """The lines from the steepest one outwards that are not much flatter."""
+def _outwards(lines: LevelLines, steepest: int, free: Flags) -> list[int]:
+    """The lines from the steepest one outwards that are not much flatter, nor of another contact."""
     found, least = [steepest], FLATTER * lines.slope[steepest]
-    while (outer := int(lines.outer[found[-1]])) >= 0 and lines.slope[outer] >= least:
+    while (outer := int(lines.outer[found[-1]])) >= 0 and free[outer] and lines.slope[outer] >= least:
         found.append(outer)
     return found
 

@@ -24,7 +24,7 @@ from tactflow.vision.types import Markers, MarkerStatus
 LENGTH: Final = 1.5
 """Correlation length of the field, pitches. Kernel and length are those that predict the markers of nine real
 recordings best, each marker from all others (leave-one-out likelihood); on four other recordings the best
-length is 1.4 (docs/flow.md)."""
+length is 1.4."""
 NUGGET: Final = 1e-5
 """Variance added to each marker's, relative to the field's: it keeps the matrix well conditioned. Markers
 known to 0.015 px in a field of 5 px have as much. Chosen by hand."""

@@ -243,6 +243,8 @@ def _found_in(
         _require_gel_between(gray, best, marks)
         # One alone has no probability.
         marks = marks.at(~(probability(evidence(gray, marks)) < least_probability))
+        if not len(marks.points):
+            raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(best))
         return _detection(gray, best, marks, found[1:])
     return _detection(gray, best, best.spots, found[1:])
 

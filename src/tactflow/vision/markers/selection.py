@@ -174,6 +174,8 @@ def links(points: Floats) -> NDArray[np.int64]:
     if len(points) < 2:
         return np.zeros((0, 2), np.int64)
     edges = neighbour_graph(points, LONGEST_LINK * pitch_of(points))
+    if not len(edges):
+        return edges
     length = np.hypot(*(points[edges[:, 0]] - points[edges[:, 1]]).T)
     usual = np.asarray(median(np.tile(length, 2), edges.T.ravel(), np.arange(len(points))))
     return np.asarray(edges[length < LONG_LINK * usual[edges].min(axis=1)], np.int64)

@@ -167,6 +167,9 @@ def _peaks(response: NDArray[np.float32], least: float, reach: float) -> tuple[F
     peak[[0, -1]] = False
     peak[:, [0, -1]] = False
     rows, columns = np.nonzero(peak)
+    # Pixels of one peak that are equally high count once.
+    _, first = np.unique(cv2.connectedComponents(peak.view(np.uint8))[1][rows, columns], return_index=True)
+    rows, columns = rows[first], columns[first]
     value = response[rows, columns].astype(np.float64)
     points = np.column_stack([columns, rows]).astype(np.float64)
     for axis, (step_y, step_x) in enumerate(((0, 1), (1, 0))):
