@@ -18,7 +18,7 @@ import pytest
 import zmq
 
 from tactflow.engine.run import Runner
-from tactflow.system import lines
+from tactflow.message import lines
 from tests.clock import PATIENCE, until
 from tests.faults.rig import FRAMES, Seen, array, run
 
