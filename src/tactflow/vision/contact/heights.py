@@ -104,9 +104,9 @@ class HeightModel:
         their mean.
         """
         flat = change.reshape(3, -1)
-        power = np.asarray(flat @ flat.T, np.float64)
-        if not power.trace() > MORE * self._power.trace():
+        if not cv2.norm(flat, cv2.NORM_L2SQR) > MORE * self._power.trace():
             return
+        power = np.asarray(flat @ flat.T, np.float64)
         size = _extended(*change.shape[1:])
         spectrum = np.asarray(fft.rfft2(change, size), np.complex64)
         across, down = _frequencies(*size)
