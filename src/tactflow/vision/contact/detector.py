@@ -263,11 +263,11 @@ class ContactDetector:
         heights = self._heights(self._background.signed_change(change))
         mask = np.zeros(shape, np.uint8)
         regions = self._contacts(heights, self._before)
-        sloping = heights.alike and heights.slopes is not None
         for rows, columns, inside, core in regions:
             window = self._background.window_change(change, rows, columns, inside)
             surely = core.repeat(2, axis=0).repeat(2, axis=1)
-            draw_level(contact_level(window, surely, sloping), CELL * rows.start, CELL * columns.start, mask)
+            level = contact_level(window, surely, heights.alike)
+            draw_level(level, CELL * rows.start, CELL * columns.start, mask)
         if not regions:
             draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL)
         return mask

@@ -32,17 +32,16 @@ INTEGRABLE: Final = 0.2
 """Part of the slopes' power that may be missing in those of a surface. One slope of a round contact, which is
 what light from one side shows, misses 0.25 with nothing beside it; sensors with lamps on several sides miss
 0.00 to 0.15."""
+ONE_SLOPE: Final = 3 / 8
+"""The same where all channels change alike: one slope of a round contact misses a quarter, depth a half."""
 WEAKEST: Final = 0.01
 """Power of a mixture of channels, relative to the strongest one, from which on it tells of a slope: a tenth
 in size. Below is noise, in a faint contact that brightens as a whole."""
-ONE_SLOPE: Final = 3 / 8
-"""The same where all channels change alike: one slope of a round contact misses a quarter, depth a half."""
 CLEAR: Final = 2.0
 """Size of a change that is more than noise, standard deviations."""
 ONE_WAY: Final = 1 / 3
-"""Part of the clear changes that is left when they are added up, from which on they are depth: of
-slopes there are as many up as down. Gray pictures of sensors lit from several sides have 0.1 to 0.3, coatings
-0.4 to 0.9."""
+"""Part of the clear changes that is left when they are added up, from which on they are depth: slopes go up
+as well as down. In gray pictures of fifteen labs it is 0.0 to 0.3, or 0.4 to 0.9."""
 MORE: Final = 0.1
 """Part of all the power so far that a frame has at least to tell more: a sensor is known after ten such
 frames. From 0.02 to 0.3 outlines overlap as well with real ones within 0.01."""
@@ -53,7 +52,7 @@ class Heights(NamedTuple):
 
     values : (h, w) float32, height of each cell above the gel at rest, in some unit, or how much it has
     changed. slopes : (2, 3) float32, mixtures of the channels that are slopes along x and y; None where no
-    mixtures are. alike : whether all channels change alike, so that they are one and the same slope.
+    mixtures are. alike : whether that is one and the same slope, since all channels change alike.
     """
 
     values: Floats32
