@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 SCENES = (
-    *("press", "bright", "cable", "bent_cable", "edge", "ring", "screw"),
+    *("press", "bright", "cable", "edge", "ring", "screw"),
     *("two", "slide", "jumps", "dense", "worn"),
 )
 PIPELINES = ("default", "wedge", "markerless", "classic")

@@ -1,11 +1,8 @@
-"""Create the pictures of README.md, view.md and accuracy.md.
+"""Create the pictures of README.md and view.md: results.jpg, view-dark.jpg, view-phone.jpg.
 
-    python docs/pictures.py            results.jpg, view-dark.jpg, view-phone.jpg
-    python docs/pictures.py troubles   accuracy/troubles.jpg
-
-The first calibrates the simulated sensor, draws its results with the stage `visualize`, and takes screenshots
-of the live page in Chromium. It needs the packages of the browser tests, and an idle machine because the page
-shows latency. The second draws the worst frames of `tactflow bench`. Each takes two minutes.
+It calibrates the simulated sensor, draws its results with the stage `visualize`, and takes screenshots of the
+live page in Chromium. It needs the packages of the browser tests, and an idle machine because the page shows
+latency. It takes two minutes.
 """
 
 from __future__ import annotations
@@ -25,7 +22,6 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, sync_playwright
 
 import tactflow
-from tactflow.bench.scenes import TROUBLES
 
 DOCS = Path(__file__).resolve().parent
 PITCH: Final = 1.724
@@ -43,10 +39,6 @@ QUALITY: Final = 82
 """JPEG quality of all pictures."""
 FULL_SECONDS: Final = 11
 """Seconds until the plots of the page are full."""
-ACROSS: Final = 5
-"""Columns of the picture of troubles."""
-SMALL: Final = (270, 380)
-"""Width and height of each, px."""
 DEEP: Final = "() => parseFloat(document.getElementById('value-depth').textContent) > 0.2"
 
 
@@ -63,20 +55,6 @@ def main() -> None:
         drawn = [_drawn(scene, calibration, *frames) for scene, frames in SHOWN.items()]
         cv2.imwrite(str(DOCS / "results.jpg"), np.hstack(drawn), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         _pages(calibration)
-
-
-def troubles() -> None:
-    """Create the picture of the worst frame of each scene with troubles of real gels."""
-    names = [case.label for case in TROUBLES]
-    with tempfile.TemporaryDirectory() as folder:
-        scenes = [word for name in names for word in ("--scene", name)]
-        command = [sys.executable, "-m", "tactflow", "bench", *scenes, "--pictures", folder]
-        subprocess.run([*command, "--json", os.devnull], check=True, stdout=subprocess.DEVNULL)
-        files = [next(Path(folder).glob(f"{name}-[dm]*.png")) for name in names]
-        pictures = [cv2.resize(cv2.imread(str(file)), SMALL, interpolation=cv2.INTER_AREA) for file in files]
-    rows = [np.hstack(pictures[first : first + ACROSS]) for first in range(0, len(pictures), ACROSS)]
-    path = DOCS / "accuracy" / "troubles.jpg"
-    cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
 def _drawn(scene: str, calibration: Path, first: int, last: int) -> NDArray[np.uint8]:
@@ -139,7 +117,4 @@ def _tactflow(*words: str) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["troubles"]:
-        troubles()
-    else:
-        main()
+    main()

@@ -19,19 +19,6 @@ def scene() -> Scene:
     return open_scene("slide?frames=12")
 
 
-@pytest.mark.parametrize("suffix", [".avi", ".mkv"])
-def test_videos_are_lossless(scene: Scene, tmp_path: Path, suffix: str) -> None:
-    export.write_frames(scene, tmp_path / f"a{suffix}")
-    reader = cv2.VideoCapture(str(tmp_path / f"a{suffix}"))
-    assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(60)
-    for index in range(12):
-        there, image = reader.read()
-        assert there
-        np.testing.assert_array_equal(image, scene.frame(index))
-    assert not reader.read()[0]
-    reader.release()
-
-
 def test_a_folder_holds_numbered_images(scene: Scene, tmp_path: Path) -> None:
     export.write_frames(scene, tmp_path / "frames")
     names = sorted(item.name for item in (tmp_path / "frames").iterdir())
@@ -45,7 +32,7 @@ def test_an_interrupted_export_leaves_nothing_behind(scene: Scene, tmp_path: Pat
         if done == 3:
             raise KeyboardInterrupt
 
-    for name in ("a.npy", "a.avi", "frames", "a.jsonl"):
+    for name in ("a.npy", "frames", "a.jsonl"):
         write = export.write_truth if name == "a.jsonl" else export.write_frames
         with pytest.raises(KeyboardInterrupt):
             write(scene, tmp_path / name, stop)

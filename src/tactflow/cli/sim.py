@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help=".npy, .avi or .mkv (lossless), or a folder for numbered PNG files",
+        help=".npy, or a folder for numbered PNG files",
     )
     parser.add_argument(
         "--truth",

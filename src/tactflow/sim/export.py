@@ -24,8 +24,8 @@ Report = Callable[[int], None]
 def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
     """Write all frames of a scene.
 
-    path : `.npy` (uint8 N x H x W x 3 BGR), `.avi` or `.mkv` (HFYU, lossless), or, without a suffix, a folder
-        of numbered PNG files. Overwrites existing files.
+    path : `.npy` (uint8 N x H x W x 3 BGR) or, without a suffix, a folder of numbered PNG files. Overwrites
+        existing files.
     report : called with the number of frames written so far.
 
     Raises ValueError for an unsupported suffix and OSError if the path is not writable.
@@ -54,12 +54,11 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
 
 def frames_writer(path: Path) -> Callable[[Scene, Path, Report], None]:
     """The function that writes frames to such a path; raises ValueError for an unsupported suffix."""
-    writers = {".npy": _write_npy, ".avi": _write_video, ".mkv": _write_video, "": _write_folder}
-    if path.is_dir():
+    if path.is_dir() or not path.suffix:
         return _write_folder
-    if path.suffix.lower() not in writers:
-        raise ValueError(f"required frames as .npy, .avi, .mkv or a folder, got {path.name!r}")
-    return writers[path.suffix.lower()]
+    if path.suffix.lower() != ".npy":
+        raise ValueError(f"required frames as .npy or a folder, got {path.name!r}")
+    return _write_npy
 
 
 def _write_npy(scene: Scene, path: Path, report: Report) -> None:
@@ -71,26 +70,6 @@ def _write_npy(scene: Scene, path: Path, report: Report) -> None:
         for index in range(len(scene)):
             file.write(np.ascontiguousarray(scene.frame(index)).data)
             report(index + 1)
-
-
-def _write_video(scene: Scene, path: Path, report: Report) -> None:
-    # Lossless in OpenCV, and readable up to the last frame after a crash.
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"HFYU"), scene.fps, scene.size)
-    if not writer.isOpened():
-        raise OSError(f"{path}: the video file cannot be opened for writing")
-    try:
-        for index in range(len(scene)):
-            writer.write(scene.frame(index))
-            report(index + 1)
-    finally:
-        writer.release()
-    # OpenCV does not report a full disk.
-    reader, readable = cv2.VideoCapture(str(path)), 0
-    while reader.grab():
-        readable += 1
-    reader.release()
-    if readable < len(scene):
-        raise OSError(f"{path}: only {readable} of {len(scene)} frames can be read back; is the disk full?")
 
 
 def _write_folder(scene: Scene, path: Path, report: Report) -> None:

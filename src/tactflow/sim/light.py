@@ -140,16 +140,6 @@ def brightness(light: Light, press: Press, depth: Array) -> Array:
     return np.asarray(added, np.float32)
 
 
-def settling(moment: int, frames: int) -> NDArray[np.float64]:
-    """Gains (3,), BGR, of a camera that starts too bright and too blue and settles within `frames`.
-
-    Like a control loop, they change fast at first and end smoothly. The first frame clips bright parts of the
-    gel.
-    """
-    left = max(1.0 - moment / frames, 0.0) ** 2 if frames else 0.0
-    return np.asarray(1.0 + left * np.array([0.9, 0.7, 0.5]))
-
-
 def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:
     """(H, W, 3) float32: factor on the light after a lamp on the right is switched on.
 
@@ -169,16 +159,6 @@ def spot(size: tuple[int, int], center: tuple[float, float], spread: tuple[float
     return np.outer(down, across)
 
 
-def leds(size: tuple[int, int], count: int) -> Array:
-    """(H, W) float32: LEDs, 1 at their centres, alternating between the upper and the lower border."""
-    width, height = size
-    total = np.zeros((height, width), np.float32)
-    for number in range(count):
-        y = height - 16.0 if number % 2 else 16.0
-        total += spot(size, ((number + 0.5) * width / count, y), (18.0, 13.0))
-    return total
-
-
 def add_mirror_spots(image: NDArray[np.float32], x: Array, y: Array, strength: float, seed: int) -> None:
     """Add specular reflections of lamps to the untouched gel (H, W, 3), grey levels; x, y : (H, W)
     coordinates."""
@@ -188,17 +168,6 @@ def add_mirror_spots(image: NDArray[np.float32], x: Array, y: Array, strength: f
         center_x, center_y, spread = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(5, 16)
         spot = np.exp(-((x - center_x) ** 2 + (y - center_y) ** 2) / np.float32(2 * spread**2))
         image += np.float32(110.0 * strength) * spot[..., None]
-
-
-@lru_cache(maxsize=2)
-def blotches(size: tuple[int, int], contrast: float, seed: int) -> Array:
-    """(H, W) float32: light transmitted by a random pattern of blotches about 15 px wide."""
-    draw = np.random.default_rng([seed, 0x626C]).standard_normal((size[1], size[0]), dtype=np.float32)
-    smooth = np.asarray(cv2.GaussianBlur(draw, (0, 0), 5.0), dtype=np.float32)
-    pattern = 0.5 + 0.5 * np.tanh(2.0 * smooth / float(smooth.std()))
-    shade = np.asarray(1.0 - contrast * pattern, dtype=np.float32)
-    shade.setflags(write=False)
-    return shade
 
 
 def highlight(depth: Array, step: float, strength: float) -> Array:

@@ -20,12 +20,6 @@ Canvas = NDArray[np.int16]
 
 _STEP = 2
 """Grid spacing of the gel's surface, raw px; its shading is smooth. Chosen by hand."""
-_SPECKLE_STEP = 20
-"""Grid spacing of the displacement of the speckle pattern, raw px; the gel stretches smoothly. Chosen by
-hand."""
-_INVERSIONS = 4
-"""Fixed-point iterations to invert the displacement of the gel. Chosen by hand: the pattern need not be
-exact."""
 _LAMP_AT = 0.475
 """Fraction of a recording after which the lamp is on: between the two contacts."""
 _BRIGHT_MARKER = 225.0
@@ -47,21 +41,21 @@ class Painter:
         self._half = markers.half_patch(layout.radius * (1.0 + settings.sizes), settings.shape, widened)
 
     def frame(
-        self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None
+        self, index: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None
     ) -> NDArray[np.uint8]:
         """Render the raw frame, a new (600, 800, 3) uint8 BGR array.
 
-        index : of the frame. moment : of the scene it shows, in frames. shown : (N,), false for invisible
-        markers; None for a frame without markers, dirt and noise.
+        index : of the frame. shown : (N,), false for invisible markers; None for a frame without markers,
+        dirt and noise.
         """
         settings = self._settings
-        canvas = self._canvas(index, moment, pressed, shown)
-        scale = self._gain(moment) / FIXED_POINT
+        canvas = self._canvas(index, pressed, shown)
+        scale = self._gain(index) / FIXED_POINT
         if shown is None:
             return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), np.uint8)
         # Drawing the noise of a seed takes 0.3 s; without any, the canvas takes its place with weight 0.
         noisy_camera = settings.noise or settings.shot
-        noise = optics.sensor_noise(settings.seed, moment, canvas.shape) if noisy_camera else canvas
+        noise = optics.sensor_noise(settings.seed, index, canvas.shape) if noisy_camera else canvas
         if settings.shot:
             noisy = np.asarray(canvas, np.float32) * np.float32(scale)
             spread = np.sqrt(settings.noise**2 + settings.shot**2 * np.maximum(noisy, 0) / np.float32(128.0))
@@ -78,15 +72,13 @@ class Painter:
             image = optics.compressed(np.asarray(image, np.uint8), settings.jpeg)
         return np.asarray(image, dtype=np.uint8)
 
-    def _gain(self, moment: int) -> float:
+    def _gain(self, index: int) -> float:
         settings = self._settings
-        seconds = moment / FPS
+        seconds = index / FPS
         warm = 1.0 + settings.drift * (1.0 - float(np.exp(-seconds / 5.0)))
         return warm * (1.0 + settings.flicker * float(np.sin(2 * np.pi * 100.0 * seconds)))
 
-    def _canvas(
-        self, index: int, moment: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None
-    ) -> Canvas:
+    def _canvas(self, index: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None) -> Canvas:
         """A frame before gain and noise, possibly a view. shown : None to omit markers and dirt."""
         settings = self._settings
         if not pressed:
@@ -99,22 +91,16 @@ class Painter:
                 self._mark(padded, pressed, shown)
         half = self._half
         canvas = padded[half:-half, half:-half]
-        if settings.speckle:
-            shade = cv2.merge([self._speckle(pressed)] * 3)
-            canvas = np.asarray(cv2.multiply(canvas, shade, dtype=cv2.CV_16S), np.int16)
         if settings.stray:
             canvas = self._with_reflections(canvas, pressed)
         if settings.blur:
             canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), settings.blur), dtype=np.int16)
         if settings.gain:
             rows = np.arange(SIZE[1], dtype=np.float32) / SIZE[1]
-            wave = np.sin(2 * np.pi * (2.0 * rows - 0.37 * moment)).astype(np.float32)
+            wave = np.sin(2 * np.pi * (2.0 * rows - 0.37 * index)).astype(np.float32)
             banded = canvas * (np.float32(1.0) + np.float32(settings.gain) * wave)[:, None, None]
             canvas = np.rint(banded, out=banded).astype(np.int16)
-        if index < settings.settle:
-            gains = np.append(light.settling(index, settings.settle), 1.0)
-            canvas = np.asarray(cv2.multiply(canvas, gains, dtype=cv2.CV_16S), np.int16)
-        if settings.lamp and moment >= _LAMP_AT * settings.frames:
+        if settings.lamp and index >= _LAMP_AT * settings.frames:
             lamp = light.lamp(SIZE, settings.lamp)
             canvas = np.asarray(cv2.multiply(canvas, lamp, dtype=cv2.CV_16S), np.int16)
         return canvas
@@ -151,8 +137,6 @@ class Painter:
             image *= (np.float32(1.0) - np.float32(settings.vignette) * radius)[..., None]
         if settings.perspective:
             image *= self._gel_window()
-        if settings.leds:
-            image += np.float32(255.0) * light.leds(SIZE, settings.leds)[..., None]
         if settings.aperture:
             image *= self._aperture[..., None]
         np.clip(image, 0, 500, out=image)
@@ -216,20 +200,6 @@ class Painter:
         cos, sin = np.cos(angle), np.sin(angle)
         axes = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], 1)
         return rest, rng.uniform(0.2, 0.75, count), axes * squeeze[:, :, None]
-
-    def _speckle(self, pressed: Sequence[gel.Press]) -> NDArray[np.float32]:
-        """(H, W): fraction of light transmitted by the speckle pattern."""
-        blocks = self._gel_blocks(_SPECKLE_STEP).reshape(-1, 2)
-        origin = blocks
-        for _ in range(_INVERSIONS if pressed else 0):
-            origin = blocks - gel.displacement(pressed, origin)
-        width, height = SIZE
-        moved = (blocks - origin).reshape(height // _SPECKLE_STEP, width // _SPECKLE_STEP, 2)
-        source = self._gel_blocks(1) - cv2.resize(moved, SIZE, interpolation=cv2.INTER_LINEAR)
-        pattern = light.blotches(SIZE, self._settings.speckle, self._settings.seed)
-        x, y = source[..., 0].astype(np.float32), source[..., 1].astype(np.float32)
-        shade = cv2.remap(pattern, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        return np.asarray(shade, dtype=np.float32)
 
     def _with_reflections(self, canvas: Canvas, pressed: Sequence[gel.Press]) -> Canvas:
         """Add the stray reflection of each contact, a bright streak on the opposite side of the frame."""

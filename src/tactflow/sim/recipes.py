@@ -33,7 +33,6 @@ SCENES: dict[str, Recipe] = {
         {"shear": 0.0},
     ),
     "cable": Recipe("a straight cable is pressed at several angles", _CABLE),
-    "bent_cable": Recipe("a cable that bends by 70 degrees", _CABLE, {"bend": 70.0}),
     "slide": Recipe(
         "a ball drags the gel along until it slips, and slides over it",
         Programme(_SPHERE, wander=(210.0, 130.0), travel=260.0, hold=50, period=90, depths=(1.0, 0.6, 0.85)),
@@ -164,12 +163,6 @@ SCENES: dict[str, Recipe] = {
         Programme(_SPHERE, wander=(120.0, 80.0), hold=50, period=90, depths=(1.0, 0.8), dilation=0.2),
         {"shear": 1.3},
     ),
-    "warm_up": Recipe(
-        "presses that begin soon after exposure and white balance have settled", _PRESS, {"settle": 12}
-    ),
-    "stale": Recipe(
-        "six buffered frames of an earlier contact at the start", _PRESS, {"stale": 6, "settle": 3}
-    ),
     "lamp": Recipe(
         "a lamp is switched on between two presses",
         Programme(_SPHERE, contacts=2, rise=5, depths=(1.0, 0.7)),
@@ -218,12 +211,6 @@ SCENES: dict[str, Recipe] = {
         "markers of many sizes without a regular grid, seen by a tilted camera",
         _PRESS,
         {"markers": (13, 10), "sizes": 0.7, "jitter": 0.06, "perspective": 0.12},
-    ),
-    "speckle": Recipe("random blotches instead of markers", _PRESS, {"markers": (0, 0), "speckle": 0.6}),
-    "leds": Recipe(
-        "faint bright markers, and six glaring LEDs beside them",
-        _PRESS,
-        {"polarity": "bright", "worn": 1.0, "leds": 6, "markers": (13, 10)},
     ),
     "stray": Recipe("presses that cause a reflection on the far side of the gel", _PRESS, {"stray": 0.8}),
 }  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.sim import gel, markers, motion, shapes
+from tactflow.sim import gel, markers, motion
 from tactflow.sim.camera import FPS, SIZE, Camera
 from tactflow.sim.picture import Painter
 from tactflow.sim.recipes import SCENES
@@ -13,9 +13,6 @@ from tactflow.sim.settings import Settings, parse_query
 from tactflow.sim.truth import Truth
 from tactflow.system.spelling import did_you_mean
 from tactflow.vision.geometry import PixelMapping, Preprocessor
-
-_STALE_FRAMES = 300
-"""Number of frames searched for the deepest contact, which stale frames show; enough for a few contacts."""
 
 
 def scene_descriptions() -> dict[str, str]:
@@ -66,14 +63,8 @@ class Scene:
         self.layout = markers.layout(settings, SIZE)
         self._raw = PixelMapping.identity(SIZE)
         self._programme = programme
-        self._shapes = tuple(
-            make(bend=settings.bend) if make is shapes.cable else make()
-            for make in (programme.indenters if programme else ())
-        )
+        self._shapes = tuple(make() for make in (programme.indenters if programme else ()))
         self._painter = Painter(settings, self.camera, self.layout)
-        self._stale = 0
-        if settings.stale:
-            self._stale = max(range(min(len(self), _STALE_FRAMES)), key=self._depth)
         self._vanishing = np.random.default_rng([settings.seed, 0x7661]).random(len(self.layout.rest))
 
     def __len__(self) -> int:
@@ -84,18 +75,16 @@ class Scene:
 
     def presses(self, index: int) -> tuple[gel.Press, ...]:
         """The indenters at frame `index`."""
-        return self._contact(self._moment(index))[0]
+        return self._contact(index)[0]
 
     def frame(self, index: int) -> NDArray[np.uint8]:
         """Render raw frame `index`, a new (600, 800, 3) uint8 BGR array."""
-        moment = self._moment(index)
-        pressed, cycle = self._contact(moment)
-        return self._painter.frame(index, moment, pressed, ~self._hidden(cycle))
+        pressed, cycle = self._contact(index)
+        return self._painter.frame(index, pressed, ~self._hidden(cycle))
 
     def clean(self, index: int) -> NDArray[np.uint8]:
         """Render raw frame `index` without markers, dirt and noise, a new (600, 800, 3) uint8 BGR array."""
-        moment = self._moment(index)
-        return self._painter.frame(index, moment, self._contact(moment)[0], None)
+        return self._painter.frame(index, self._contact(index)[0], None)
 
     def truth(self, index: int, mapping: PixelMapping | Preprocessor | None = None) -> Truth:
         """Ground truth of frame `index`.
@@ -104,7 +93,7 @@ class Scene:
             pixel centres. None: raw coordinates.
         """
         pixels = mapping.mapping if isinstance(mapping, Preprocessor) else mapping or self._raw
-        presses, cycle = self._contact(self._moment(index))
+        presses, cycle = self._contact(index)
         shown = ~self._hidden(cycle)
         return Truth(presses, self.camera, pixels, self.layout.rest, shown)
 
@@ -112,19 +101,12 @@ class Scene:
         """(N,) bool: markers invisible during contact number `cycle` (-1: no contact)."""
         return (self._vanishing < self.settings.vanish) & (cycle >= 0)
 
-    def _moment(self, index: int) -> int:
-        """Moment that frame `index` shows: stale frames show an earlier contact."""
+    def _contact(self, index: int) -> tuple[tuple[gel.Press, ...], int]:
+        """The indenters at frame `index`, and the index of their contact."""
         if not 0 <= index < len(self):
             raise IndexError(f"required a frame in [0, {len(self) - 1}], got {index}")
-        return self._stale if index < self.settings.stale else index
-
-    def _depth(self, moment: int) -> float:
-        return max((press.depth for press in self._contact(moment)[0]), default=0.0)
-
-    def _contact(self, moment: int) -> tuple[tuple[gel.Press, ...], int]:
-        """The indenters at a moment, and the index of their contact."""
         if self._programme is None:
             return (), -1
         return motion.presses(
-            self._programme, self._shapes, moment, self.settings, size=SIZE, pitch=self.layout.pitch
+            self._programme, self._shapes, index, self.settings, size=SIZE, pitch=self.layout.pitch
         )

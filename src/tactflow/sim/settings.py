@@ -52,7 +52,6 @@ class Settings(BaseModel):
     missing: float = _number(0, 0, 0.9, "fraction of markers that were never printed")
     dirty: float = _number(0, 0, 2, "specks of dirt per marker")
     vanish: float = _number(0, 0, 0.9, "fraction of markers that are invisible during a contact")
-    speckle: float = _number(0, 0, 1, "contrast of random blotches that move with the gel")
     light: Literal["photometric", "bright", "mixed", "dark_channel", "darkening", "absorbing"] = Field(
         "photometric",
         description="type of sensor (photometric|bright|mixed|dark_channel|darkening|absorbing)",
@@ -63,13 +62,10 @@ class Settings(BaseModel):
     flicker: float = _number(
         0, 0, 0.5, "amplitude of the flicker of mains light (100 Hz seen at 60 Hz), relative"
     )
-    settle: int = _number(0, 0, 10_000, "frames until exposure and white balance have settled")
-    stale: int = _number(0, 0, 10_000, "frames at the start that show an earlier contact")
     lamp: float = _number(0, -0.5, 0.5, "light of a lamp that comes on before the second half, relative")
     vignette: float = _number(0.2, 0, 1, "loss of light in the corners, relative")
     specular: float = _number(0, 0, 1, "strength of mirror-like highlights")
     stray: float = _number(0, 0, 1, "strength of the reflection of a contact on the far side of the gel")
-    leds: int = _number(0, 0, 40, "number of glaring LEDs at the upper and lower border of the frame")
     texture: float = _number(1, 0, 10, "grain of the gel's coating, % of the light")
     blur: float = _number(0, 0, 20, "standard deviation of a Gaussian blur in addition to the lens's own, px")
     jpeg: int = _number(0, 0, 100, "quality of a JPEG round trip; 0 for none")
@@ -85,7 +81,6 @@ class Settings(BaseModel):
     depth: float = _number(1, 0, 1.5, "factor on the depth of all contacts")
     shear: float = _number(0.12, 0, 1.5, "largest drag of the gel by a contact, pitches")
     twist: float = _number(0, -60, 60, "largest turn of the gel by a contact, degrees")
-    bend: float = _number(0, -150, 150, "turn of a cable's direction from end to end, degrees")
     sink: float = _number(
         SINK_IN, 0.1, 0.6, "depth of the gel at a contact's edge, relative to full depth; 0.5: deep gel"
     )

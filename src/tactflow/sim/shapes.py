@@ -140,31 +140,15 @@ def tilt_surface(shape: Shape, rotation: NDArray[np.float64]) -> Shape:
     return replace(shape, gap=gap, tilted=lambda more: tilt_surface(shape, more))
 
 
-def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0, bend: float = 0.0) -> Shape:
-    """A cylinder of `radius` px along x with rounded ends.
-
-    bend : change of direction along 800 px of cable, degrees; 0 is straight.
-    """
-    curvature = np.radians(bend) / 800.0
+def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0) -> Shape:
+    """A cylinder of `radius` px along x with rounded ends."""
 
     def gap(x: Array, y: Array) -> Array:
-        if abs(curvature) > 1e-9:
-            turn = np.float32(1.0 / curvature)
-            # The centre line is an arc through the origin about (0, turn); unroll it.
-            from_center = np.hypot(x, y - turn)
-            along = np.arctan2(x, np.sign(turn) * (turn - y)) * abs(turn)
-            across = from_center - abs(turn)
-        else:
-            along, across = x, y
-        beyond = np.maximum(np.abs(along) - np.float32(half_length), 0)
-        return np.asarray((beyond * beyond + across * across) * np.float32(0.5 / radius), dtype=np.float32)
+        beyond = np.maximum(np.abs(x) - np.float32(half_length), 0)
+        return np.asarray((beyond * beyond + y * y) * np.float32(0.5 / radius), dtype=np.float32)
 
-    sources = _segment(half_length, 24)
-    if abs(curvature) > 1e-9:
-        arc = sources[:, 0] * curvature
-        sources = np.stack([np.sin(arc), 1.0 - np.cos(arc)], axis=1) / curvature
     contact = float(np.sqrt(radius * depth))
-    return Shape(gap, half_length + 4 * contact, depth, sources, 1.3 * contact)
+    return Shape(gap, half_length + 4 * contact, depth, _segment(half_length, 24), 1.3 * contact)
 
 
 def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, lean: float = 0.0) -> Shape:
@@ -231,18 +215,12 @@ def _lookup(picture: Array, outside: float) -> Callable[[Array, Array], Array]:
     return value
 
 
-def _letters(text: str, scale: float, thickness: int, margin: int) -> tuple[NDArray[np.uint8], int, int]:
-    """Text in OpenCV's plain font, 0 on 255, and its width and height without the margin, px."""
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
-    canvas = np.full((height + 2 * margin, width + 2 * margin), 255, np.uint8)
-    origin = (margin, margin + height)
-    cv2.putText(canvas, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, (0.0,), thickness, cv2.LINE_8)
-    return canvas, width, height
-
-
 def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Shape:
     """A disc with a raised rim and text, `relief` px high, on a face that also makes contact."""
-    letters = 255 - _letters("10c", 3.4, 14, 60)[0]
+    font, text, scale, thickness, margin = cv2.FONT_HERSHEY_SIMPLEX, "10c", 3.4, 14, 60
+    (width, height), _ = cv2.getTextSize(text, font, scale, thickness)
+    letters = np.zeros((height + 2 * margin, width + 2 * margin), np.uint8)
+    cv2.putText(letters, text, (margin, margin + height), font, scale, (255.0,), thickness, cv2.LINE_8)
     smooth = np.asarray(cv2.GaussianBlur(letters, (0, 0), 2.5), dtype=np.float32)
     raised = _lookup(smooth / np.float32(255.0), 0.0)
 
