@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import inspect
 import signal
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import wraps
+from itertools import count
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar, overload
@@ -15,7 +17,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.by_hand import with_frames_made
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
 from tactflow.config.recorded import with_recorded_calibration
@@ -25,7 +26,9 @@ from tactflow.config.validation import validated
 from tactflow.engine.conformance import build, component, configured
 from tactflow.engine.contract import Stage
 from tactflow.engine.errors import ConfigError
+from tactflow.engine.frame import NO_PICTURE, Frame
 from tactflow.engine.graph import Pipeline
+from tactflow.engine.ports import Port
 from tactflow.engine.run import Runner, RunResult
 from tactflow.sources.memory import MemoryFrames
 from tactflow.system.redaction import public_address
@@ -246,5 +249,36 @@ def stage(use: str | type[Stage], /, **params: Any) -> Any:
     offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
     instance: Any = build(found.cls, checked, offered)
     instance.open()
-    instance.process = with_frames_made(instance.process, configured(found, checked).ports.inputs)
+    instance.process = _with_frames_made(instance.process, configured(found, checked).ports.inputs)
     return instance
+
+
+def _with_frames_made(process: Callable[..., Any], inputs: Sequence[Port]) -> Callable[..., Any]:
+    """`process` with an optional parameter `frame: Frame`; the first call is the reference.
+
+    Positional arguments are the other inputs, in order; the frame is created from the first array among them.
+    A stage whose only input is the frame takes the picture instead.
+
+    process : of a stage. inputs : its ports.
+
+    >>> def process(frame: Frame) -> tuple[int, ...]:
+    ...     return frame.image.shape
+    >>> _with_frames_made(process, [Port("frame", Frame)])(np.zeros((4, 6, 3), np.uint8))
+    (4, 6, 3)
+    """
+    frame = next((port.name for port in inputs if port.annotation is Frame), None)
+    if frame is None:
+        return process
+    names = [port.name for port in inputs if port.name != frame] or [frame]
+    numbers = count()
+
+    @wraps(process)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        values = dict(zip(names, args, strict=False)) | kwargs
+        if len(args) > len(names) or any(isinstance(value, Frame) for value in values.values()):
+            return process(*args, **kwargs)
+        picture = next((value for value in values.values() if isinstance(value, np.ndarray)), NO_PICTURE)
+        seq = next(numbers)
+        return process(**values | {frame: Frame("main", seq, seq / 30, picture)})
+
+    return call

@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from mcap.writer import Writer
+from mcap_protobuf.writer import Writer
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -67,22 +67,10 @@ def write_bag(
     return path
 
 
-def write_foxglove(path: Path, messages: Sequence[Any], packing: str) -> Path:
-    """A Foxglove file. messages : of `foxglove_schemas_protobuf`, or bytes of JSON ("json")."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        if packing == "protobuf":
-            from mcap_protobuf.schema import build_file_descriptor_set
-
-            descriptor = type(messages[0]).DESCRIPTOR
-            data = build_file_descriptor_set(type(messages[0])).SerializeToString()
-            schema = writer.register_schema(descriptor.full_name, "protobuf", data)
-        else:
-            schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
-        channel = writer.register_channel(TOPIC, packing, schema)
+def write_foxglove(path: Path, messages: Sequence[Any]) -> Path:
+    """A Foxglove file. messages : of `foxglove_schemas_protobuf`."""
+    with path.open("wb") as file, Writer(file) as writer:
         for index, one in enumerate(messages):
-            data = one if isinstance(one, bytes) else one.SerializeToString()
-            writer.add_message(channel, BEGIN + index * PERIOD, data, BEGIN + index * PERIOD)
-        writer.finish()
+            taken = BEGIN + index * PERIOD
+            writer.write_message(TOPIC, one, log_time=taken, publish_time=taken)
     return path

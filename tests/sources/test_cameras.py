@@ -63,7 +63,7 @@ def test_a_camera_is_described_with_formats_and_all_its_names(dev: Path) -> None
 
 
 def test_the_command_lists_cameras_as_json(dev: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.run(argparse.Namespace(dev=dev, sys=dev, json=True)) == 0
+    assert command.run(argparse.Namespace(dev=dev, json=True)) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["index"] for line in lines] == [0, 1, 10]
 
@@ -84,7 +84,7 @@ def test_without_a_camera_the_command_says_what_to_try(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(command.sys, "platform", system)
-    assert command.run(argparse.Namespace(dev=tmp_path, sys=tmp_path, json=False)) == 0
+    assert command.run(argparse.Namespace(dev=tmp_path, json=False)) == 0
     out, err = capsys.readouterr()
     assert out == ""
     assert all(word in err for word in words)

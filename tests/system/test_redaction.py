@@ -66,16 +66,6 @@ def test_no_error_message_repeats_a_secret_of_the_command_line(
     assert said
 
 
-@pytest.mark.parametrize("asked", [False, True])
-def test_a_message_shows_the_host_and_all_of_the_address_when_asked(
-    asked: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TACTFLOW_SHOW_ADDRESSES", "1" if asked else "")
-    assert main(["run", "--source", "ftp://camera:81/gel?channel=2"]) in (2, 4)
-    shown = "--source ftp://camera:81/gel?channel=2)" if asked else "--source ftp://camera:81/...)"
-    assert shown in capsys.readouterr().err
-
-
 def test_what_is_no_secret_stays() -> None:
     text = "stages: {capture: {source: 'http://camera:81'}}\nsinks: {view: {token: null, path: 'ipc:///tmp/a'}}\n"
     assert without_secrets(text) == text

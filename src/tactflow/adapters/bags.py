@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import cv2
@@ -23,7 +20,7 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
 SETTINGS = {"topic": "name of a topic with pictures"}
-DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf", "json": "json"}
+DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf"}
 """Encoding of the messages in an MCAP file -> package that decodes them."""
 PACKAGES = ("sensor_msgs/msg", "sensor_msgs", "foxglove", "foxglove_msgs/msg", "foxglove_msgs")
 """Where the types of messages with pictures are defined."""
@@ -209,8 +206,6 @@ class McapFile:
                 + ", ".join(DECODERS)
             )
         require(self._path, f"messages encoded as {encoding}", "bags", DECODERS[encoding])
-        if encoding == "json":
-            return _from_json
         if encoding == "protobuf":
             from mcap_protobuf.decoder import DecoderFactory
 
@@ -234,13 +229,6 @@ def _from_ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
     if encoding == "ros1":
         return lambda data: store.deserialize_ros1(data, name)
     return lambda data: store.deserialize_cdr(data, name)
-
-
-def _from_json(data: bytes) -> Any:
-    """A message of Foxglove's JSON schemas, with bytes in base64."""
-    message = json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
-    message.data = base64.b64decode(message.data)
-    return message
 
 
 # -- pictures in messages -----------------------------------------------------------------------------------

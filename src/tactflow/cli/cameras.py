@@ -12,7 +12,6 @@ import orjson
 
 from tactflow.cli.options import add_json
 from tactflow.sources.cameras import CameraInfo, list_cameras
-from tactflow.sources.usb import UsbHub, usb_hubs
 from tactflow.system.terminal import say, show
 
 NO_CAMERA = """no camera is plugged in (there is no /dev/video*)
@@ -27,7 +26,7 @@ NO_NAMES = """on this system, cameras have no names, only numbers in the order i
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `cameras`."""
     add_json(parser, "one JSON object per camera")
-    parser.set_defaults(dev=Path("/dev"), sys=Path("/sys"))
+    parser.set_defaults(dev=Path("/dev"))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -38,16 +37,11 @@ def run(args: argparse.Namespace) -> int:
     cameras = list_cameras(args.dev)
     if not cameras:
         say(NO_CAMERA)
-    hubs = usb_hubs([camera.device for camera in cameras], args.sys)
     for camera in cameras:
         if args.json:
-            hub = next((h for h in hubs if camera.device in [c.device for c in h.cameras]), None)
-            usb = None if hub is None else {"hub": hub.root, "speed": hub.speed}
-            print(orjson.dumps(asdict(camera) | {"usb": usb}).decode())
+            print(orjson.dumps(asdict(camera)).decode())
         else:
             show(describe(camera))
-    for hub in () if args.json else hubs:
-        show(describe_hub(hub))
     return 0
 
 
@@ -65,10 +59,3 @@ def describe(camera: CameraInfo) -> Iterator[str]:
     for form, sizes in abilities.formats.items() if abilities else ():
         sizes_text = ", ".join(f"{width} x {height}" for width, height in sizes)
         yield f"    {form}: {sizes_text or 'any size within a range'}"
-
-
-def describe_hub(hub: UsbHub) -> Iterator[str]:
-    """A USB root hub in words, and the cameras that share it."""
-    yield f"USB hub {hub.root}: {hub.speed} Mbit/s"
-    for camera in hub.cameras:
-        yield f"    {camera.device} ({camera.name}, port {camera.port}, {camera.speed} Mbit/s)"

@@ -19,7 +19,7 @@ from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
 from tactflow.system.arguments import number
 from tactflow.system.files import completed
-from tactflow.system.redaction import shown_address
+from tactflow.system.redaction import public_address
 from tactflow.system.terminal import printable, show_json
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         rival, lines = error.best, [str(error), *_best(error.best)]
     except ValueError as error:
         raise ConfigError(f"--dot: {error}") from None
-    title = f"{shown_address(source)}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
+    title = f"{public_address(source)}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
     without = 0.0 if valid is None else float(np.mean(valid == 0))
     if without > 0:
         lines.append(f"dim: {100 * without:.0f} % of the picture shows no gel")

@@ -11,7 +11,7 @@ from typing import Final, NoReturn
 
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError, TactflowError
-from tactflow.system.redaction import shown_address
+from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.spelling import closest, did_you_mean
 from tactflow.system.terminal import printable, say
@@ -66,9 +66,9 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
         return int(args.run(args))
     except TactflowError as error:
         mistakes = error.mistakes if isinstance(error, ConfigError) and len(error.mistakes) > 1 else ()
-        say(f"tactflow: {len(mistakes)} mistakes" if mistakes else shown_address(f"tactflow: {error}"))
+        say(f"tactflow: {len(mistakes)} mistakes" if mistakes else public_address(f"tactflow: {error}"))
         for mistake in mistakes:
-            say(shown_address(mistake))
+            say(public_address(mistake))
         return error.exit_code
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -87,7 +87,7 @@ def _check_environment() -> None:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        super().error(shown_address(printable(message)))
+        super().error(public_address(printable(message)))
 
 
 def make_parser(command: str | None) -> argparse.ArgumentParser:

@@ -13,7 +13,6 @@ from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.plan import Plan
-from tactflow.system.extras import opencv_conflict
 from tactflow.system.terminal import say, show, show_json, table
 
 
@@ -47,7 +46,6 @@ def run_check(args: argparse.Namespace) -> int:
     """Print one line for each sensor, or JSON; raises ConfigError with every mistake."""
     from tactflow.fleet.sinks import clash_problems
 
-    warn_of_opencv()
     names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
     valid: dict[str | None, tuple[Pipeline, Plan]] = {}
     mistakes: list[str] = []
@@ -76,13 +74,6 @@ def run_check(args: argparse.Namespace) -> int:
         words = ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for noun, count in counts.items())
         show([f"{pipeline.file}: {f'sensor {name} ' if name else ''}OK ({words})"])
     return 0
-
-
-def warn_of_opencv() -> None:
-    """Warn where several OpenCV packages overwrite each other's files."""
-    conflict = opencv_conflict()
-    if conflict is not None:
-        say(f"tactflow: WARNING: {conflict}")
 
 
 def add_arguments_schema(parser: argparse.ArgumentParser) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 
 from tactflow.api import ended_by_signals, make_runner
 from tactflow.cli.options import add_overwrite, add_pipeline, add_quiet, refuse_output
-from tactflow.cli.pipelines import warn_of_opencv
 from tactflow.cli.progress import run_progress, summary
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.overrides import Override
@@ -28,7 +27,7 @@ from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
 from tactflow.system.arguments import positive, seconds
 from tactflow.system.files import is_device, next_name
-from tactflow.system.redaction import shown_address
+from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.terminal import notes, say
 
@@ -92,11 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the pipeline; returns the exit code. Raises ConfigError when nothing was started."""
     file = find_pipeline(args.pipeline)
-    sensors: list[str] = []
-    if args.sensor is None:
-        # A process that runs one of several sensors need not warn again.
-        warn_of_opencv()
-        sensors = sensor_names(file, args.overrides)
+    sensors = sensor_names(file, args.overrides) if args.sensor is None else []
     if len(sensors) > 1:
         return _run_all(args, file, sensors)
     return _run_one(args, _load(args, file, args.sensor, _added_sinks(args, None)))
@@ -151,7 +146,7 @@ def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
 def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks) -> Pipeline:
     source_values = []
     if args.source is not None:
-        address = f" {shown_address(args.source)}" if args.source.isprintable() else ""
+        address = f" {public_address(args.source)}" if args.source.isprintable() else ""
         source_values.append(Override("source", args.source, f"--source{address}"))
     if args.realtime:
         source_values.append(Override("realtime", value=True, origin="--realtime"))

@@ -19,7 +19,7 @@ from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.cameras import list_cameras
 from tactflow.system.files import completed
-from tactflow.system.redaction import shown_address
+from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
 from tactflow.system.terminal import notes, printable, say, typed
 from tactflow.tune.propose import FEWEST_FOUND, Attempt, Sample, distinct_pipelines, divide, propose
@@ -234,7 +234,7 @@ def _decide(
 def _write(out: Path, source: str, attempts: Sequence[Attempt], remarks: Sequence[str]) -> None:
     """Write the first pipeline, with what was measured as comments."""
     file = find_pipeline(attempts[0].pipeline)
-    title = f"Made by tactflow start for {shown_address(source)}, from {file.name}. Tried on its pictures:"
+    title = f"Made by tactflow start for {public_address(source)}, from {file.name}. Tried on its pictures:"
     comments = [printable(line) for line in (title, *(f"  {attempt}" for attempt in attempts), *remarks)]
     settings = {"stages.capture.source": source, **attempts[0].settings}
     text = changed_pipeline(file, settings, comments, out)

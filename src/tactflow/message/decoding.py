@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any, TypeVar
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.frame import Absent
-from tactflow.message.encoding import FLOW_DETAILS, SLIP_DETAILS, STATUS_NAMES
+from tactflow.message.encoding import STATUS_NAMES
 from tactflow.vision.types import Contact, Depth, Ellipse, Features, Flow, Force, Markers, Pose, Scale, Slip
-
-T = TypeVar("T")
 
 _UNKNOWN = float("nan")
 
@@ -24,17 +23,8 @@ def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str,
     Raises KeyError, TypeError or ValueError if it is not a result message.
     """
     skipped = {str(port): str(reason) for port, reason in message["skipped"].items()}
-    values: dict[str, Any] = {
-        "contact": _optional(_contact, message["contact"]),
-        "flow": _optional(_flow, message["flow"]),
-        "markers": _optional(_markers, message["markers"]),
-        "scale": _optional(_scale, message.get("scale")),
-        "depth": _optional(_depth, message["contact"]),
-        "slip": _optional(_slip, message.get("slip")),
-        "force": _optional(_force, message.get("force")),
-        "pose": _optional(_pose, message.get("pose")),
-        "features": _optional(_features, message.get("features")),
-    }
+    values = {port: _optional(decode, message.get(port)) for port, decode in _DECODERS.items()}
+    values["depth"] = _optional(_depth, message["contact"])
     parts = tuple(map(_contact, message.get("contacts", ())))
     if values["contact"] is not None and len(parts) > 1:
         values["contact"] = replace(values["contact"], separate=parts)
@@ -42,18 +32,22 @@ def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str,
     return values | absent, skipped
 
 
-def _optional(decode: Callable[[Any], T], value: Any) -> T | None:
+def _optional(decode: Callable[[Any], Any], value: Any) -> Any:
     return None if value is None else decode(value)
 
 
-def _numbers(value: Any) -> Any:
-    """A number, or a tuple of numbers; None if unknown."""
-    return tuple(map(_numbers, value)) if isinstance(value, list | tuple) else _optional(float, value)
+def _plain(value: Any) -> Any:
+    """Lists as tuples; numbers and words as they are."""
+    return tuple(map(_plain, value)) if isinstance(value, list) else value
 
 
-def _pair(pair: Any) -> tuple[float, float]:
-    x, y = pair
-    return float(x), float(y)
+def _read(cls: Any, part: Any, **own: Any) -> Any:
+    """A dataclass from the values that a part of the message has under the names of its attributes.
+
+    own : attributes that are not such values.
+    """
+    names = [field.name for field in fields(cls) if field.name in part and field.name not in own]
+    return cls(**{name: _plain(part[name]) for name in names}, **own)
 
 
 def _points(points: Any) -> NDArray[np.float64]:
@@ -61,36 +55,16 @@ def _points(points: Any) -> NDArray[np.float64]:
 
 
 def _contact(contact: Any) -> Contact:
-    return Contact(
-        area=float(contact["area"]),
-        center=_pair(contact["center"]),
-        angle=_optional(float, contact["angle"]),
-        slope=_optional(float, contact["slope"]),
-        hull=_points(contact["hull"]),
-        ellipse=_optional(_ellipse, contact["ellipse"]),
-        confidence=float(contact.get("confidence", 0.0)),
-        evidence=contact.get("evidence", "light"),
-        probability=contact.get("probability"),
-    )
-
-
-def _ellipse(ellipse: Any) -> Ellipse:
-    return Ellipse(_pair(ellipse["center"]), _pair(ellipse["axes"]), _optional(float, ellipse["angle"]))
+    ellipse = _optional(partial(_read, Ellipse), contact["ellipse"])
+    found: Contact = _read(Contact, contact, hull=_points(contact["hull"]), ellipse=ellipse)
+    return found
 
 
 def _depth(contact: Any) -> Depth | None:
     if contact.get("depth_mm") is None:
         return None
-    depth, depth_stderr, volume, volume_stderr = (
-        _numbers(contact.get(key))
-        for key in ("depth_mm", "depth_mm_stderr", "volume_mm3", "volume_mm3_stderr")
-    )
-    return Depth(np.zeros((0, 0), np.float32), depth, depth_stderr, volume, volume_stderr)
-
-
-def _flow(flow: Any) -> Flow:
-    details = {key: _numbers(flow.get(key)) for key in FLOW_DETAILS}
-    return Flow(_optional(_pair, flow["mean"]), int(flow["count"]), **details)
+    keys = ("depth_mm", "depth_mm_stderr", "volume_mm3", "volume_mm3_stderr")
+    return Depth(np.zeros((0, 0), np.float32), *map(contact.get, keys))
 
 
 def _markers(markers: Any) -> Markers:
@@ -106,27 +80,29 @@ def _markers(markers: Any) -> Markers:
 
 
 def _scale(scale: Any) -> Scale:
-    return Scale(*_pair(scale["mm_per_px"]), (_UNKNOWN, _UNKNOWN), _pair(scale["origin"]))
-
-
-def _slip(slip: Any) -> Slip:
-    keys = ("probability", "translation", "rotation", "speed", "since", *SLIP_DETAILS)
-    known = {key: _numbers(slip.get(key)) for key in keys}
-    since = _optional(int, known.pop("since"))
-    return Slip(bool(slip["slipping"]), float(slip["stick_ratio"]), since=since, **known)
-
-
-def _force(force: Any) -> Force:
-    return Force(_numbers(force["value"]), _numbers(force["stderr"]), bool(force["in_range"]))
+    x, y = scale["mm_per_px"]
+    return Scale(x, y, (_UNKNOWN, _UNKNOWN), _plain(scale["origin"]))
 
 
 def _pose(pose: Any) -> Pose:
     """Without a covariance in the message, only the variances are known."""
     variances = np.diag(np.square(np.array(pose["stderr"], np.float64)))
     covariance = np.array(pose.get("covariance", variances), np.float64).reshape(6, 6)
-    center, translation, rotation = (_numbers(pose[key]) for key in ("center", "translation", "rotation"))
-    return Pose(pose["status"], int(pose["since"]), center, translation, rotation, covariance)
+    found: Pose = _read(Pose, pose, covariance=covariance)
+    return found
 
 
 def _features(features: Any) -> Features:
-    return Features(np.array(features["values"], np.float32), str(features["unit"]))
+    return Features(np.array(features["values"], np.float32), features["unit"])
+
+
+_DECODERS: dict[str, Callable[[Any], Any]] = {
+    "contact": _contact,
+    "flow": partial(_read, Flow),
+    "markers": _markers,
+    "scale": _scale,
+    "slip": partial(_read, Slip),
+    "force": partial(_read, Force),
+    "pose": _pose,
+    "features": _features,
+}

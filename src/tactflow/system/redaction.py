@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any
 
 # A single slash is the result of passing an address through `pathlib`.
 _ADDRESS = re.compile(r"\b((?!ipc:|file:)[A-Za-z][A-Za-z0-9+.-]*://|(?:https?|rtsps?|udp|tcp):/)(\S*)")
-SHOW: Final = "TACTFLOW_SHOW_ADDRESSES"
-"""Environment variable with which messages on the terminal show complete addresses."""
 _KEYS = ("token", "password")
 """Parameters of stages and sinks whose values are secret."""
 _SETTING = re.compile(rf"\b({'|'.join(_KEYS)})(\s*[=:]\s*)[^\s,}}]+")
@@ -23,11 +20,6 @@ def public_address(text: str) -> str:
     'rtsp://camera:554/...: no stream'
     """
     return _ADDRESS.sub(_scheme_and_host, text)
-
-
-def shown_address(text: str) -> str:
-    """`public_address`, unless the environment variable TACTFLOW_SHOW_ADDRESSES is set."""
-    return text if os.environ.get(SHOW) else public_address(text)
 
 
 def _scheme_and_host(address: re.Match[str]) -> str:
