@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
-from functools import partial
-from typing import Any
+from dataclasses import MISSING, fields, replace
+from functools import cache, partial
+from math import nan
+from typing import Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, create_model
 
 from tactflow.engine.frame import Absent
 from tactflow.message.encoding import STATUS_NAMES
-from tactflow.vision.types import Contact, Depth, Ellipse, Features, Flow, Force, Markers, Pose, Scale, Slip
-
-_UNKNOWN = float("nan")
+from tactflow.vision.types import Contact, Depth, Features, Flow, Force, Markers, Pose, Scale, Slip
 
 
 def decode_values(message: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -36,18 +37,21 @@ def _optional(decode: Callable[[Any], Any], value: Any) -> Any:
     return None if value is None else decode(value)
 
 
-def _plain(value: Any) -> Any:
-    """Lists as tuples; numbers and words as they are."""
-    return tuple(map(_plain, value)) if isinstance(value, list) else value
+@cache
+def _model(cls: Any) -> type[BaseModel]:
+    """The attributes of a dataclass that a message has as they are: numbers, words and tuples."""
+    hints = get_type_hints(cls)
+    plain = [field for field in fields(cls) if not re.search("NDArray|Contact", str(field.type))]
+    attributes: dict[str, Any] = {
+        field.name: (hints[field.name], ... if field.default is MISSING else field.default) for field in plain
+    }
+    model: type[BaseModel] = create_model("Part", **attributes)
+    return model
 
 
-def _read(cls: Any, part: Any, **own: Any) -> Any:
-    """A dataclass from the values that a part of the message has under the names of its attributes.
-
-    own : attributes that are not such values.
-    """
-    names = [field.name for field in fields(cls) if field.name in part and field.name not in own]
-    return cls(**{name: _plain(part[name]) for name in names}, **own)
+def _read(cls: Any, part: Any, **arrays: Any) -> Any:
+    """A dataclass from the values that a part of the message has under the names of its attributes."""
+    return cls(**dict(_model(cls).model_validate(part)), **arrays)
 
 
 def _points(points: Any) -> NDArray[np.float64]:
@@ -55,8 +59,7 @@ def _points(points: Any) -> NDArray[np.float64]:
 
 
 def _contact(contact: Any) -> Contact:
-    ellipse = _optional(partial(_read, Ellipse), contact["ellipse"])
-    found: Contact = _read(Contact, contact, hull=_points(contact["hull"]), ellipse=ellipse)
+    found: Contact = _read(Contact, contact, hull=_points(contact["hull"]))
     return found
 
 
@@ -64,7 +67,8 @@ def _depth(contact: Any) -> Depth | None:
     if contact.get("depth_mm") is None:
         return None
     keys = ("depth_mm", "depth_mm_stderr", "volume_mm3", "volume_mm3_stderr")
-    return Depth(np.zeros((0, 0), np.float32), *map(contact.get, keys))
+    numbers: list[Any] = [_optional(float, contact.get(key)) for key in keys]
+    return Depth(np.zeros((0, 0), np.float32), *numbers)
 
 
 def _markers(markers: Any) -> Markers:
@@ -81,7 +85,8 @@ def _markers(markers: Any) -> Markers:
 
 def _scale(scale: Any) -> Scale:
     x, y = scale["mm_per_px"]
-    return Scale(x, y, (_UNKNOWN, _UNKNOWN), _plain(scale["origin"]))
+    found: Scale = _read(Scale, {"x": x, "y": y, "stderr": (nan, nan), "origin": scale["origin"]})
+    return found
 
 
 def _pose(pose: Any) -> Pose:
@@ -93,7 +98,7 @@ def _pose(pose: Any) -> Pose:
 
 
 def _features(features: Any) -> Features:
-    return Features(np.array(features["values"], np.float32), features["unit"])
+    return Features(np.array(features["values"], np.float32), str(features["unit"]))
 
 
 _DECODERS: dict[str, Callable[[Any], Any]] = {
