@@ -78,10 +78,12 @@ def simulated(name: str, frames: int) -> Row:
     slipping = found = others = 0
     false: list[int] = []
     errors, stated = [], []
-    start, slipped, before = np.zeros(3), -math.inf, None
+    start, slipped, before, mapping = np.zeros(3), -math.inf, None, None
     for result in tactflow.stream(source=f"sim:{spec}", settings={"stages.slip": {}}):
-        truth, slip = scene.truth(result.seq, result["mapping"]), result.slip
-        true = over_gel(scene, result.seq, result["mapping"])
+        # One object for all frames, by which the scene remembers where its pixels lie: each result has a copy.
+        mapping = mapping or result["mapping"]
+        truth, slip = scene.truth(result.seq, mapping), result.slip
+        true = over_gel(scene, result.seq, mapping)
         moves = before is not None and true is not None and math.dist(true[:2], before[:2]) > STILL
         slipped = result.t if truth.slipping or (moves and name not in ROLLS) else slipped
         before = true
