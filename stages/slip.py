@@ -7,7 +7,7 @@ from typing import NamedTuple
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import ContactMask, MarkerMask, Slipping, Touching, Unmarked, Untouched
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import ColorImage
 from tactflow.vision.flow import DisplacementField, SlipTracker
 from tactflow.vision.flow.registration import cells, light_change
 from tactflow.vision.types import Slip
@@ -30,7 +30,7 @@ class SlipStage(Stage):
 
     def __init__(self, params: StageParams) -> None:
         super().__init__(params)
-        self._rest: tuple[Untouched, Floats32] | None = None
+        self._rest: tuple[Untouched, ColorImage] | None = None
         self._tracker = SlipTracker()
 
     def reset(self) -> None:

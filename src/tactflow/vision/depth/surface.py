@@ -17,6 +17,7 @@ import numpy as np
 from tactflow.vision.arrays import Floats32
 from tactflow.vision.depth.slopes import STEEPEST, Bytes, SlopeModel, coordinates
 from tactflow.vision.depth.surroundings import CELL, Resting, Window, resting, surroundings
+from tactflow.vision.geometry.downsample import cell_means
 from tactflow.vision.types import Depth, Scale
 
 DIM: Final = 20.0
@@ -59,12 +60,12 @@ class Rest:
         self.light = _halved(untouched, self.window)
         self.weight: Floats32 = np.reciprocal(self.light + np.float32(DIM), dtype=np.float32)
         self.x, self.y = coordinates((self.window.right, self.window.bottom))
-        self._cells = _in_cells(untouched)
+        self._cells = cell_means(untouched, CELL)
         self._cell_weight = np.reciprocal(self._cells + np.float32(DIM), dtype=np.float32)
 
     def around(self, image: Bytes | Floats32, mask: Bytes) -> Resting:
         """Where the gel around a contact is at rest. image, mask : as `Surface.depth` takes them."""
-        change = np.asarray(cv2.subtract(_in_cells(image), self._cells, dtype=cv2.CV_32F), np.float32)
+        change = np.asarray(cv2.subtract(cell_means(image, CELL), self._cells, dtype=cv2.CV_32F), np.float32)
         return resting(change * self._cell_weight, mask)
 
 
@@ -235,13 +236,3 @@ def _steep_part(slope: Floats32, steepest: float | None) -> float:
 def _halved(image: Bytes | Floats32, window: Window) -> Bytes | Floats32:
     """(h, w, 3) of the picture's dtype: a window of it at half resolution."""
     return cv2.resize(image[window.whole], (window.width, window.height), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
-
-
-def _in_cells(image: Bytes | Floats32) -> Bytes | Floats32:
-    """(h, w, 3) of the picture's dtype: its means over cells; a rest that fills none is left out."""
-    height, width = (max(side // CELL, 1) for side in image.shape[:2])
-    cells = image[: height * CELL, : width * CELL]
-    # Three halvings take a quarter of the time of one step, for OpenCV has a loop of its own for them.
-    for side in (CELL // 2, CELL // 4, 1):
-        cells = cv2.resize(cells, (width * side, height * side), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    return cells

@@ -228,6 +228,7 @@ class DisplacementField:
     def __init__(self, model: FieldModel, markers: Markers, seen: Flags) -> None:
         self.grid = model.fine.grid
         self._asked: tuple[Mask, GelMotion | None] | None = None
+        self._shared: tuple[Mask, Floats] | None = None
         self._model, self._seen = model, seen
         position = np.ascontiguousarray(markers.position, np.float64)
         stderr = np.ascontiguousarray(markers.stderr, np.float64)
@@ -268,10 +269,15 @@ class DisplacementField:
         return np.asarray(moved[:, 0], np.float64)
 
     def share(self, mask: Mask) -> Floats:
-        """(rows, columns), how much of the gel of each cell is in a region now, 0 to 1.
+        """(rows, columns), how much of the gel of each cell is in a region now, 0 to 1. Not to be changed.
 
         mask : (H, W) uint8, 255 inside, else 0. Raises ValueError if it is not.
         """
+        if self._shared is None or self._shared[0] is not mask:
+            self._shared = mask, self._share(mask)
+        return self._shared[1]
+
+    def _share(self, mask: Mask) -> Floats:
         check_mask(mask)
         side = int(self._model.fine.place[SIDE])
         left, top, width, height = cv2.boundingRect(mask)

@@ -10,6 +10,7 @@ import numpy as np
 from tactflow.vision.arrays import Flags, Mask
 from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
 from tactflow.vision.flow.inside import inside_mask
+from tactflow.vision.geometry.similarity import as_complex, fit_similarity
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 UNKNOWN: Final = 0.1
@@ -61,28 +62,26 @@ def flow_in_mask(markers: Markers, mask: Mask, *, dilate: float = 0.0) -> Flow:
         chosen = tracked
     if len(chosen) == 0:
         return Flow(None, 0)
-    arms = np.asarray(markers.origin[chosen], np.float64)
-    rest = np.asarray(markers.position[chosen], np.float64) - arms
-    mean = rest.mean(axis=0)
-    rest, arms = rest - mean, arms - arms.mean(axis=0)
-    x, y = arms.T
-    xx, yy = float(x @ x), float(y @ y)
+    origin = np.asarray(markers.origin[chosen], np.float64)
+    moved = np.asarray(markers.position[chosen], np.float64) - origin
+    fit = fit_similarity(as_complex(origin), as_complex(moved), np.full(len(chosen), 1 / len(chosen)))
+    rest = as_complex(moved) - fit.mean
     rotation = divergence = residual = None
     parameters = 1
     # Product over squared sum of the principal scatters; about their ratio where one is small.
-    if len(arms) >= 3 and xx * yy - float(x @ y) ** 2 > (_FLAT * (xx + yy)) ** 2:
+    squares = abs(complex((fit.away * fit.away).mean()))
+    if len(chosen) >= 3 and (fit.spread**2 - squares**2) / 4 > (_FLAT * fit.spread) ** 2:
         parameters = 2
-        u, v = rest.T
-        spread, turn = float(x @ u + y @ v) / (xx + yy), float(x @ v - y @ u) / (xx + yy)
-        rest = rest - np.column_stack([spread * x - turn * y, turn * x + spread * y])
-        rotation, divergence = _rotation(spread, turn), _divergence(spread, turn)
-        residual = math.sqrt(float((rest * rest).sum()) / len(arms))
+        rest = rest - fit.slope * fit.away
+        rotation = _rotation(fit.slope.real, fit.slope.imag)
+        divergence = _divergence(fit.slope.real, fit.slope.imag)
+        residual = math.sqrt(float((np.abs(rest) ** 2).mean()))
     stderr = None
     if len(tracked) >= 2:
         # The similarity has four parameters, two for each axis; the mean has one for each.
-        variance = (rest * rest).sum(axis=0) / ((len(arms) - parameters) * len(tracked))
-        stderr = (math.sqrt(variance[0]), math.sqrt(variance[1]))
-    return Flow((float(mean[0]), float(mean[1])), len(arms), stderr, rotation, divergence, residual)
+        count = (len(chosen) - parameters) * len(tracked)
+        stderr = tuple(math.sqrt(float(part @ part) / count) for part in (rest.real, rest.imag))
+    return Flow((fit.mean.real, fit.mean.imag), len(chosen), stderr, rotation, divergence, residual)
 
 
 def flow_of_field(

@@ -23,9 +23,11 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.vision.arrays import MAD_TO_SIGMA, ColorImage, Floats, Floats32, Indices, Mask
 from tactflow.vision.flow.loops import compare_light
+from tactflow.vision.geometry.downsample import cell_means
 
 CELL: Final = 4
 """Processed px per side of a cell, over which the light is averaged."""
@@ -56,24 +58,20 @@ UNLIKE: Final = 0.6
 """Residual relative to the contrast of the picture from which on a picture shows something else."""
 
 
-def light_change(unmarked: ColorImage, untouched: Floats32, markers: Mask | None) -> Floats32:
+def light_change(unmarked: ColorImage, untouched: ColorImage, markers: Mask | None) -> Floats32:
     """(h, w, 4) float32: change of light in cells, grey levels, and 1 where no marker covers the cell, or 0.
 
-    unmarked : (H, W, 3), without markers. untouched : of `cells`. markers : (H, W), 255 on them; None: none.
+    unmarked : (H, W, 3), without markers. untouched : (h, w, 3), `cells` of the gel. markers : (H, W), 255 on
+    them; None: none.
     """
-    change = np.ones((*untouched.shape[:2], 4), np.float32)
-    change[..., :3] = cells(unmarked)
-    change[..., :3] -= untouched
-    if markers is not None:
-        change[..., 3] = cells(markers) == 0
-    return change
+    light = cv2.subtract(cells(unmarked), untouched, dtype=cv2.CV_32F)
+    seen = np.ones(light.shape[:2], np.float32) if markers is None else np.float32(cells(markers) == 0)
+    return np.asarray(cv2.merge((light, seen)), np.float32)
 
 
-def cells(picture: ColorImage | Mask) -> Floats32:
-    """(h, w, ...) float32, means over cells; what is left over at the right and below is not looked at."""
-    rows, columns = picture.shape[0] // CELL, picture.shape[1] // CELL
-    whole = picture[: rows * CELL, : columns * CELL]
-    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+def cells(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(h, w, ...): means over cells of a picture (H, W, ...)."""
+    return cell_means(picture, CELL)
 
 
 class Template(NamedTuple):
@@ -143,28 +141,39 @@ def template_of(change: Floats32, mask: Mask) -> Template | None:
     away = (places - center).astype(np.float32)
     moments = np.asarray(away.T @ away, np.float64) / len(away)
     radius = math.sqrt(np.trace(moments))
-    light = change[..., :3]
+    light = np.ascontiguousarray(change[..., :3])
     dx, dy = (
         cv2.Sobel(light, cv2.CV_32F, *axis, ksize=3, scale=1 / 8)[rows, columns] for axis in ((1, 0), (0, 1))
     )
     x, y = (away / np.float32(radius)).T[:, :, None]
     values = light[rows, columns]
     by = np.stack([dx, dy, x * dy - y * dx, x * dx + y * dy, -values], axis=-1)
-    power = np.einsum("nci,ncj->ij", by, by, dtype=np.float64)
+    flat = by.reshape(-1, 5)
     # Of each channel, a slope over x and over y, and a part of every channel.
-    slopes = np.einsum("nci,knc->ikc", by, np.stack([x * values, y * values])).reshape(5, -1)
-    mixtures = np.einsum("nci,nd->icd", by, values).reshape(5, -1)
-    lamps = LAMPS * np.hstack([slopes, mixtures]).astype(np.float64)
-    contrast = float(np.sqrt(values.var(axis=0).mean()))
-    lamps = lamps @ lamps.T
-    return Template(center, radius, moments, away, patches, values, by, power, lamps, contrast, _noise(light))
+    slopes = [by[:, channel].T @ (place * values)[:, [channel]] for place in (x, y) for channel in range(3)]
+    mixtures = [by[:, channel].T @ values for channel in range(3)]
+    lamps = LAMPS * np.hstack([*slopes, *mixtures]).astype(np.float64)
+    return Template(
+        center,
+        radius,
+        moments,
+        away,
+        patches,
+        values,
+        by,
+        power=np.asarray(flat.T @ flat, np.float64),
+        lamps=lamps @ lamps.T,
+        contrast=float(np.sqrt(values.var(axis=0).mean())),
+        noise=_noise(light),
+    )
 
 
 def _noise(light: Floats32) -> float:
     """Variance of the difference of two pictures like this one (h, w, 3), by Immerkaer's differences, which a
     smooth picture does not have: most of the gel is untouched."""
     line = np.array([1.0, -2.0, 1.0])
-    differences = np.abs(cv2.sepFilter2D(light, cv2.CV_32F, line, line)[1:-1, 1:-1])
+    # Every other one, for neighbours are alike.
+    differences = np.abs(cv2.sepFilter2D(light, cv2.CV_32F, line, line)[1:-1:2, 1:-1:2])
     return max(2 * (MAD_TO_SIGMA * float(np.median(differences))) ** 2 / 36, ROUNDING)
 
 

@@ -9,13 +9,13 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Mask
 from tactflow.vision.flow.displacement_field import CELL, OUTLINE, DisplacementField, Grid
 from tactflow.vision.flow.in_mask import UNKNOWN
 from tactflow.vision.flow.registration import CELL as PX
 from tactflow.vision.flow.registration import UNLIKE, Registration, Template, register, template_of
+from tactflow.vision.geometry.similarity import Complexes, as_complex, fit_similarity
 from tactflow.vision.types import Slip
 
 WINDOW: Final = 0.1
@@ -53,8 +53,6 @@ ASIDE: Final = 2.0
 gel does both alike, slip only the first. Chosen on the simulator."""
 _ROUNDS: Final = 2
 """Fits to the part that sticks, each to what the last one found to stick. Chosen by hand."""
-Complexes = NDArray[np.complex128]
-"""(M,), x + iy, px."""
 
 
 class _Key(NamedTuple):
@@ -185,7 +183,7 @@ class SlipTracker:
 
     def _registered(self, key: _Key, change: Floats32, field: DisplacementField) -> Registration | None:
         """How the picture has moved since the keyframe: nearly as in the last frame, or else with the gel."""
-        moved = _complex(field.displacement[key.cells]) - key.before
+        moved = as_complex(field.displacement[key.cells]) - key.before
         x, y, turn = _rigid(key.rest + key.before - key.template.place, moved, key.share)[0].tolist()
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
         best: Registration | None = None
@@ -270,8 +268,9 @@ def _keyframe(
     grown: float,
 ) -> _Key:
     """A frame that others are compared with. share : (rows, columns), of each cell in contact."""
-    inside = _core(field.grid.points, share) & (share > 0)
-    rest, before = _complex(field.grid.points[inside]), _complex(field.displacement[inside])
+    inside = share > 0
+    inside[inside] = _core(field.grid.points[inside], share[inside])
+    rest, before = as_complex(field.grid.points[inside]), as_complex(field.displacement[inside])
     count = float(share[inside].sum())
     return _Key(
         template, field.grid, inside, rest, before, share[inside] / count, count, slid, covariance, grown
@@ -285,7 +284,7 @@ def _slid(key: _Key, found: Registration, field: DisplacementField, time: float)
     now = (key.rest + key.before - place) * cmath.exp(1j * turn / radius) + complex(x, y) * PX
     under = key.rest - place
     for _ in range(ROUNDS):
-        moved = _complex(field.at((under + place).view(np.float64).reshape(-1, 2)))
+        moved = as_complex(field.at((under + place).view(np.float64).reshape(-1, 2)))
         under = now - moved
     slid, left = _rigid(key.rest - place, under + place - key.rest, key.share)
     to_px = np.array([PX, PX, 1 / radius])
@@ -306,37 +305,22 @@ def _of_growth(key: _Key, grown: float) -> Floats:
     return covariance
 
 
-def _complex(pairs: Floats) -> Complexes:
-    """Points or displacements (M, 2) as x + iy."""
-    return np.ascontiguousarray(pairs).view(np.complex128)[:, 0]
-
-
-def _similarity(places: Complexes, moved: Complexes, share: Floats) -> tuple[complex, complex, Complexes]:
-    """The similarity nearest to displacements of places: mean + slope * away, by their mean, px, growth + i
-    turn, and the places from their middle. share : with the sum 1."""
-    middle, mean = complex(share @ places), complex(share @ moved)
-    away = places - middle
-    slope = complex(share @ (away.conj() * moved)) / max(float(share @ np.abs(away) ** 2), 1e-9)
-    return mean, slope, away
-
-
 def _rigid(places: Complexes, moved: Complexes, share: Floats) -> tuple[Floats, float]:
     """(3,): the rigid motion nearest to displacements of places: shift of the origin, px, and turn from +x to
     +y, radians; the variance that it leaves of each component, px^2. share : with the sum 1."""
-    mean, slope, away = _similarity(places, moved, share)
-    turn = 1j * slope.imag
-    shift = mean + turn * complex(away[0] - places[0])
-    left = np.abs(moved - mean - turn * away)
-    return np.array([shift.real, shift.imag, slope.imag]), float(share @ (left * left)) / 2
+    fit = fit_similarity(places, moved, share)
+    turn = 1j * fit.slope.imag
+    shift = fit.mean - turn * fit.middle
+    left = np.abs(moved - fit.mean - turn * fit.away)
+    return np.array([shift.real, shift.imag, turn.imag]), float(share @ (left * left)) / 2
 
 
 def _core(places: Floats, share: Floats) -> Flags:
-    """Which places (..., 2) with a share (...) in the contact lie around its middle."""
-    away = places - share.ravel() @ places.reshape(-1, 2) / share.sum()
-    distance = np.hypot(away[..., 0], away[..., 1])
-    order = np.argsort(distance, axis=None)
-    filled = np.cumsum(share.flat[order])
-    return np.asarray(distance <= distance.flat[order[np.searchsorted(filled, CORE * filled[-1])]])
+    """Which places (n, 2) with shares (n,) in the contact lie around its middle."""
+    distance = np.hypot(*(places - share @ places / share.sum()).T)
+    order = np.argsort(distance)
+    filled = np.cumsum(share[order])
+    return np.asarray(distance <= distance[order[np.searchsorted(filled, CORE * filled[-1])]])
 
 
 def _correlation(first: Floats32, second: Floats32) -> float:
@@ -366,17 +350,17 @@ def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, nois
     inside = cells > 0
     if not inside.any():
         return 0.0
-    share, places, way = cells[inside] / cells.sum(), _complex(points[inside]), _complex(moved[inside])
+    share, places, way = cells[inside] / cells.sum(), as_complex(points[inside]), as_complex(moved[inside])
     sticks = _core(points[inside], share)
     for _ in range(_ROUNDS):
         weight = share * sticks
         if not sticks.any():
             return 0.0
-        mean, slope, away = _similarity(places, way, weight / weight.sum())
-        rigid = mean + 1j * slope.imag * away
+        fit = fit_similarity(places, way, weight / weight.sum())
+        rigid = fit.mean + 1j * fit.slope.imag * fit.away
         length = np.abs(rigid)
         # Along the motion, and aside of it.
-        behind = (mean + slope * away - way) * rigid.conj() / np.maximum(length, 1e-9)
+        behind = (fit.mean + fit.slope * fit.away - way) * rigid.conj() / np.maximum(length, 1e-9)
         motion, spread = (math.sqrt(share @ (part * part)) for part in (length, behind.imag))
         sticks = np.abs(behind.real) <= max(UNSURE * noise, LAG * motion, ASIDE * spread)
     return float(share[sticks].sum() / share.sum())

@@ -43,13 +43,13 @@ class Gel(NamedTuple):
     """How the gel that is in contact in two frames has moved between them: the rigid motion in the plane that
     fits it best.
 
-    before, now : (2,), its middle, mm. turn : radians. variance : of each coordinate of `now`, mm^2. spread :
+    before, now : its middle, x + iy, mm. turn : radians. variance : of each coordinate of `now`, mm^2. spread :
     mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance / spread.
     overlap : share of the gel in contact now that was before.
     """
 
-    before: Floats
-    now: Floats
+    before: complex
+    now: complex
     turn: float
     variance: float
     spread: float
@@ -246,8 +246,8 @@ def _gel_part(template: Template, now: Imprint, gel: Gel, motion: Floats) -> _Pa
     """The gel, at the mean height of both contacts: how it strains from the rim to the deepest point is not
     known."""
     turn = motion[:3, :3]
-    x, y, z = np.array([*gel.before, template.imprint.height]) - template.center
-    after = np.array([*gel.now, now.height]) - template.center
+    x, y, z = np.array([gel.before.real, gel.before.imag, template.imprint.height]) - template.center
+    after = np.array([gel.now.real, gel.now.imag, now.height]) - template.center
     error = np.zeros(3)
     error[:2] = (after - motion[:3, 3]) @ turn[:, :2] - (x, y)
     yaw = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+import cmath
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
 from tactflow.vision.arrays import Floats, Mask
 from tactflow.vision.flow.displacement_field import CELL, DisplacementField
+from tactflow.vision.geometry.similarity import as_complex, fit_similarity
 from tactflow.vision.pose.align import FREE, Alignment, Gel, align
 from tactflow.vision.pose.imprint import Imprint, Template, imprint_of, template_of
 from tactflow.vision.pose.rigid import adjoint, inverse, vector
@@ -177,17 +178,14 @@ class PoseTracker:
             return None
         share = both[inside] / total
         rest = field.grid.points[inside] - self._scale.origin
-        old, new = (self._mm * (rest + f.displacement[inside]) for f in (old_field, field))
-        middle, moved = share @ old, share @ new
-        lever, after = old - middle, new - moved
-        spread = float(share @ (lever * lever).sum(axis=1))
-        dot = float(share @ (lever * after).sum(axis=1))
-        cross = float(share @ (lever[:, 0] * after[:, 1] - lever[:, 1] * after[:, 0]))
+        old, new = (as_complex(self._mm * (rest + f.displacement[inside])) for f in (old_field, field))
+        fit = fit_similarity(old, new, share)
         # What no rigid motion explains; displacements a pitch apart are independent.
-        stretch = (spread + float(share @ (after * after).sum(axis=1)) - 2 * math.hypot(dot, cross)) / 2
+        square = float(share @ np.abs(new - fit.mean) ** 2)
+        stretch = (fit.spread + square) / 2 - abs(fit.slope) * fit.spread
         variance = (old_stderr**2 + stderr**2) * float(self._mm.prod()) + stretch / max(total * CELL**2, 1.0)
         overlap = total / float(new_share.sum())
-        return Gel(middle, moved, math.atan2(cross, dot), variance, spread, overlap)
+        return Gel(fit.middle, fit.mean, cmath.phase(fit.slope), variance, fit.spread, overlap)
 
     def _pose(self, status: Literal["tracked", "lost"], motion: Floats, covariance: Floats) -> Pose:
         """For people: in the sensor's axes, in mm and degrees, with the error of the scale."""
