@@ -80,7 +80,7 @@ def simulated(name: str, frames: int) -> Row:
     errors, stated = [], []
     start, slipped, before, mapping = np.zeros(3), -math.inf, None, None
     for result in tactflow.stream(source=f"sim:{spec}", settings={"stages.slip": {}}):
-        # One object for all frames, by which the scene remembers where its pixels lie: each result has a copy.
+        # One object for all frames, by which the scene remembers its pixels: each result has a copy.
         mapping = mapping or result["mapping"]
         truth, slip = scene.truth(result.seq, mapping), result.slip
         true = over_gel(scene, result.seq, mapping)

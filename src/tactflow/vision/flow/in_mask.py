@@ -80,7 +80,8 @@ def flow_in_mask(markers: Markers, mask: Mask, *, dilate: float = 0.0) -> Flow:
     if len(tracked) >= 2:
         # The similarity has four parameters, two for each axis; the mean has one for each.
         count = (len(chosen) - parameters) * len(tracked)
-        stderr = tuple(math.sqrt(float(part @ part) / count) for part in (rest.real, rest.imag))
+        x, y = rest.real, rest.imag
+        stderr = math.sqrt(float(x @ x) / count), math.sqrt(float(y @ y) / count)
     return Flow((fit.mean.real, fit.mean.imag), len(chosen), stderr, rotation, divergence, residual)
 
 

@@ -65,8 +65,8 @@ def light_change(unmarked: ColorImage, untouched: ColorImage, markers: Mask | No
     them; None: none.
     """
     light = cv2.subtract(cells(unmarked), untouched, dtype=cv2.CV_32F)
-    seen = np.ones(light.shape[:2], np.float32) if markers is None else np.float32(cells(markers) == 0)
-    return np.asarray(cv2.merge((light, seen)), np.float32)
+    hidden = np.zeros(light.shape[:2], np.uint8) if markers is None else cells(markers)
+    return np.asarray(cv2.merge((light, (hidden == 0).astype(np.float32))), np.float32)
 
 
 def cells(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from tactflow.vision.compiled import kernel
 
 Bytes = NDArray[np.uint8]
-_Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 
 def halved(
@@ -52,7 +51,7 @@ def halved(
     return half
 
 
-def cell_means(picture: NDArray[_Pixel], side: int) -> NDArray[_Pixel]:
+def cell_means(picture: NDArray[Any], side: int) -> NDArray[Any]:
     """Means over square cells; means of whole numbers are rounded.
 
     picture : (H, W) or (H, W, channels), uint8 or float32. side : of a cell, px, a power of two. Returns
@@ -62,13 +61,13 @@ def cell_means(picture: NDArray[_Pixel], side: int) -> NDArray[_Pixel]:
     array([[3., 5.]], dtype=float32)
     """
     height, width = (extent // side for extent in picture.shape[:2])
-    cells = picture[: height * side, : width * side]
+    cells: Any = picture[: height * side, : width * side]
     # OpenCV has a loop of its own for halves: two take a third of the time of one step.
     while side > 1:
         side //= 2
         size = (width * side, height * side)
-        cells = cv2.resize(cells, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    return cells
+        cells = cv2.resize(cells, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cells)
 
 
 @kernel("void(Array(uint8, 2, 'C', readonly=True), int64, int64, boolean, uint8[:, ::1])")

@@ -43,9 +43,9 @@ class Gel(NamedTuple):
     """How the gel that is in contact in two frames has moved between them: the rigid motion in the plane that
     fits it best.
 
-    before, now : its middle, x + iy, mm. turn : radians. variance : of each coordinate of `now`, mm^2. spread :
-    mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance / spread.
-    overlap : share of the gel in contact now that was before.
+    before, now : its middle, x + iy, mm. turn : radians. variance : of each coordinate of `now`, mm^2.
+    spread : mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance /
+    spread. overlap : share of the gel in contact now that was before.
     """
 
     before: complex
