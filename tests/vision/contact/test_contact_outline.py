@@ -26,6 +26,11 @@ CLINGS = 2.0
 """Distance from the border of a contact inwards to where the gel leaves the object, px at half resolution."""
 
 
+LAMPS = np.array([[math.cos(k * 2 * math.pi / 3), -math.sin(k * 2 * math.pi / 3)] for k in range(3)])
+"""(3, 2): how three lights from all sides answer to slopes along x and y."""
+SLOPES = np.asarray(np.linalg.pinv(LAMPS), np.float32)
+
+
 def tilted(outside: Float, ring: float = 3.0, skirt: float = 0.7) -> Float:
     """(h, w, 3) change of a gel that answers with its slope, largest where it leaves the object.
 
@@ -39,11 +44,8 @@ def tilted(outside: Float, ring: float = 3.0, skirt: float = 0.7) -> Float:
     strength = np.where(free < 0, np.exp(free / ring), skirt * np.exp(-free / fading))
     blurred = cv2.GaussianBlur(strength.astype(np.float32), (0, 0), 0.8)
     turn = np.linspace(0, 2 * np.pi, SIZE, dtype=np.float32)[None, :]
-    # Three lights: what one channel loses another gains.
-    shares = np.stack(
-        [np.broadcast_to(np.cos(turn + k * 2 * np.pi / 3), blurred.shape) for k in range(3)], axis=2
-    )
-    return np.asarray(blurred[..., None] * shares * 0.4, np.float32)
+    slopes = np.stack([np.broadcast_to(part, blurred.shape) for part in (np.cos(turn), np.sin(turn))], axis=2)
+    return np.asarray(blurred[..., None] * (slopes @ LAMPS.T) * 0.4, np.float32)
 
 
 def disc(radius: float = 30.0) -> Float:
@@ -56,9 +58,9 @@ def punch(half_width: float = 32.0, half_height: float = 24.0) -> Float:
     return np.asarray(away, np.float32)
 
 
-def found(change: Float, core: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def found(change: Float, core: NDArray[np.bool_], slopes: Float | None = SLOPES) -> NDArray[np.bool_]:
     """Pixels in contact, of which some are known."""
-    return np.asarray(contact_level(change, core.astype(np.uint8)) > 0, np.bool_)
+    return np.asarray(contact_level(change, core.astype(np.uint8), slopes) > 0, np.bool_)
 
 
 def hull_of(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -95,7 +97,7 @@ def test_what_the_core_does_not_reach_is_no_part_of_the_contact() -> None:
 def test_masks_are_left_as_they_are() -> None:
     change, core = tilted(disc()), (disc() < -4).astype(np.uint8)
     kept = change.copy(), core.copy()
-    contact_level(change, core)
+    contact_level(change, core, SLOPES)
     assert np.array_equal(change, kept[0])
     assert np.array_equal(core, kept[1])
 
@@ -103,7 +105,7 @@ def test_masks_are_left_as_they_are() -> None:
 def test_a_darkened_contact_with_a_bright_halo_ends_where_it_turns_bright() -> None:
     away = disc(24)
     darker = np.clip(-away / 6, 0, 1) - 0.4 * np.exp(-((away - 8) ** 2) / 50) * (away > 0)
-    mask = found(-np.repeat(darker[..., None], 3, axis=2).astype(np.float32), away < -4)
+    mask = found(-np.repeat(darker[..., None], 3, axis=2).astype(np.float32), away < -4, None)
     # It darkens over 6 px, and is 0.15 dark 0.9 px inside; with the halo's size it would reach 9 px further.
     assert math.sqrt(mask.sum() / math.pi) == pytest.approx(24 - 0.9, abs=0.5)
 
@@ -134,7 +136,7 @@ def test_a_large_contact_has_the_same_outline_however_it_is_turned() -> None:
 def test_a_brightened_contact_reaches_as_far_where_it_is_dim() -> None:
     away, across = disc(32), (np.arange(SIZE) - 49.5) / 32
     uneven = (0.5 - 0.5 * np.tanh(away / 4)) * np.clip(0.65 + 0.35 * across, 0.3, 1.0)
-    mask = found(np.repeat(uneven[..., None], 3, axis=2).astype(np.float32), disc(16) < 0)
+    mask = found(np.repeat(uneven[..., None], 3, axis=2).astype(np.float32), disc(16) < 0, None)
     assert 49.5 - np.flatnonzero(mask[50])[0] > 28
 
 
@@ -144,7 +146,7 @@ def test_both_flanks_of_a_ball_lit_from_one_side_are_one_contact(turn: int) -> N
     toward = columns * math.cos(math.radians(turn)) + rows * math.sin(math.radians(turn))
     slope = np.where(disc(24) < 0, toward / 24, np.float32(0)).astype(np.float32)
     change = np.repeat(cv2.GaussianBlur(slope, (0, 0), 0.8)[..., None], 3, axis=2)
-    mask = found(change, disc(16) < 0)
+    mask = found(change, disc(16) < 0, np.full((2, 3), 0.4, np.float32))
     # One of the flanks alone has its centroid 14 px off.
     assert math.hypot(*(float(places[mask].mean()) for places in (rows, columns))) < 0.5
     # The slope vanishes where the light comes along the border, so that the outline is drawn in there.

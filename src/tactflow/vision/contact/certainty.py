@@ -19,7 +19,7 @@ from tactflow.vision.arrays import Floats, Floats32, Mask
 from tactflow.vision.contact.background import CELL
 from tactflow.vision.types import Contact
 
-WEIGHTS: Final = (1.23, 1.37, 1.89, 1.49)
+WEIGHTS: Final = (0.13, 2.53, 0.95, 1.64)
 """Constant and weights of `contact_evidence` in the log odds: `python -m tactflow.bench.judge --fit`."""
 DOUBTFUL: Final = 0.25
 """Probability below which a region beside another does not count: three to one against it."""

@@ -27,28 +27,20 @@ SHALLOW: Final = 0.2
 """Part of the largest depth nearby that the gel has at the border of a contact. Under a ball it is 0.32 on a
 half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap as well with real
 outlines within 0.02."""
-COLOURED: Final = 6.0
-"""A change has brightened as a whole where its mean over the channels, squared and summed, is more than one
-part in so many of its length's: of three equal channels it is one in three. Chosen by hand, half of that."""
-
-TWO_SIDED: Final = 0.4
-"""How far apart what has brightened and what has darkened are (`_sidedness`), from which on they are two
-flanks of one contact: half of the 0.83 of a ball lit from one side. A dark contact with a bright halo has
-0.02 (9dtact_1), other contacts that change as a whole have 0.23 at most (sts_640). In grey pictures of
-mini_ball it is 0.74 to 0.83, of digit_fots 0.53 in the median."""
 FAINT: Final = 0.3
 """Fraction of the largest change of the whole contact that the largest one nearby counts for at least.
 Chosen by hand."""
 
 
-def contact_level(change: Floats32, core: Mask, sloping: bool = False) -> Floats32:
+def contact_level(change: Floats32, core: Mask, slopes: Floats32 | None) -> Floats32:
     """Level set of one contact's outline.
 
     Parameters
     ----------
     change : (h, w, 3) float32, of the contact's window, in standard deviations; 0 where nothing belongs to
-        the contact. core : (h, w) uint8, 1 where the contact surely is, else 0. sloping : whether the light
-        is known to answer with slope; otherwise the change tells.
+        the contact. core : (h, w) uint8, 1 where the contact surely is, else 0. slopes :
+        (2, 3) float32, mixtures of the channels that are slopes along x and y; None where the light answers
+        with depth.
 
     Returns
     -------
@@ -61,11 +53,11 @@ def contact_level(change: Floats32, core: Mask, sloping: bool = False) -> Floats
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> disc = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
     >>> core = (disc == 1).astype(np.uint8)
-    >>> level = contact_level(np.stack([disc] * 3, axis=2), core)
+    >>> level = contact_level(np.stack([disc] * 3, axis=2), core, slopes=None)
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
-    shows, border = _what_shows(change, sloping)
+    shows, border = _what_shows(change, slopes)
     level = np.asarray(shows / largest_nearby(shows) - np.float32(border), np.float32)
     inside = _around(np.asarray((level > 0) | (core > 0)), core)
     # What is filled in is as deep inside as what has changed most, what is left out as far outside.
@@ -73,43 +65,16 @@ def contact_level(change: Floats32, core: Mask, sloping: bool = False) -> Floats
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
-def _what_shows(change: Floats32, sloping: bool) -> tuple[Floats32, float]:
+def _what_shows(change: Floats32, slopes: Floats32 | None) -> tuple[Floats32, float]:
     """What tells of the contact, (h, w), and the part of its largest value at which the contact ends."""
-    blue, green, red = cv2.split(change)
-    brightness = np.asarray((blue + green + red) * np.float32(1 / 3), np.float32)
-    strength = np.asarray(cv2.magnitude(cv2.magnitude(blue, green), red), np.float32)
-    whole = cv2.norm(strength, cv2.NORM_L2SQR)
-    if (
-        sloping
-        or COLOURED * cv2.norm(brightness, cv2.NORM_L2SQR) <= whole
-        or _sidedness(brightness) >= TWO_SIDED
-    ):
-        return strength, OUTER
-    brighter = np.maximum(brightness, np.float32(0))
-    darker = brighter - brightness
+    if slopes is not None:
+        along_x, along_y = cv2.split(cv2.transform(change, slopes))
+        return np.asarray(cv2.magnitude(along_x, along_y), np.float32), OUTER
+    brightness = np.asarray(cv2.transform(change, np.ones((1, 3), np.float32)), np.float32)
+    brighter, darker = np.maximum(brightness, np.float32(0)), np.maximum(-brightness, np.float32(0))
     if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
         return darker, SHALLOW
     return brighter, SHALLOW
-
-
-def _sidedness(brightness: Floats32) -> float:
-    """How far apart what has brightened and what has darkened are, 0..1.
-
-    The distance of the centroids of both, weighted by the squared change, times twice the product of their
-    shares, over the radius of gyration of the whole: 0 where all has changed the same way, or where one way
-    lies around the other; 0.83 for a disc whose change grows linearly from one side to the other.
-    """
-    squares = np.square(brightness)
-    whole = cv2.moments(squares)
-    brighter = cv2.moments(np.where(brightness > 0, squares, np.float32(0)))
-    share = brighter["m00"] / max(whole["m00"], 1e-9)
-    if not 0 < share < 1:
-        return 0.0
-    # The brighter part is as far from the whole as from the darker part, times the darker part's share.
-    apart = [brighter[key] / brighter["m00"] - whole[key] / whole["m00"] for key in ("m10", "m01")]
-    # Of a single pixel it is 0, or by rounding less.
-    gyration = math.sqrt(max((whole["mu20"] + whole["mu02"]) / whole["m00"], 1e-18))
-    return 2 * share * math.hypot(*apart) / gyration
 
 
 def largest_nearby(values: Floats32) -> Floats32:

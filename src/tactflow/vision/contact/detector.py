@@ -73,7 +73,8 @@ class ContactResult:
     mask : (H, W) uint8, 255 in contact, else 0. touching : whether any pixel is in contact.
     strength : largest change anywhere, in standard deviations of the untouched gel (`noise` only; else 0).
     deviations : (2, h, w) float32, squared changes of each cell that belongs to a contact, of its light and
-        of its colour alone, in variances of the untouched gel; 0 elsewhere (`noise` only; else None).
+        of its colour alone, in variances of the untouched gel; 0 elsewhere (`noise` only; else None). Where
+        all channels change alike both are the same.
     """
 
     mask: NDArray[np.uint8]
@@ -250,11 +251,15 @@ class ContactDetector:
             self._mask = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
         self._before = union(found, change.squared.shape)
-        deviations = np.stack([change.squared, change.colour]) * self._before
-        if faint and change.remaining < 1 - self._creep and self._mask is not None:
-            return ContactResult(self._mask.copy(), True, strength, deviations)
-        self._mask = self._outlined(change, image.shape[:2])
-        return ContactResult(self._mask, True, strength, deviations)
+        fading = faint and change.remaining < 1 - self._creep and self._mask is not None
+        if not fading:
+            self._mask = self._outlined(change, image.shape[:2])
+        assert self._mask is not None
+        mask = self._mask.copy() if fading else self._mask
+        # A gray camera sees no colours: a change that is one of colour in others is one of light there.
+        colour = change.squared if self._heights.alike else change.colour
+        deviations = np.stack([change.squared, colour]) * self._before
+        return ContactResult(mask, True, strength, deviations)
 
     def _outlined(self, change: Change, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         """(H, W): the contacts that a change shows; the cells that have changed, where no shape does."""
@@ -266,7 +271,7 @@ class ContactDetector:
         for rows, columns, inside, core in regions:
             window = self._background.window_change(change, rows, columns, inside)
             surely = core.repeat(2, axis=0).repeat(2, axis=1)
-            level = contact_level(window, surely, heights.alike)
+            level = contact_level(window, surely, heights.slopes)
             draw_level(level, CELL * rows.start, CELL * columns.start, mask)
         if not regions:
             draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL)

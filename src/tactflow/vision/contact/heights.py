@@ -20,14 +20,15 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy import fft, linalg
+from scipy import linalg
 
 from tactflow.vision.arrays import Floats32
 
 MARGIN: Final = 0.15
-"""Part of the longer side of the picture by which it is extended with gel at rest on all sides: the surface
-that is integrated has to return to where it was."""
+"""Part of each side of the picture by which it is extended with gel at rest at both ends: the surface that is
+integrated ends as high as it began."""
+SHORTEST: Final = 4
+"""Length of the shortest waves, cells: cells are means over three by three."""
 INTEGRABLE: Final = 0.2
 """Part of the slopes' power that may be missing in those of a surface. One slope of a round contact, which is
 what light from one side shows, misses 0.25 with nothing beside it; sensors with lamps on several sides miss
@@ -52,16 +53,17 @@ class Heights(NamedTuple):
 
     values : (h, w) float32, height of each cell above the gel at rest, in some unit, or how much it has
     changed. slopes : (2, 3) float32, mixtures of the channels that are slopes along x and y; None where no
-    mixtures are. alike : whether that is one and the same slope, since all channels change alike.
+    mixtures are.
     """
 
     values: Floats32
     slopes: Floats32 | None
-    alike: bool = False
 
 
 class HeightModel:
     """Learns how the light of a sensor answers to slopes, and integrates them.
+
+    alike : whether all channels have changed alike so far, as those of a gray camera do.
 
     Examples
     --------
@@ -78,8 +80,8 @@ class HeightModel:
     def __init__(self) -> None:
         self._missing, self._power = np.zeros((6, 6)), np.zeros((3, 3))
         self._one_way = self._size = 0.0
+        self.alike = False
         self._slopes: Floats32 | None = None
-        self._alike = False
         self._before = np.zeros((2, 3), np.float32)
 
     def __call__(self, change: Floats32) -> Heights:
@@ -89,40 +91,29 @@ class HeightModel:
             return Heights(cv2.magnitude(cv2.magnitude(change[0], change[1]), change[2]), None)
         high, wide = change.shape[1:]
         slopes = (self._slopes @ change.reshape(3, -1)).reshape(2, high, wide)
-        size = _extended(high, wide)
-        along_x, along_y = fft.rfft2(slopes, size)
-        from_x, from_y = _integrals(*size)
-        extended = fft.irfft2(from_x * along_x + from_y * along_y, size)
-        rest = np.median(np.concatenate([extended[high], extended[-1]]))
-        return Heights(np.asarray(extended[:high, :wide] - rest, np.float32), self._slopes, self._alike)
+        down, across = _waves(high), _waves(wide)
+        climbs = down.values @ slopes[0] @ across.slopes.T + down.slopes @ slopes[1] @ across.values.T
+        climbs /= _squares(high, wide)
+        return Heights(np.asarray(down.values.T @ climbs @ across.values, np.float32), self._slopes)
 
     def _learn(self, change: Floats32) -> None:
-        """Add the power of a change, and what of it would be missing in a surface, if that tells more.
-
-        Of slopes (p, q) at the frequency (u, v), (v p - u q) / |(u, v)| is no slope of a surface, nor is
-        their mean.
-        """
+        """Add the power of a change, and what of it would be missing in a surface, if that tells more."""
         flat = change.reshape(3, -1)
         if not cv2.norm(flat, cv2.NORM_L2SQR) > MORE * self._power.trace():
             return
+        high, wide = change.shape[1:]
+        down, across = _waves(high), _waves(wide)
+        along_x = down.values @ change @ across.slopes.T
+        along_y = down.slopes @ change @ across.values.T
+        climbs = np.concatenate([along_x, along_y]) / np.sqrt(_squares(high, wide))
+        both = np.asarray(climbs.reshape(6, -1), np.float64)
         power = np.asarray(flat @ flat.T, np.float64)
-        size = _extended(*change.shape[1:])
-        spectrum = np.asarray(fft.rfft2(change, size), np.complex64)
-        across, down = _frequencies(*size)
-        length = np.maximum(np.hypot(across, down), np.float32(1e-9))
-        curl = np.concatenate([spectrum * (-down / length), spectrum * (across / length)])
-        # All but the first column stand for two frequencies.
-        curl[:, :, 1:] *= np.float32(2**0.5)
-        both, mean = curl.reshape(6, -1), flat.sum(axis=1, dtype=np.float64)
-        missing = (both @ both.conj().T).real.astype(np.float64)
-        missing[:3, :3] += np.outer(mean, mean)
-        missing[3:, 3:] += np.outer(mean, mean)
         self._power += power
+        self._missing += np.kron(np.eye(2), power) - both @ both.T
         sizes = np.linalg.norm(flat, axis=0)
         clear = sizes > CLEAR
         self._one_way += float(np.linalg.norm(flat[:, clear].sum(axis=1)))
         self._size += float(sizes[clear].sum())
-        self._missing += missing / (size[0] * size[1])
         self._slopes = self._integrable()
         if self._slopes is not None:
             # Up to the sign, which stays as it was.
@@ -133,35 +124,50 @@ class HeightModel:
         """Mixtures (2, 3) of the channels that are slopes along x and y; None where none are of a surface."""
         powers, directions = np.linalg.eigh(self._power)
         basis = np.kron(np.eye(2), directions[:, powers >= WEAKEST * powers[-1]])
-        self._alike = basis.shape[1] == 2
-        if self._alike and self._one_way >= ONE_WAY * self._size:
+        self.alike = basis.shape[1] == 2
+        if self.alike and self._one_way >= ONE_WAY * self._size:
             return None
         power = basis.T @ np.kron(np.eye(2), self._power) @ basis
         missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
         mixtures = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
-        integrable = missing[0] <= (ONE_SLOPE if self._alike else INTEGRABLE)
+        integrable = missing[0] <= (ONE_SLOPE if self.alike else INTEGRABLE)
         return mixtures / np.linalg.norm(mixtures) if integrable else None
 
 
-@lru_cache(maxsize=4)
-def _extended(high: int, wide: int) -> tuple[int, int]:
-    """Size of a picture of cells that is extended by gel at rest, and that transforms quickly."""
-    margin = max(round(MARGIN * max(high, wide)), 1)
-    rows, columns = (int(fft.next_fast_len(side + 2 * margin, real=True)) for side in (high, wide))
-    return rows, columns
+class _Waves(NamedTuple):
+    """Waves of a surface along one side of the picture, extended at both ends: cosines, then sines.
+
+    values : (k, n) float32, at each cell. slopes : (k, n) float32, of the waves, per cell. frequencies :
+    (k,) float32, radians per cell, from 0. The squares of a wave sum up to 1 over the extended side.
+    """
+
+    values: Floats32
+    slopes: Floats32
+    frequencies: Floats32
 
 
 @lru_cache(maxsize=4)
-def _integrals(rows: int, columns: int) -> NDArray[np.complex64]:
-    """(2, rows, columns // 2 + 1): factors of the spectra of slopes along x and y in that of a surface."""
-    across, down = _frequencies(rows, columns)
-    square = across**2 + down**2
-    square[0, 0] = 1
-    return np.asarray(-1j * np.stack([across / square, down / square]), np.complex64)
+def _waves(side: int) -> _Waves:
+    """Those of a side of so many cells."""
+    margin = max(round(MARGIN * side), 1)
+    length = side + 2 * margin
+    frequencies = 2 * np.pi / length * np.arange(length // SHORTEST + 1)[:, None]
+    phases = frequencies * (margin + np.arange(side))
+    cosines, sines = np.cos(phases), np.sin(phases)
+    cosines[0] /= np.sqrt(2)
+    values = np.concatenate([cosines, sines[1:]])
+    slopes = np.concatenate([-frequencies * sines, (frequencies * cosines)[1:]])
+    scale = np.sqrt(2 / length)
+    return _Waves(
+        np.asarray(scale * values, np.float32),
+        np.asarray(scale * slopes, np.float32),
+        np.asarray(np.concatenate([frequencies, frequencies[1:]])[:, 0], np.float32),
+    )
 
 
 @lru_cache(maxsize=4)
-def _frequencies(rows: int, columns: int) -> tuple[Floats32, Floats32]:
-    """Along x, (1, columns // 2 + 1), and along y, (rows, 1), of a picture of that size."""
-    across, down = fft.rfftfreq(columns)[None], fft.fftfreq(rows)[:, None]
-    return np.asarray(across, np.float32), np.asarray(down, np.float32)
+def _squares(high: int, wide: int) -> Floats32:
+    """(k, l) float32: squared slopes of each wave of a picture, summed over it; of the flat one infinite."""
+    squares = np.add.outer(_waves(high).frequencies ** 2, _waves(wide).frequencies ** 2)
+    squares[0, 0] = np.inf
+    return squares
