@@ -68,8 +68,7 @@ class TactflowCamera(Camera):
         from tactflow.sources.cameras import list_cameras
 
         return [
-            {"name": camera.abilities.name if camera.abilities else camera.device, "type": "tactflow"}
-            | {"id": camera.source}
+            {"name": camera.name or camera.device, "type": "tactflow"} | {"id": camera.source}
             for camera in list_cameras()
         ]
 

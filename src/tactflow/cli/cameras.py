@@ -47,15 +47,10 @@ def run(args: argparse.Namespace) -> int:
 
 def describe(camera: CameraInfo) -> Iterator[str]:
     """A camera in words: the name to use first, then what else is known."""
-    abilities = camera.abilities
-    title = f"{abilities.name}: " if abilities and abilities.name else ""
     yield camera.source
-    yield f"    {title}{camera.device} (--source {camera.index})"
+    yield f"    {camera.name}{': ' if camera.name else ''}{camera.device} (--source {camera.index})"
     yield from (f"    also {name}" for name in camera.names[1:])
     if camera.problem:
         yield f"    cannot be queried: {camera.problem}"
-    if abilities and not abilities.pictures:
+    if not camera.pictures:
         yield "    delivers only metadata, no pictures"
-    for form, sizes in abilities.formats.items() if abilities else ():
-        sizes_text = ", ".join(f"{width} x {height}" for width, height in sizes)
-        yield f"    {form}: {sizes_text or 'any size within a range'}"

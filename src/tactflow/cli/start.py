@@ -117,7 +117,7 @@ def _cameras(dev: Path) -> list[str]:
     if not sys.platform.startswith("linux"):
         return ["0", "1", "2"]
     cameras = list_cameras(dev)
-    found = [camera.source for camera in cameras if camera.abilities is None or camera.abilities.pictures]
+    found = [camera.source for camera in cameras if camera.pictures]
     if not found:
         raise SourceError(f"{NO_CAMERA}\n  to try it without one: tactflow start sim:press")
     return found
