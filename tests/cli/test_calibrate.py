@@ -39,15 +39,14 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(termin
     sunk = float(open_scene("press?seed=11&frames=80").truth(deepest.seq).sunk.max()) * RAW_MM
     assert abs(deepest.depth.greatest - sunk) < max(3 * deepest.depth.greatest_stderr, 0.03 * sunk)
 
-    gauge = ["ball?frames=100&shear=0.6", "--out", "gauge.avi", "--truth", "gauge.csv", "--quiet"]
-    assert terminal("sim", *gauge) == 0
-    force = ["force", "calibration/main.yaml", "--from", "gauge.avi"]
+    scene = "ball?frames=100&shear=0.6"
+    assert terminal("sim", scene, "--truth", "gauge.csv", "--quiet") == 0
+    force = ["force", "calibration/main.yaml", "--from", f"sim:{scene}", "--csv", "gauge.csv"]
     assert terminal("calibrate", *force) == 0
     output = terminal.err
     assert "heights are not known" not in output
     assert "the gauge's x axis lies -90 degrees" in output
-    today = ["check", *force[1:], "--csv", "gauge.csv"]
-    assert terminal("calibrate", *today) == 0
+    assert terminal("calibrate", "check", *force[1:]) == 0
     assert "N RMS from the gauge today; when it was made" in terminal.out
     assert terminal("calibrate", *force) == 2
     assert "has a force already" in terminal.err
@@ -215,15 +214,16 @@ def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(termi
         ("idle", "idle?frames=12"),
         ("bad", "ball?frames=12"),
     ):
-        files = ["--out", f"forces/{name}.avi", "--truth", f"forces/{name}.csv"]
-        assert terminal("sim", scene, *files, "--quiet") == 0
+        assert terminal("sim", scene, "--truth", f"forces/{name}.csv", "--quiet") == 0
+        recorded = ["--source", f"sim:{scene}", "--out", f"forces/{name}.mcap", "--set", "sinks={}"]
+        assert terminal("record", "markerless", *recorded, "--quiet") == 0
     Path("forces/bad.csv").write_text("t,force\n0,1\n")
     assert terminal("calibrate", "force", "gel.yaml", "--from", "forces") == 0
     output = terminal.err
-    assert "forces/idle.avi is left out: " in output
-    assert "forces/bad.avi is left out: " in output
-    assert "forces/good.avi: 100 frames" in output
-    assert list(yaml.safe_load(Path("gel.yaml").read_text())["force"]["recordings"]) == ["forces/good.avi"]
+    assert "forces/idle.mcap is left out: " in output
+    assert "forces/bad.mcap is left out: " in output
+    assert "forces/good.mcap: 100 frames" in output
+    assert list(yaml.safe_load(Path("gel.yaml").read_text())["force"]["recordings"]) == ["forces/good.mcap"]
     Path("forces/good.csv").unlink()
     assert terminal("calibrate", "force", "gel.yaml", "--from", "forces", "--overwrite") == 2
     assert "none of the 2 recordings can be used" in terminal.err
