@@ -34,10 +34,6 @@ WEIGHT_SIGMA: Final = 1.1
 """Width of the Gaussian by which a mark's weight falls with its distance, pitches: 0.66 at one pitch. Chosen
 by hand."""
 
-LEAST_SUPPORT: Final = 0.6
-"""Sum of the weights of the seen marks around a mark that is placed: one neighbour is enough. Below, the mark
-is lost."""
-
 RIDGE: Final = np.diag([1e-9, 0.05, 0.05, 0.3, 0.3, 0.3])
 """Ridge of the fit's coefficients 1, x, y, x^2, x y, y^2. It turns a quadratic fit into a plane, and a plane
 into a mean, where there is too little to fit it. Chosen by hand."""
@@ -117,11 +113,10 @@ class Interpolator:
         self._origin, self._pitch = origin, pitch
         self._around, self._weight = surroundings(origin, pitch)
 
-    def place(self, position: Floats, found: Flags, share: float = 0.0) -> Indices:
+    def place(self, position: Floats, found: Flags) -> Indices:
         """Place the marks that are not found, where enough of those around them are.
 
         position : (N, 2) float64, px, finite, changed in place. found : (N,) bool.
-        share : of the weight of all marks around, that those found have at least, 0 to 1.
         Returns the numbers of the marks that are placed; the positions of others stay.
         """
         missing = np.flatnonzero(~found)
@@ -135,8 +130,7 @@ class Interpolator:
             basis[..., number] = term
         weighted = (basis * weight[:, :, None]).transpose(0, 2, 1)
         fitted = np.linalg.solve(weighted @ basis + RIDGE, weighted @ moved)[:, 0]
-        total = weight.sum(axis=1)
-        supported = (total > LEAST_SUPPORT) & (total > share * self._weight[missing].sum(axis=1))
+        supported = weight.sum(axis=1) > LEAST_SHARE * self._weight[missing].sum(axis=1)
         placed = np.asarray(missing[supported], np.int64)
         position[placed] = self._origin[placed] + fitted[supported]
         return placed
@@ -189,7 +183,7 @@ def grow(
         free = np.delete(free, taken)
         return len(first) > 0
 
-    while len(free) and len(asked := interpolator.place(position, known, LEAST_SHARE)) and take(asked):
+    while len(free) and len(asked := interpolator.place(position, known)) and take(asked):
         pass
     left = np.flatnonzero(~known)
     position[left] = last[left]

@@ -6,23 +6,24 @@ from typing import Final
 
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats, Floats32
-from tactflow.vision.markers.matching import LEAST_SUPPORT, surroundings
+from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
+from tactflow.vision.compiled import kernel
+from tactflow.vision.markers.matching import LEAST_SHARE, surroundings
+
+REST: Final = 0.1
+"""Distance of a mark from its origin, along either axis, within which it rests, pitches. Chosen by hand."""
 
 BEST_AGREEMENT: Final = 0.25
 """Difference of a mark's displacement from the mean of those around it, over this mean, that is always
 expected. In seven recordings and eight scenes the evidence against a true mark is then 4.1 at most, 3 in all
 but one of them (measured)."""
 
-LEAST_SPREAD: Final = 0.01
-"""Difference that is always expected, px: the error of a mark without noise."""
+LEAVING_EVIDENCE: Final = 5.0
+"""Evidence that a mark stays while those around it move, from which on it leaves: very strong (Kass and
+Raftery, "Bayes factors", 1995)."""
 
 NEAREST: Final = 4
 """Marks around, of which one has to move: those next to it on a square grid."""
-
-FARTHER: Final = 1.2
-"""Ratio of the largest displacements of two frames that are weighed: frames in between add little, for the
-evidence grows with the displacement."""
 
 
 class MotionEvidence:
@@ -30,13 +31,14 @@ class MotionEvidence:
 
     In one frame a mark that moves with those around is as far from their mean displacement as they are
     themselves: normally distributed. One that stays is so far from zero. Frames repeat each other, so only
-    the strongest evidence of all frames counts, and only those are weighed in which the gel has moved
-    farther than before, since it last rested.
+    the strongest evidence of all frames counts.
 
-    origin : (N, 2) float64, marks in the reference, px. pitch : px. rest : distance from its origin within
-    which a mark rests, px.
+    origin : (N, 2) float64, marks in the reference, px. pitch : px.
+    prior : (N,) float64, probability of being a mark by its looks, 0 to 1.
+    against : (N,) float64, logarithm of how much more probable it is that a mark stays, 0 or more: what is
+    known so far.
 
-    against : (N,) float64, logarithm of how much more probable it is that a mark stays, 0 or more.
+    left : (n,) int64, marks that do not move with the gel.
 
     References
     ----------
@@ -46,47 +48,83 @@ class MotionEvidence:
     Examples
     --------
     >>> x, y = np.meshgrid(np.arange(5.0), np.arange(5.0))
-    >>> evidence = MotionEvidence(10 * np.column_stack([x.ravel(), y.ravel()]), 10.0, 1.0)
+    >>> origin = 10 * np.column_stack([x.ravel(), y.ravel()])
+    >>> evidence = MotionEvidence(origin, 10.0, np.full(25, 0.99), np.zeros(25))
     >>> moved = np.full((25, 2), 2.0)
     >>> moved[12] = 0
     >>> evidence.add(moved, np.full(25, 0.02, np.float32), np.ones(25, bool))
     True
-    >>> evidence.against[[12, 13]].round(1)
-    array([8., 0.])
+    >>> evidence.against[[12, 13]].round(1), evidence.left
+    (array([8., 0.]), array([12]))
     """
 
-    def __init__(self, origin: Floats, pitch: float, rest: float) -> None:
-        self._around, self._weight = surroundings(origin, pitch)
-        self._rest, self._farthest = rest**2, rest**2
-        self.against = np.zeros(len(origin))
+    def __init__(self, origin: Floats, pitch: float, prior: Floats, against: Floats) -> None:
+        self._around, weight = surroundings(origin, pitch)
+        self._share = weight / weight.sum(axis=1, keepdims=True)
+        self._rest = REST * pitch
+        self._log_odds = np.log(prior / (1 - prior))
+        self.against = against
+        self.left: Indices = self._leaving()
+
+    @property
+    def probability(self) -> Floats:
+        """(N,) float64, of being a mark, 0 to 1."""
+        return np.asarray(1 / (1 + np.exp(self.against - self._log_odds)), np.float64)
+
+    def _leaving(self) -> Indices:
+        return np.flatnonzero((self.against > LEAVING_EVIDENCE) & (self.against > self._log_odds))
 
     def add(self, displacement: Floats, stderr: Floats32, seen: Flags) -> bool:
-        """Take one frame into account; returns whether a mark that is seen is not at rest.
+        """Take one frame into account; returns whether the gel is not at rest.
 
-        displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool.
+        displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool, which are measured.
         """
-        squared = np.where(seen, np.einsum("ni,ni->n", displacement, displacement), 0.0)
-        farthest = float(squared.max(initial=0))
-        if farthest <= self._rest:
-            self._farthest = self._rest
-            return False
-        if farthest > self._farthest:
-            self._farthest = FARTHER**2 * farthest
-            self._weigh(displacement, stderr, seen, squared > self._rest)
-        return True
+        around = self._around, self._share, self._rest
+        moves = weigh_motion(displacement, stderr, seen, *around, self.against)
+        if moves and self.against.max() > LEAVING_EVIDENCE:
+            self.left = self._leaving()
+        return moves
 
-    def _weigh(self, displacement: Floats, stderr: Floats32, seen: Flags, moves: Flags) -> None:
-        """Raise `against` to the evidence of a frame, where a mark rests beside one that `moves`, (N,)."""
-        resting = np.flatnonzero(seen & ~moves & moves[self._around[:, :NEAREST]].any(axis=1))
-        around = self._around[resting]
-        share = self._weight[resting] * seen[around]
-        told = share.sum(axis=1) > LEAST_SUPPORT
-        resting, around, share = resting[told], around[told], share[told]
-        share /= share.sum(axis=1, keepdims=True)
-        moved = displacement[around]
-        mean = np.einsum("nk,nki->ni", share, moved)
-        length = (mean**2).sum(axis=1)
-        spread = np.maximum(np.einsum("nk,nki,nki->n", share, moved, moved) - length, 0) / 2
-        expected = spread + stderr[resting] ** 2 + BEST_AGREEMENT**2 * length + LEAST_SPREAD**2
-        along = (mean * displacement[resting]).sum(axis=1)
-        self.against[resting] = np.maximum(self.against[resting], (length / 2 - along) / expected)
+
+@kernel(
+    "boolean(float64[:, ::1], float32[::1], boolean[::1], int64[:, ::1], float64[:, ::1], float64,"
+    "float64[::1])"
+)
+def weigh_motion(
+    displacement: Floats,
+    stderr: Floats32,
+    seen: Flags,
+    around: Indices,
+    share: Floats,
+    rest: float,
+    against: Floats,
+) -> bool:
+    """Raise `against`, (N,), to the evidence of a frame; returns whether a mark moves.
+
+    displacement : (N, 2). stderr, seen : (N,). around, share : (N, K), the marks around, nearest first, and their
+    shares in a mean. rest : distance along an axis within which a mark rests.
+    """
+    moves, moving = np.empty(len(displacement), np.bool_), False
+    for n in range(len(displacement)):
+        moves[n] = max(abs(displacement[n, 0]), abs(displacement[n, 1])) > rest
+        moving = moving or moves[n]
+    for n in range(len(displacement) if moving else 0):
+        beside = False
+        for k in range(min(NEAREST, around.shape[1])):
+            beside = beside or (moves[around[n, k]] and seen[around[n, k]])
+        if moves[n] or not (seen[n] and beside):
+            continue
+        total = mean_x = mean_y = squares = 0.0
+        for k in range(around.shape[1]):
+            if seen[around[n, k]]:
+                x, y = displacement[around[n, k]]
+                total, squares = total + share[n, k], squares + share[n, k] * (x * x + y * y)
+                mean_x, mean_y = mean_x + share[n, k] * x, mean_y + share[n, k] * y
+        if total < LEAST_SHARE:
+            continue
+        mean_x, mean_y = mean_x / total, mean_y / total
+        length = mean_x * mean_x + mean_y * mean_y
+        expected = (squares / total - length) / 2 + stderr[n] * stderr[n] + BEST_AGREEMENT**2 * length
+        along = mean_x * displacement[n, 0] + mean_y * displacement[n, 1]
+        against[n] = max(against[n], (length / 2 - along) / expected)
+    return moving

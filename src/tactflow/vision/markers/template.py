@@ -40,12 +40,8 @@ are never trusted. Chosen by hand."""
 ONE_TEMPLATE: Final = 1.5
 """Ratio of radii of marks whose templates have one size, at most. Chosen by hand."""
 
-LARGEST_LEVEL: Final = 2**15 - 1
-"""Largest weight as a whole number of 16 bits."""
-
-LEAST_RESIDUAL: Final = np.float32(1e-3)
-"""Sum of squares, grey levels^2, that always counts as unexplained: keeps r_squared below 1 and errors
-above 0."""
+TINY: Final = np.finfo(np.float32).tiny
+"""Keeps quotients finite."""
 
 LEAST_GAIN: Final = np.float32(0.2)
 """Contrast of a mark that is seen, over that of its template, at least. A step is divided by no less: that
@@ -125,7 +121,7 @@ class MarkerTemplates:
             slope_x = (shifted[y + 1][x + 2] - shifted[y + 1][x]) * (PHASES / 2)
             slope_y = (shifted[y + 2][x + 1] - shifted[y][x + 1]) * (PHASES / 2)
             model = _normal_equations(shifted[y + 1][x + 1], slope_x, slope_y, scaled, dark)
-            unit = np.maximum(np.abs(model[0]).max(axis=2), np.finfo(np.float32).tiny) / LARGEST_LEVEL
+            unit = np.maximum(np.abs(model[0]).max(axis=2), TINY) / np.iinfo(np.int16).max
             weights[y, x] = np.rint(model[0] / unit[:, :, None])
             terms[y, x, :, 10:] = unit
             terms[y, x, :, :9] = model[1].reshape(count, 9)
@@ -365,5 +361,5 @@ def fit_template(weight: Levels, term: Floats32, patch: Floats32, varies: float)
     explained += shift_x * (term[3] * gain + term[4] * shift_x + term[5] * shift_y)
     explained += shift_y * (term[6] * gain + term[7] * shift_x + term[8] * shift_y)
     contrast = varies - slope_x * slope_x - slope_y * slope_y
-    rest = max(contrast - explained, float(LEAST_RESIDUAL))
+    rest = max(contrast - explained, float(TINY))
     return gain, shift_x, shift_y, explained / (explained + rest), rest

@@ -41,16 +41,6 @@ SEARCH_INTERVAL: Final = 10
 MAX_DISPLACEMENT: Final = 1.3
 """Farthest a mark goes between two frames unless said otherwise, pitches. Chosen by hand."""
 
-REST: Final = 0.1
-"""Distance of a mark from its rest within which it rests, pitches. Chosen by hand."""
-
-WHOLE: Final = 0.95
-"""Fraction of the marks of a grid that rest and are seen, beyond which the grid rests. Chosen by hand."""
-
-LEAVING_EVIDENCE: Final = 5.0
-"""Evidence that a mark stays while those around it move, from which on it leaves: very strong (Kass and
-Raftery, "Bayes factors", 1995)."""
-
 JOINING_PROBABILITY: Final = 0.95
 """Of a mark that the reference did not show, at least: of those called so 96 % are marks."""
 
@@ -128,7 +118,7 @@ class MarkerTracker:
         self._shapes = (self._shape, (*self._shape, 3))
         self._pitch, self._radius = detection.pitch, detection.dot_radius
         self._valid, self._looked_again = valid, False
-        self._prior = None if detection.probability is None else _log_odds(detection.probability)
+        self._prior = detection.probability
         # Nothing that is seen goes farther than across the frame; the votes for a jump take memory.
         across = float(np.hypot(*self._shape))
         self._farthest = min(max_displacement or MAX_DISPLACEMENT * self._pitch, across)
@@ -158,9 +148,13 @@ class MarkerTracker:
         self._position = self._origin.copy()
         self._seen = np.ones(self._count, bool)
         self._age = 0
-        self._evidence = MotionEvidence(self._origin, self._pitch, REST * self._pitch)
-        self._left: Indices = np.zeros(0, np.int64)
+        self._evidence = self._weigh(np.zeros(self._count))
         self._has_moved = False
+
+    def _weigh(self, against: Floats) -> MotionEvidence:
+        """Begin with evidence (N,) against marks that is known already."""
+        prior = np.full(self._count, np.nan) if self._prior is None else self._prior
+        return MotionEvidence(self._origin, self._pitch, prior, against)
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
         """Find the marks in one frame.
@@ -174,43 +168,33 @@ class MarkerTracker:
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {image.shape[:2]}")
         image = np.ascontiguousarray(image)
         found = self._templates.align(image, self._position)
-        found.gain[self._left] = 0
+        found.gain[self._evidence.left] = 0
         position, stderr = found.position, found.stderr
         seen, strain, doubt = self._check(found)
-        self._age += 1
         # Where something stays missing, look again now and then.
-        missing = np.count_nonzero(seen) < self._count - len(self._left)
-        if doubt or (self._age >= SEARCH_INTERVAL and missing):
+        missing = np.count_nonzero(seen) < self._count - len(self._evidence.left)
+        self._age = self._age + 1 if missing else 0
+        if doubt or self._age >= SEARCH_INTERVAL:
             position, seen, stderr = self._search(image, found, seen, strain)
             self._age = 0
-        rests = self._weigh_motion(position, stderr, seen)
         # All tracked, which is 0; `np.full` takes three times as long.
         status = np.zeros(self._count, np.uint8)
         errors = stderr.astype(np.float64)
         if not seen.all():
-            errors[~seen] = np.nan
-            status[~seen] = _LOST
-            status[self._infer(position, seen)] = _INFERRED
-            status[self._left] = _LOST
+            errors[~seen], status[~seen] = np.nan, _LOST
+            position[~seen] = self._position[~seen]
+            status[self._interpolator.place(position, seen)] = _INFERRED
         self._position, self._seen = position, seen
-        if rests and self._has_moved and not self._looked_again:
+        moves = self._evidence.add(position - self._origin, stderr, seen)
+        left = self._evidence.left
+        seen[left], errors[left], status[left] = False, np.nan, _LOST
+        self._has_moved = self._has_moved or moves
+        if self._has_moved and not (moves or self._looked_again) and 2 * np.count_nonzero(seen) > len(seen):
             self._looked_again = True
             if self._join(image):
                 return self.track(image)
-        probability = None if self._prior is None else _probability(self._prior - self._evidence.against)
+        probability = None if self._prior is None else self._evidence.probability
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
-
-    def _weigh_motion(self, position: Floats, stderr: NDArray[Any], seen: Flags) -> bool:
-        """Have marks that do not move with the gel leave `seen`; returns whether the gel rests."""
-        moves = self._evidence.add(position - self._origin, stderr, seen)
-        if moves:
-            self._has_moved = True
-            against = self._evidence.against
-            if self._prior is not None and against.max() > LEAVING_EVIDENCE:
-                self._left = np.flatnonzero((against > LEAVING_EVIDENCE) & (against > self._prior))
-            seen[self._left] = False
-        whole = np.count_nonzero(seen) > WHOLE * (self._count - len(self._left))
-        return bool(whole and not moves)
 
     def _join(self, image: NDArray[np.uint8]) -> bool:
         """Take up marks of a frame at rest that the reference did not show; returns whether there are any."""
@@ -235,10 +219,8 @@ class MarkerTracker:
         Interpolator(origin, self._pitch).place(placed, known)
         origin[~known] -= placed[~known] - centers
         self._know(origin, lattice.neighbour_graph(origin, lattice.LONGEST_LINK * self._pitch))
-        against = self._evidence.against
-        self._evidence = MotionEvidence(origin, self._pitch, REST * self._pitch)
-        self._evidence.against[: len(against)] = against
-        self._prior = np.concatenate([self._prior, _log_odds(found.probability[joins])])
+        self._prior = np.concatenate([self._prior, found.probability[joins]])
+        self._evidence = self._weigh(np.append(self._evidence.against, np.zeros(len(centers))))
         self._position = np.concatenate([self._position, centers])
         self._seen = np.concatenate([self._seen, known[~known]])
         return True
@@ -259,7 +241,7 @@ class MarkerTracker:
         result = _Result(found.position.copy(), inliers.copy(), found.stderr.copy())
         result.position[~inliers] = self._position[~inliers]
         settled = inliers.copy()
-        settled[self._left] = True
+        settled[self._evidence.left] = True
         if settled.all():
             return result
         # Where a mark is seen without being an inlier is a spot like any other.
@@ -294,7 +276,7 @@ class MarkerTracker:
             jumped[grid] += common_displacement(jumped[grid], spots, self._pitch, self._farthest)
         for start in (self._origin, jumped):
             other = self._templates.align(image, start)
-            other.gain[self._left] = 0
+            other.gain[self._evidence.left] = 0
             seen = other.seen
             there = self._graph.largest_component(seen, self._graph.strain(other.position))
             better = np.zeros(self._count, np.bool_)
@@ -309,11 +291,6 @@ class MarkerTracker:
             )
         return found, inliers
 
-    def _infer(self, position: Floats, found: Flags) -> Indices:
-        """Place the marks that were not found, in place, and return those; others stay where they were."""
-        position[~found] = self._position[~found]
-        return self._interpolator.place(position, found)
-
 
 class _Result(NamedTuple):
     """What a search finds of each mark: (N, 2) position, (N,) found, (N,) stderr; filled as it goes on."""
@@ -327,14 +304,6 @@ def _radii(detection: Detection) -> Floats:
     """(N,) of each mark, px."""
     count, radii = len(detection.centers), detection.radii
     return np.full(count, detection.dot_radius) if radii is None else radii
-
-
-def _log_odds(probability: Floats) -> Floats:
-    return np.asarray(np.log(probability / (1 - probability)), np.float64)
-
-
-def _probability(log_odds: Floats) -> Floats:
-    return np.asarray(1 / (1 + np.exp(-log_odds)), np.float64)
 
 
 def _are_apart(points: Floats, others: Floats, distance: float) -> Flags:
