@@ -1,4 +1,4 @@
-"""The graph of neighbours: strain of the links, and the largest component that moves together."""
+"""The graph of neighbours: links of little strain, and the largest component that moves together."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ def test_of_several_grids_each_has_its_largest_component() -> None:
     first, second = grid(4, 4, 12.0, corner=(10.0, 10.0)), grid(5, 4, 12.0, corner=(90.0, 70.0))
     edges = np.concatenate([neighbour_graph(first, 30.0), neighbour_graph(second, 30.0) + 16])
     under_test = MarkerGraph(np.concatenate([first, second]), edges)
-    seen, strain = np.ones(36, bool), np.zeros(len(edges))
-    torn = [0, 5]
-    strain[np.isin(edges, torn).any(axis=1)] = 0.5
-    expected = ~np.isin(np.arange(36), torn)
-    np.testing.assert_array_equal(under_test.largest_component(seen, strain), expected)
-    seen[20] = expected[20] = False
-    np.testing.assert_array_equal(under_test.largest_component(seen, strain), expected)
+    origin = np.concatenate([first, second])
+    seen, moved = np.ones(36, bool), origin.copy()
+    moved[[0, 5]] += 100.0
+    expected = ~np.isin(np.arange(36), [0, 5])
+    smooth, torn = under_test.check(moved, seen)
+    assert torn
+    np.testing.assert_array_equal(under_test.largest_component(seen, smooth), expected)
+    seen[[0, 5, 20]] = expected[20] = False
+    smooth, torn = under_test.check(moved, seen)
+    assert not torn
+    np.testing.assert_array_equal(under_test.largest_component(seen, smooth), expected)
 
 
 def test_edges_to_marks_that_are_not_there_are_refused() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import components, nearest
 
 MOST_STRAIN: Final = 0.5
@@ -15,17 +16,14 @@ MOST_STRAIN: Final = 0.5
 scenes and seven recordings (measured)."""
 
 REACH: Final = 0.4
-"""Distance, pitches, of a spot from where the marks around predict a mark, at most: with 0.3 three times as
+"""Scatter of the field, pitches: distance of a mark from where those around it predict it, or from where it
+would be if all moved alike, at most; and of a spot from the mark that it is. With 0.3 three times as
 many marks of wedge_roll are not seen, with 0.5 some take a shadow half a pitch away (measured)."""
 
 LEAST_SHARE: Final = 0.15
 """Share, by weight, of the marks around that are known where they predict a mark: one alone is not enough.
 With 0.2, jumps of 0.9 pitches cost identities; with 0.1, marks of sts_torque160, 3 px apart, take the spots
 of others in 2 % of all cases (measured)."""
-
-AGREEMENT: Final = 0.2
-"""Distance from a common displacement within which a mark agrees, and within which a mark is at a spot,
-pitches: the scatter of the field."""
 
 NEIGHBOURS: Final = 24
 """Marks around a mark that a fit uses, at most: the two rings of a square grid, 8 + 16."""
@@ -57,39 +55,55 @@ class MarkerGraph:
     --------
     >>> origin = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]])
     >>> graph = MarkerGraph(origin, np.array([[0, 1], [1, 2]]))
-    >>> strain = graph.strain(origin + [[1.0, 0.0], [1.0, 0.0], [6.0, 0.0]])
-    >>> strain
-    array([0. , 0.5])
-    >>> graph.largest_component(np.ones(3, bool), strain)
+    >>> seen = np.ones(3, bool)
+    >>> smooth, torn = graph.check(origin + [[1.0, 0.0], [1.0, 0.0], [6.0, 0.0]], seen)
+    >>> smooth, torn
+    (array([ True, False]), True)
+    >>> graph.largest_component(seen, smooth)
     array([ True,  True, False])
     """
 
     def __init__(self, origin: Floats, edges: Indices) -> None:
         count = len(origin)
-        self.edges = np.ascontiguousarray(edges, np.int64).reshape(-1, 2)
-        if len(self.edges) and not 0 <= self.edges.min() <= self.edges.max() < count:
-            raise ValueError(f"required edges between marks 0 to {count - 1}, got {self.edges.tolist()}")
+        self._edges = np.ascontiguousarray(edges, np.int64).reshape(-1, 2)
+        if len(self._edges) and not 0 <= self._edges.min() <= self._edges.max() < count:
+            raise ValueError(f"required edges between marks 0 to {count - 1}, got {self._edges.tolist()}")
         self._origin = origin
-        self.length = np.linalg.norm(origin[self.edges[:, 0]] - origin[self.edges[:, 1]], axis=1)
-        self._grid = components(self.edges, count)
+        self._length = np.linalg.norm(origin[self._edges[:, 0]] - origin[self._edges[:, 1]], axis=1)
+        self._grid = components(self._edges, count)
         self.grids = [np.flatnonzero(self._grid == grid) for grid in np.unique(self._grid)]
         """The marks of each grid without links to others."""
 
-    def strain(self, position: Floats) -> Floats:
-        """Strain of each link (E,), of positions (N, 2), px."""
-        moved = position - self._origin
-        x, y = (moved[self.edges[:, 0]] - moved[self.edges[:, 1]]).T
-        return np.asarray(np.sqrt(x * x + y * y) / self.length)
+    def check(self, position: Floats, seen: Flags) -> tuple[Flags, bool]:
+        """Of positions (N, 2), px, of marks that are seen, (N,): which links (E,) have little strain, between
+        marks that are seen; and whether any has much."""
+        smooth = np.empty(len(self._edges), np.bool_)
+        return smooth, check_links(position, seen, self._origin, self._edges, self._length, smooth)
 
-    def largest_component(self, seen: Flags, strain: Floats) -> Flags:
-        """The seen marks (N,) of the largest component, in each grid, whose links have little strain (E,)."""
-        linked = (strain < MOST_STRAIN) & seen[self.edges].all(axis=1)
-        component = components(self.edges[linked], len(seen))
+    def largest_component(self, seen: Flags, smooth: Flags) -> Flags:
+        """The seen marks (N,) of the largest component, in each grid, by links (E,) of little strain."""
+        component = components(self._edges[smooth], len(seen))
         # Of components of one size the first one.
         rank = np.where(seen, np.bincount(component)[component] - component / len(seen), 0.0)
         best = np.zeros(len(seen))
         np.maximum.at(best, self._grid, rank)
         return np.asarray(seen & (rank == best[self._grid]))
+
+
+@kernel("boolean(float64[:, ::1], boolean[::1], float64[:, ::1], int64[:, ::1], float64[::1], boolean[::1])")
+def check_links(
+    position: Floats, seen: Flags, origin: Floats, edges: Indices, length: Floats, smooth: Flags
+) -> bool:
+    """Fill `smooth`, (E,); returns whether marks that are seen have a link that is not."""
+    torn = False
+    for e in range(len(edges)):
+        one, other = edges[e, 0], edges[e, 1]
+        x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
+        y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
+        both = seen[one] and seen[other]
+        smooth[e] = both and np.sqrt(x * x + y * y) < MOST_STRAIN * length[e]
+        torn = torn or (both and not smooth[e])
+    return torn
 
 
 class Interpolator:
@@ -222,6 +236,6 @@ def common_displacement(position: Floats, spots: Floats, pitch: float, farthest:
     if len(votes) == 0:
         return np.zeros(2)
     tree = KDTree(votes)
-    best = np.asarray(tree.query_ball_point(votes, AGREEMENT * pitch, return_length=True)).argmax()
-    agree = tree.query_ball_point(votes[best], AGREEMENT * pitch)
+    best = np.asarray(tree.query_ball_point(votes, REACH * pitch, return_length=True)).argmax()
+    agree = tree.query_ball_point(votes[best], REACH * pitch)
     return np.asarray(votes[agree].mean(axis=0), np.float64)

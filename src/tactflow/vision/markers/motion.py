@@ -101,8 +101,8 @@ def weigh_motion(
 ) -> bool:
     """Raise `against`, (N,), to the evidence of a frame; returns whether a mark moves.
 
-    displacement : (N, 2). stderr, seen : (N,). around, share : (N, K), the marks around, nearest first, and their
-    shares in a mean. rest : distance along an axis within which a mark rests.
+    displacement : (N, 2). stderr, seen : (N,). around, share : (N, K), the marks around, nearest first, and
+    their shares in a mean. rest : distance along an axis within which a mark rests.
     """
     moves, moving = np.empty(len(displacement), np.bool_), False
     for n in range(len(displacement)):

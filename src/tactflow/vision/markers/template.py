@@ -55,20 +55,27 @@ made from there: elsewhere it leads nowhere. Chosen by hand."""
 class Alignment(NamedTuple):
     """Where marks are.
 
-    position : (n, 2) float64, px. gain : (n,) float32, contrast over that of the template. r_squared : (n,)
-    float32, fraction of the patch's contrast that the template explains. stderr : (n,) float32, standard
-    error of each coordinate, px.
+    position : (n, 2) float64, px. stderr : (n,) float32, standard error of each coordinate, px. seen : (n,)
+    bool, whether the template explains what is there.
     """
 
     position: Floats
-    gain: Floats32
-    r_squared: Floats32
     stderr: Floats32
+    seen: Flags
 
-    @property
-    def seen(self) -> Flags:
-        """(n,) bool, which marks are seen, from how their templates fit."""
-        return np.asarray((self.gain > LEAST_GAIN) & (self.r_squared > LEAST_R_SQUARED))
+
+class _Model(NamedTuple):
+    """What the alignment of marks of one size needs.
+
+    weights : (PHASES^2 N, 5, p) int16, of the pixels of a disc. terms : (PHASES^2 N, 15) float32, 9 of the
+    Gram matrix, variance per pixel, 5 units of the weights. widths : (rows,) int64, of the disc's rows, px.
+    radius : of a mark, px.
+    """
+
+    weights: Levels
+    terms: Floats32
+    widths: Indices
+    radius: float
 
 
 class MarkerTemplates:
@@ -84,7 +91,7 @@ class MarkerTemplates:
     ----------
     reference : (H, W) float32, grey levels.
     origin : (N, 2) float64, centres of the marks in the reference, px.
-    radius : of a mark, px.
+    radii : (N,) float64, px. Each template holds its mark, and no neighbour.
     dark : whether marks are darker than the gel.
 
     References
@@ -97,40 +104,37 @@ class MarkerTemplates:
     --------
     >>> frame = np.full((40, 40), 150, np.uint8)
     >>> frame = cv2.GaussianBlur(cv2.circle(frame, (20, 20), 4, 40, -1), (0, 0), 1.0)
-    >>> templates = MarkerTemplates(frame.astype(np.float32), np.array([[20.0, 20.0]]), 4.0)
+    >>> templates = MarkerTemplates(frame.astype(np.float32), np.array([[20.0, 20.0]]), np.array([4.0]))
     >>> moved = np.roll(frame, 1, axis=1)
     >>> templates.align(moved, np.array([[20.0, 20.0]])).position.round(1)
     array([[21., 20.]])
     """
 
-    def __init__(self, reference: Floats32, origin: Floats, radius: float, dark: bool = True) -> None:
-        extent = PATCH_SCALE * radius + PATCH_MARGIN
-        reach = int(np.ceil(extent))
-        axis = np.arange(-reach, reach + 1)
-        grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
-        disc = np.hypot(grid_x, grid_y) <= extent
-        pixels, count = int(disc.sum()), len(origin)
-        # Of 16 bits, since reading the weights of all marks is what takes most of the time.
-        weights = np.empty((PHASES, PHASES, count, 5, pixels), np.int16)
-        terms = np.empty((PHASES, PHASES, count, 15), np.float32)
-        scaled = np.array([grid_x[disc], grid_y[disc]]) / radius
-        # From one phase before the first to one after the last, for the slopes.
-        steps = (np.arange(-1, PHASES + 1) + 0.5) / PHASES - 0.5
-        shifted = [[_interpolate(reference, origin - (x, y), reach)[:, disc] for x in steps] for y in steps]
-        for y, x in np.ndindex(PHASES, PHASES):
-            slope_x = (shifted[y + 1][x + 2] - shifted[y + 1][x]) * (PHASES / 2)
-            slope_y = (shifted[y + 2][x + 1] - shifted[y][x + 1]) * (PHASES / 2)
-            model = _normal_equations(shifted[y + 1][x + 1], slope_x, slope_y, scaled, dark)
-            unit = np.maximum(np.abs(model[0]).max(axis=2), TINY) / np.iinfo(np.int16).max
-            weights[y, x] = np.rint(model[0] / unit[:, :, None])
-            terms[y, x, :, 10:] = unit
-            terms[y, x, :, :9] = model[1].reshape(count, 9)
-            terms[y, x, :, 9] = model[2] / max(pixels - 6, 1)
-        self._all = np.arange(count)
-        self._weights = weights.reshape(PHASES * PHASES * count, 5, pixels)
-        self._terms = terms.reshape(PHASES * PHASES * count, 15)
-        self._widths = disc.sum(axis=1)
-        self._radius = float(radius)
+    def __init__(self, reference: Floats32, origin: Floats, radii: Floats, dark: bool = True) -> None:
+        self._dark = dark
+        self._models: list[_Model] = []
+        self._model_of, self._place = np.zeros((2, 0), np.int64)
+        self.add(reference, origin, radii)
+
+    def add(self, reference: Floats32, origin: Floats, radii: Floats) -> None:
+        """Append marks (n, 2), px, with radii (n,), px, as they look in another frame."""
+        step = np.floor(np.log(radii / radii.min()) / np.log(ONE_TEMPLATE) + 1e-6)
+        sizes, size_of = np.unique(step, return_inverse=True)
+        place = np.empty(len(radii), np.int64)
+        known = len(self._models)
+        for size in range(len(sizes)):
+            those = np.flatnonzero(size_of == size)
+            place[those] = np.arange(len(those))
+            self._models.append(_model(reference, origin[those], float(radii[those].max()), self._dark))
+        self._model_of = np.concatenate([self._model_of, size_of + known])
+        self._place = np.concatenate([self._place, place])
+        every = np.arange(len(self._place))
+        self._all = [self._those_of(model, every) for model in range(len(self._models))]
+
+    def _those_of(self, model: int, marks: Indices) -> tuple[Indices, Indices]:
+        """Which of some marks have a model, and their places in it."""
+        which = np.flatnonzero(self._model_of[marks] == model)
+        return which, self._place[marks[which]]
 
     def align(self, image: NDArray[np.uint8], start: Floats, marks: Indices | None = None) -> Alignment:
         """Find marks from starting points that are right to about a radius.
@@ -138,53 +142,42 @@ class MarkerTemplates:
         image : (H, W, 3) uint8 BGR or (H, W) uint8. start : (n, 2) float64, px. marks : (n,) int64, which
         marks these are; None for all.
         """
-        marks = self._all if marks is None else marks
-        position, found = np.empty((len(marks), 2)), np.empty((3, len(marks)), np.float32)
         picture = np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
-        model = self._weights, self._terms, self._widths
-        align_marks(picture, np.ascontiguousarray(start), marks, *model, self._radius, position, found)
-        return Alignment(position, found[0], found[1], found[2])
+        start, count = np.ascontiguousarray(start), len(start)
+        found = Alignment(np.empty((count, 2)), np.empty(count, np.float32), np.empty(count, np.bool_))
+        for number, model in enumerate(self._models):
+            which, places = self._all[number] if marks is None else self._those_of(number, marks)
+            align_marks(picture, start, which, places, *model, *found)
+        return found
 
 
-class TemplateGroups:
-    """Templates of marks of several sizes, or of several frames: each holds its mark, and no neighbour.
-
-    As `MarkerTemplates`, but radii : (N,) float64, px.
-    """
-
-    def __init__(self, reference: Floats32, origin: Floats, radii: Floats, dark: bool = True) -> None:
-        self._dark = dark
-        self._templates: list[MarkerTemplates] = []
-        self._group, self._place = np.zeros((2, 0), np.int64)
-        self.add(reference, origin, radii)
-
-    def add(self, reference: Floats32, origin: Floats, radii: Floats) -> None:
-        """Append marks (n, 2), px, with radii (n,), px, as they look in another frame."""
-        step = np.floor(np.log(radii / radii.min()) / np.log(ONE_TEMPLATE) + 1e-6)
-        sizes, group = np.unique(step, return_inverse=True)
-        place = np.empty(len(radii), np.int64)
-        known = len(self._templates)
-        for size in range(len(sizes)):
-            marks = np.flatnonzero(group == size)
-            place[marks] = np.arange(len(marks))
-            radius = float(np.max(radii[marks]))
-            self._templates.append(MarkerTemplates(reference, origin[marks], radius, self._dark))
-        self._group = np.concatenate([self._group, group + known])
-        self._place = np.concatenate([self._place, place])
-
-    def align(self, image: NDArray[np.uint8], start: Floats, marks: Indices | None = None) -> Alignment:
-        """As `MarkerTemplates.align`."""
-        if len(self._templates) == 1:
-            return self._templates[0].align(image, start, marks)
-        marks = np.arange(len(self._group)) if marks is None else marks
-        found = np.empty((len(marks), 2)), *np.empty((3, len(marks)), np.float32)
-        for group, templates in enumerate(self._templates):
-            those = np.flatnonzero(self._group[marks] == group)
-            if len(those):
-                part = templates.align(image, start[those], self._place[marks[those]])
-                for whole, values in zip(found, part, strict=True):
-                    whole[those] = values
-        return Alignment(*found)
+def _model(reference: Floats32, origin: Floats, radius: float, dark: bool) -> _Model:
+    """The model of marks (N, 2), px, of one size. Arguments as of `MarkerTemplates`."""
+    extent = PATCH_SCALE * radius + PATCH_MARGIN
+    reach = int(np.ceil(extent))
+    axis = np.arange(-reach, reach + 1)
+    grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
+    disc = np.hypot(grid_x, grid_y) <= extent
+    pixels, count = int(disc.sum()), len(origin)
+    # Of 16 bits, since reading the weights of all marks is what takes most of the time.
+    weights = np.empty((PHASES, PHASES, count, 5, pixels), np.int16)
+    terms = np.empty((PHASES, PHASES, count, 15), np.float32)
+    scaled = np.array([grid_x[disc], grid_y[disc]]) / radius
+    # From one phase before the first to one after the last, for the slopes.
+    steps = (np.arange(-1, PHASES + 1) + 0.5) / PHASES - 0.5
+    shifted = [[_interpolate(reference, origin - (x, y), reach)[:, disc] for x in steps] for y in steps]
+    for y, x in np.ndindex(PHASES, PHASES):
+        slope_x = (shifted[y + 1][x + 2] - shifted[y + 1][x]) * (PHASES / 2)
+        slope_y = (shifted[y + 2][x + 1] - shifted[y][x + 1]) * (PHASES / 2)
+        exact, gram, variance = _normal_equations(shifted[y + 1][x + 1], slope_x, slope_y, scaled, dark)
+        unit = np.maximum(np.abs(exact).max(axis=2), TINY) / np.iinfo(np.int16).max
+        weights[y, x] = np.rint(exact / unit[:, :, None])
+        terms[y, x, :, :9] = gram.reshape(count, 9)
+        terms[y, x, :, 9] = variance / max(pixels - 6, 1)
+        terms[y, x, :, 10:] = unit
+    phases = PHASES * PHASES * count
+    widths = disc.sum(axis=1)
+    return _Model(weights.reshape(phases, 5, pixels), terms.reshape(phases, 15), widths, radius)
 
 
 def _normal_equations(
@@ -284,37 +277,39 @@ def to_gray(pixels: Bytes, channels: int, levels: Floats32) -> None:
 
 
 @kernel(
-    "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[::1], float64, float64[:, ::1], float32[:, ::1])",
+    "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int64[::1], int16[:, :, ::1],"
+    "float32[:, ::1], int64[::1], float64, float64[:, ::1], float32[::1], boolean[::1])",
 )
 def align_marks(
     image: Bytes,
     start: Floats,
     marks: Indices,
+    places: Indices,
     weights: Levels,
     terms: Floats32,
     widths: Indices,
     radius: float,
     position: Floats,
-    found: Floats32,
+    stderr: Floats32,
+    seen: Flags,
 ) -> None:
-    """All steps of all marks, into `position` (n, 2) and `found` (3, n): gain, r_squared, standard error.
+    """All steps of those `marks`, into `position` (n, 2), `stderr` (n,) and `seen` (n,).
 
-    image : (H, W, 3) BGR or (H, W, 1). start : (n, 2). marks : (n,), of those in `weights`. weights :
-    (PHASES^2 N, 5, p), of the pixels of a disc. terms : (PHASES^2 N, 15), 9 of the Gram matrix, variance per
-    pixel, 5 units of the weights. widths : of the disc's rows, px. radius : of a mark, px; no step is longer
-    along an axis."""
+    image : (H, W, 3) BGR or (H, W, 1). start : (n, 2). places : as many as marks, where they are in the
+    model (see `_Model`). No step is longer along an axis than a radius.
+    """
     height, width, _ = image.shape
     longest, count = np.float32(radius), weights.shape[0] // (PHASES * PHASES)
     patch = np.empty(weights.shape[2], np.float32)
-    for n in range(len(marks)):
+    for number in range(len(marks)):
+        n, place = marks[number], places[number]
         x, y = start[n, 0], start[n, 1]
         seen_left, seen_top, varies = -1, -1, 0.0
         phase_x, phase_y = nearest_phase(x, y, width, height)
         before_x, before_y = -1, -1
         for _ in range(ROUNDS + 1):
             left, top = phase_x // PHASES, phase_y // PHASES
-            which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + marks[n]
+            which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + place
             # A step of less than a pixel often sees the same patch from another phase.
             if left != seen_left or top != seen_top:
                 seen_left, seen_top = left, top
@@ -322,6 +317,7 @@ def align_marks(
             gain, shift_x, shift_y, r_squared, rest = fit_template(
                 weights[which], terms[which], patch, varies
             )
+            seen[n] = gain > LEAST_GAIN and r_squared > LEAST_R_SQUARED
             safe = max(gain, LEAST_GAIN)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
@@ -331,15 +327,12 @@ def align_marks(
                 x, y = (x + now_x) / 2, (y + now_y) / 2
                 break
             x, y = now_x, now_y
-            settled = next_x == phase_x and next_y == phase_y
-            if settled or not (r_squared > LEAST_R_SQUARED and gain > LEAST_GAIN):
+            if not seen[n] or (next_x == phase_x and next_y == phase_y):
                 break
             before_x, before_y, phase_x, phase_y = phase_x, phase_y, next_x, next_y
         position[n, 0], position[n, 1] = x, y
-        found[0, n], found[1, n] = gain, r_squared
-        found[2, n] = np.sqrt(
-            rest * terms[which, 9] / (safe * safe) + np.float32(SAMPLING_ERROR * SAMPLING_ERROR)
-        )
+        noise = rest * terms[which, 9] / (safe * safe)
+        stderr[n] = np.sqrt(noise + np.float32(SAMPLING_ERROR * SAMPLING_ERROR))
 
 
 @helper

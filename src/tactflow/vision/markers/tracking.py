@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
-from tactflow.vision.compiled import kernel
 from tactflow.vision.markers import lattice
 from tactflow.vision.markers.detection import (
     Detection,
@@ -21,8 +20,6 @@ from tactflow.vision.markers.detection import (
     to_gray,
 )
 from tactflow.vision.markers.matching import (
-    AGREEMENT,
-    MOST_STRAIN,
     REACH,
     Interpolator,
     MarkerGraph,
@@ -32,7 +29,7 @@ from tactflow.vision.markers.matching import (
 from tactflow.vision.markers.motion import MotionEvidence
 from tactflow.vision.markers.selection import LEAST_STRENGTH, expected_marks
 from tactflow.vision.markers.spots import LEAST_SIGMA, RADIUS_PER_SIGMA, find_peaks
-from tactflow.vision.markers.template import LEAST_GAIN, LEAST_R_SQUARED, Alignment, TemplateGroups
+from tactflow.vision.markers.template import Alignment, MarkerTemplates
 from tactflow.vision.types import Markers, MarkerStatus
 
 SEARCH_INTERVAL: Final = 10
@@ -127,7 +124,7 @@ class MarkerTracker:
         self._origin = np.array(detection.centers, np.float64)
         if len(grays) > 1:
             self._origin = refine_centers(mean if dark else 255 - mean, self._origin, self._radius)
-        self._templates = TemplateGroups(mean, self._origin, _radii(detection), dark)
+        self._templates = MarkerTemplates(mean, self._origin, _radii(detection), dark)
         self._sigma = max(self._radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
         peaks, strength = find_peaks(mean, self._sigma, self._polarity, 0.0)
         usual = strength[KDTree(peaks).query(self._origin)[1]] if len(peaks) else np.ones(1)
@@ -167,16 +164,15 @@ class MarkerTracker:
             require_image(image)
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {image.shape[:2]}")
         image = np.ascontiguousarray(image)
-        found = self._templates.align(image, self._position)
-        found.gain[self._evidence.left] = 0
-        position, stderr = found.position, found.stderr
-        seen, strain, doubt = self._check(found)
+        found = self._align(image, self._position)
+        smooth, torn = self._graph.check(found.position, found.seen)
         # Where something stays missing, look again now and then.
-        missing = np.count_nonzero(seen) < self._count - len(self._evidence.left)
+        missing = np.count_nonzero(found.seen) < self._count - len(self._evidence.left)
         self._age = self._age + 1 if missing else 0
-        if doubt or self._age >= SEARCH_INTERVAL:
-            position, seen, stderr = self._search(image, found, seen, strain)
+        if torn or self._age >= SEARCH_INTERVAL or (missing and (self._seen & ~found.seen).any()):
+            found = self._search(image, found, smooth)
             self._age = 0
+        position, stderr, seen = found
         # All tracked, which is 0; `np.full` takes three times as long.
         status = np.zeros(self._count, np.uint8)
         errors = stderr.astype(np.float64)
@@ -195,6 +191,12 @@ class MarkerTracker:
                 return self.track(image)
         probability = None if self._prior is None else self._evidence.probability
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
+
+    def _align(self, image: NDArray[np.uint8], start: Floats) -> Alignment:
+        """Align the marks from where they start, (N, 2) px; those that have left are not seen."""
+        found = self._templates.align(image, start)
+        found.seen[self._evidence.left] = False
+        return found
 
     def _join(self, image: NDArray[np.uint8]) -> bool:
         """Take up marks of a frame at rest that the reference did not show; returns whether there are any."""
@@ -225,79 +227,51 @@ class MarkerTracker:
         self._seen = np.concatenate([self._seen, known[~known]])
         return True
 
-    def _check(self, found: Alignment) -> tuple[Flags, Floats, bool]:
-        """Which marks are seen, the strain of the links, and whether aligning the marks from where they were
-        may have missed or mistaken one."""
-        seen, strain = np.empty(self._count, np.bool_), np.empty(len(self._graph.edges))
-        edges, length = self._graph.edges, self._graph.length
-        fit = found.position, self._origin, found.gain, found.r_squared
-        return seen, strain, check_marks(*fit, edges, length, self._seen, seen, strain)
-
-    def _search(self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats) -> _Result:
+    def _search(self, image: NDArray[np.uint8], found: Alignment, smooth: Flags) -> Alignment:
         """Spots for the marks outside the largest smooth component of the field."""
         gray = to_gray(image).astype(np.float32)
         spots, _ = find_peaks(gray, self._sigma, self._polarity, self._least)
-        found, inliers = self._best_start(image, found, seen, strain, spots)
-        result = _Result(found.position.copy(), inliers.copy(), found.stderr.copy())
-        result.position[~inliers] = self._position[~inliers]
-        settled = inliers.copy()
-        settled[self._evidence.left] = True
-        if settled.all():
-            return result
+        inliers = self._best_start(image, found, smooth, spots)
         # Where a mark is seen without being an inlier is a spot like any other.
         own = found.position[found.seen & ~inliers]
-        spots = np.concatenate([spots, own[_are_apart(own, spots, AGREEMENT * self._pitch)]])
-        spots = spots[_are_apart(spots, found.position[inliers], AGREEMENT * self._pitch)]
+        spots = np.concatenate([spots, own[_are_apart(own, spots, REACH * self._pitch)]])
+        spots = spots[_are_apart(spots, found.position[inliers], REACH * self._pitch)]
+        found.position[~inliers], found.seen[~inliers] = self._position[~inliers], False
         reach = np.minimum(REACH * self._apart, self._farthest)
-        marks, chosen = grow(result.position, inliers, spots, self._interpolator, reach)
-        marks, chosen = marks[~settled[marks]], chosen[~settled[marks]]
+        marks, chosen = grow(found.position, inliers, spots, self._interpolator, reach)
         if len(marks):
             aligned = self._templates.align(image, spots[chosen], marks)
-            result.position[marks], result.stderr[marks] = aligned.position, aligned.stderr
-            result.found[marks] = aligned.seen
-        return result
+            for whole, part in zip(found, aligned, strict=True):
+                whole[marks] = part
+            found.seen[self._evidence.left] = False
+        return found
 
-    def _best_start(
-        self, image: NDArray[np.uint8], found: Alignment, seen: Flags, strain: Floats, spots: Floats
-    ) -> tuple[Alignment, Flags]:
-        """Alignment of the marks and its inliers, the largest smooth component of those seen, (N,).
+    def _best_start(self, image: NDArray[np.uint8], found: Alignment, smooth: Flags, spots: Floats) -> Flags:
+        """Align each grid from where most of its marks are inliers, in place; returns the inliers, (N,): the
+        largest smooth component.
 
         A grid that jumped by a pitch, or was let go from afar, is as smooth as before where it is not: what
-        tells is how many of its marks are there. So each grid begins where most of its marks are inliers:
-        where it was last, at its rest, or displaced by what most pairs of a mark and a spot say.
+        tells is how many of its marks are there. So a grid that misses some may also be at its rest, or
+        displaced by what most pairs of a mark and a spot say.
         """
-        inliers = self._graph.largest_component(seen, strain)
+        inliers = self._graph.largest_component(found.seen, smooth)
         # Whoever is a pitch off misses a row, which of N marks has about the root of N.
         torn = [grid for grid in self._graph.grids if 2 * np.count_nonzero(~inliers[grid]) > len(grid) ** 0.5]
         if not torn:
-            return found, inliers
+            return inliers
         jumped = self._position.copy()
         for grid in torn:
             jumped[grid] += common_displacement(jumped[grid], spots, self._pitch, self._farthest)
         for start in (self._origin, jumped):
-            other = self._templates.align(image, start)
-            other.gain[self._evidence.left] = 0
-            seen = other.seen
-            there = self._graph.largest_component(seen, self._graph.strain(other.position))
-            better = np.zeros(self._count, np.bool_)
+            other = self._align(image, start)
+            smooth, _ = self._graph.check(other.position, other.seen)
+            there = self._graph.largest_component(other.seen, smooth)
             for grid in torn:
-                better[grid] = np.count_nonzero(there[grid]) > np.count_nonzero(inliers[grid])
-            inliers = np.where(better, there, inliers)
-            found = Alignment(
-                np.where(better[:, None], other.position, found.position),
-                np.where(better, other.gain, found.gain),
-                np.where(better, other.r_squared, found.r_squared),
-                np.where(better, other.stderr, found.stderr),
-            )
-        return found, inliers
-
-
-class _Result(NamedTuple):
-    """What a search finds of each mark: (N, 2) position, (N,) found, (N,) stderr; filled as it goes on."""
-
-    position: Floats
-    found: Flags
-    stderr: NDArray[Any]
+                if np.count_nonzero(there[grid]) > np.count_nonzero(inliers[grid]):
+                    inliers[grid] = there[grid]
+                    for whole, part in zip(found, other, strict=True):
+                        whole[grid] = part[grid]
+        return inliers
 
 
 def _radii(detection: Detection) -> Floats:
@@ -311,33 +285,3 @@ def _are_apart(points: Floats, others: Floats, distance: float) -> Flags:
     if not (len(points) and len(others)):
         return np.ones(len(points), bool)
     return np.asarray(KDTree(others).query(points)[0] > distance)
-
-
-@kernel(
-    "boolean(float64[:, ::1], float64[:, ::1], float32[::1], float32[::1], int64[:, ::1], float64[::1],"
-    "boolean[::1], boolean[::1], float64[::1])"
-)
-def check_marks(
-    position: Floats,
-    origin: Floats,
-    gain: NDArray[np.float32],
-    r_squared: NDArray[np.float32],
-    edges: Indices,
-    length: Floats,
-    seen_before: Flags,
-    seen: Flags,
-    strain: Floats,
-) -> bool:
-    """Fill `seen`, (N,), and `strain`, (E,), of each link; returns whether a mark was lost or a link between
-    marks that are seen is too steep."""
-    doubt = False
-    for n in range(len(position)):
-        seen[n] = gain[n] > LEAST_GAIN and r_squared[n] > LEAST_R_SQUARED
-        doubt = doubt or (seen_before[n] and not seen[n])
-    for e in range(len(edges)):
-        one, other = edges[e, 0], edges[e, 1]
-        x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
-        y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
-        strain[e] = np.sqrt(x * x + y * y) / length[e]
-        doubt = doubt or (strain[e] > MOST_STRAIN and seen[one] and seen[other])
-    return doubt
