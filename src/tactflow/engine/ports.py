@@ -39,12 +39,11 @@ class SignalPort:
     """Type of a boolean port that can gate stages.
 
     closed : the reason while it is False. otherwise : outputs of a gated stage then, unless its `when:` says
-    otherwise: "absent", or "repeat" for the last ones. closed None: both are taken from the input signal, for
-    a stage that only holds a signal.
+    otherwise: "absent", or "repeat" for the last ones.
     """
 
     name: str
-    closed: str | None
+    closed: str
     otherwise: Literal["absent", "repeat"] = "absent"
 
 
