@@ -88,9 +88,9 @@ def largest_nearby(values: Floats32) -> Floats32:
     reach = round(math.sqrt(np.count_nonzero(values > OUTER * peak) / math.pi) / 2)
     half = -(-values.shape[1] // 2), -(-values.shape[0] // 2)
     coarse = cv2.resize(smooth, half, interpolation=cv2.INTER_AREA)
-    beyond = [(reach, reach), (reach, reach)]
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    largest = cv2.dilate(np.pad(coarse, beyond), square)
+    padded = cv2.copyMakeBorder(coarse, reach, reach, reach, reach, cv2.BORDER_CONSTANT)
+    largest = cv2.dilate(padded, square)
     around = cv2.blur(largest, square.shape, borderType=cv2.BORDER_CONSTANT)
     around = around[reach : reach + coarse.shape[0], reach : reach + coarse.shape[1]]
     nearby = cv2.resize(np.maximum(around, np.float32(FAINT * peak)), values.shape[::-1])

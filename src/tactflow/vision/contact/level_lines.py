@@ -63,11 +63,21 @@ class LevelLines(NamedTuple):
 def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
     """Lines at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
     levels = np.linspace(0, heights.max(), LEVELS + 2, dtype=np.float32)[1:-1]
-    above = np.empty(heights.shape, np.int32)
-    lines = np.empty((LEVELS * heights.size // SMALLEST, 7), np.int32)
+    high, wide = heights.shape
+    # All lines lie in a window, and do not touch its border, but that of the picture.
+    left, top, across, down = cv2.boundingRect((heights > levels[0]).view(np.uint8))
+    window = slice(max(top - 1, 0), top + down + 1), slice(max(left - 1, 0), left + across + 1)
+    surface = np.ascontiguousarray(heights[window])
+    marked = np.ascontiguousarray(changed[window]).view(np.uint8)
+    above = np.zeros((high, wide), np.int32)
+    over = np.empty(surface.shape, np.int32)
+    lines = np.empty((LEVELS * surface.size // SMALLEST, 7), np.int32)
     drops = np.empty(len(lines), np.float32)
-    count = grow_level_lines(heights, changed.view(np.uint8), levels, SMALLEST, above, drops, lines)
+    count = grow_level_lines(surface, marked, levels, SMALLEST, over, drops, lines)
+    above[window] = over
     level, inside, cells, enclosed, sides, border, outer = lines[:count].T
+    y, x = np.divmod(inside, surface.shape[1])
+    inside = (y + window[0].start) * wide + x + window[1].start
     # A line in any direction is pi / 4 as long as the sides of cells along it.
     length = np.float32(math.pi / 4) * sides
     possible = (sides >= (1 - OPEN) * (sides + border)) & (cells <= WIDEST * heights.size)
