@@ -135,6 +135,7 @@ SOURCES: list[tuple[str, Callable[[Path], str], int, str]] = [
 
 MISSING: list[tuple[str, Callable[[Path], str], str]] = [
     ("rosbags", lambda f: topic(bag(f)), "need rosbags: pip install 'tactflow[bags]'"),
+    ("mcap", lambda f: str(one_file(f, "mcap")), "need mcap: pip install 'tactflow[record]'"),
     ("h5py", lambda f: f"{hdf5(f)}?dataset=/x", "need h5py: pip install 'tactflow[hdf5]'"),
     ("zarr", lambda f: f"{zarr(f)}?dataset=/x", "need zarr: pip install 'tactflow[zarr]'"),
     ("pyarrow", lambda f: episode(lerobot(f)), "need pyarrow: pip install 'tactflow[lerobot]'"),

@@ -106,7 +106,8 @@ class DatasetWriter:
         self._features: dict[str, dict[str, Any]] = {}
         self._moments: dict[str, Moments] = {}
         self._order = MarkerOrder()
-        self._pixels: list[NDArray[np.float64]] = []
+        self._colors = Moments()
+        self._sampled = 0
 
     def add(self, results: Iterable[Result]) -> int:
         """Write one episode; returns the number of its frames.
@@ -180,9 +181,8 @@ class DatasetWriter:
         row: dict[str, Any] = {f"{TACTILE}.{name}": values for name, values in _values(result).items()}
         row |= self._marker_rows(result)
         if index % SAMPLED == 0:
-            # Mean, mean square, minimum and maximum of red, green, blue.
-            rgb = image.reshape(-1, 3)[:, ::-1] / 255.0
-            self._pixels.append(np.array([rgb.mean(0), (rgb**2).mean(0), rgb.min(0), rgb.max(0)]))
+            self._colors.add(image.reshape(-1, 3)[:, ::-1] / 255.0)
+            self._sampled += 1
         if not self._is_video:
             row[self._camera] = {"bytes": cv2.imencode(".png", image)[1].tobytes(), "path": None}
         integers = (index, episode, self._frames + index, 0)
@@ -218,9 +218,8 @@ class DatasetWriter:
             self._features = {name: _feature(name, value, calibrated) for name, value in values[0].items()}
         if values[0].keys() != self._features.keys():
             raise StageError("it has markers, and the recordings before have none: make two datasets")
-        for arrays in values:
-            for name, array in arrays.items():
-                self._moments.setdefault(name, Moments()).add(array)
+        for name in self._features:
+            self._moments.setdefault(name, Moments()).add(np.stack([arrays[name] for arrays in values]))
 
     def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
         import pyarrow as pa
@@ -295,16 +294,14 @@ class DatasetWriter:
 
     def _statistics(self) -> dict[str, Any]:
         """Statistics for normalisation: of each number, and of each color (in [0, 1], red first)."""
-        statistics: dict[str, Any] = {}
-        for name, moments in self._moments.items():
-            summary: dict[str, Any] = {key: value.tolist() for key, value in moments.summary().items()}
-            statistics[name] = summary | {"count": [moments.frames]}
-        means, squares, lowest, highest = np.array(self._pixels).transpose(1, 0, 2)
-        mean = means.mean(0)
-        std = np.sqrt(np.maximum(squares.mean(0) - mean**2, 0))
-        colors = {"min": lowest.min(0), "max": highest.max(0), "mean": mean, "std": std}
+        statistics: dict[str, dict[str, Any]] = {
+            name: {key: value.tolist() for key, value in moments.summary().items()}
+            | {"count": [self._frames]}
+            for name, moments in self._moments.items()
+        }
+        colors = self._colors.summary()
         statistics[self._camera] = {key: value.reshape(3, 1, 1).tolist() for key, value in colors.items()}
-        statistics[self._camera]["count"] = [len(means)]
+        statistics[self._camera]["count"] = [self._sampled]
         return statistics
 
 

@@ -116,39 +116,33 @@ class MarkerOrder:
 
 
 class Moments:
-    """Running minimum, maximum, mean and standard deviation of arrays of the same shape; ignores NaN.
+    """Running minimum, maximum, mean and standard deviation of rows (n, ...) of numbers; ignores NaN.
 
     >>> moments = Moments()
-    >>> for values in ([1.0, np.nan], [3.0, np.nan]):
-    ...     moments.add(np.array(values))
+    >>> moments.add(np.array([[1.0, np.nan], [3.0, np.nan]]))
     >>> {name: values.tolist() for name, values in moments.summary().items()}
     {'min': [1.0, 0.0], 'max': [3.0, 0.0], 'mean': [2.0, 0.0], 'std': [1.0, 0.0]}
     """
 
     def __init__(self) -> None:
-        self.frames = 0
-        self._count: NDArray[np.float64] | float = 0.0
-        self._sum: NDArray[np.float64] | float = 0.0
-        self._squares: NDArray[np.float64] | float = 0.0
-        self._min: NDArray[np.float64] | float = np.inf
-        self._max: NDArray[np.float64] | float = -np.inf
+        self._count = self._sum = self._squares = np.zeros(())
+        self._min, self._max = np.array(np.inf), np.array(-np.inf)
 
-    def add(self, values: NDArray[np.generic]) -> None:
-        """Add the values of a frame."""
-        numbers = values.astype(np.float64)
+    def add(self, rows: NDArray[np.generic]) -> None:
+        """Add one row or more."""
+        numbers = rows.astype(np.float64)
         known = np.isfinite(numbers)
-        self.frames += 1
-        self._count = self._count + known
-        self._sum = self._sum + np.where(known, numbers, 0.0)
-        self._squares = self._squares + np.where(known, numbers, 0.0) ** 2
-        self._min = np.minimum(self._min, np.where(known, numbers, np.inf))
-        self._max = np.maximum(self._max, np.where(known, numbers, -np.inf))
+        zeroed = np.where(known, numbers, 0.0)
+        self._count = self._count + known.sum(0)
+        self._sum = self._sum + zeroed.sum(0)
+        self._squares = self._squares + (zeroed**2).sum(0)
+        self._min = np.minimum(self._min, np.where(known, numbers, np.inf).min(0))
+        self._max = np.maximum(self._max, np.where(known, numbers, -np.inf).max(0))
 
     def summary(self) -> dict[str, NDArray[np.float64]]:
-        """The four statistics by name, of the values' shape; 0 without known values."""
-        known = np.asarray(self._count) > 0
+        """The four statistics by name, of a row's shape; 0 without known values."""
         count = np.maximum(self._count, 1)
         mean = self._sum / count
         std = np.sqrt(np.maximum(self._squares / count - mean**2, 0))
         statistics = {"min": self._min, "max": self._max, "mean": mean, "std": std}
-        return {name: np.where(known, values, 0.0) for name, values in statistics.items()}
+        return {name: np.where(self._count > 0, values, 0.0) for name, values in statistics.items()}
