@@ -10,12 +10,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import tactflow
 from tactflow.batch.work import Task
 from tactflow.cli import batch as command
 from tactflow.cli.main import main
 from tests.batch.doubles import PIPELINE, InThisProcess, add_stage, recording
+from tests.sources.test_open_source import write_video
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -179,7 +182,8 @@ def test_a_full_disk_ends_the_batch_and_loses_nothing(call: Call) -> None:
 
 def test_a_warning_is_reported_at_the_end_and_on_the_page(call: Call) -> None:
     film = call.folder / "rec" / "film.avi"
-    assert main(["sim", "press?frames=6", "--out", str(film), "--quiet"]) == 0
+    scene = tactflow.open_scene("press")
+    write_video(film, np.stack([scene.frame(index) for index in range(6)]))
     film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
     assert call() == 0
     assert "1 done with warnings: " in call.stderr

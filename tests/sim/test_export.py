@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,20 +18,12 @@ def scene() -> Scene:
     return open_scene("slide?frames=12")
 
 
-def test_a_folder_holds_numbered_images(scene: Scene, tmp_path: Path) -> None:
-    export.write_frames(scene, tmp_path / "frames")
-    names = sorted(item.name for item in (tmp_path / "frames").iterdir())
-    assert names[0] == "000000.png"
-    assert len(names) == 12
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "frames" / names[5])), scene.frame(5))
-
-
 def test_an_interrupted_export_leaves_nothing_behind(scene: Scene, tmp_path: Path) -> None:
     def stop(done: int) -> None:
         if done == 3:
             raise KeyboardInterrupt
 
-    for name in ("a.npy", "frames", "a.jsonl"):
+    for name in ("a.npy", "a.jsonl"):
         write = export.write_truth if name == "a.jsonl" else export.write_frames
         with pytest.raises(KeyboardInterrupt):
             write(scene, tmp_path / name, stop)

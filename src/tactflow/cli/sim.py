@@ -18,12 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="a scene, optionally with settings, as in 'press?frames=300&seed=7' (see --list)",
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help=".npy, or a folder for numbered PNG files",
-    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="an .npy file for the frames")
     parser.add_argument(
         "--truth",
         type=Path,
@@ -42,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     failed.
     """
     from tactflow.sim import open_scene
-    from tactflow.sim.export import TRUTH_SUFFIXES, frames_writer, write_frames, write_truth
+    from tactflow.sim.export import TRUTH_WRITERS, write_frames, write_truth
 
     if args.list:
         _list()
@@ -53,18 +48,13 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("required --out FILE, --truth FILE, or both: there is nothing to write")
     try:
         scene = open_scene(args.name.removeprefix("sim:"))
-        if args.out is not None:
-            frames_writer(args.out)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    if args.out is not None and not _replaces_pictures(args.out, args.overwrite):
-        refuse_output("--out", args.out, overwrite=args.overwrite)
+    if args.out is not None:
+        refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".npy",))
     if args.truth is not None:
-        refuse_output("--truth", args.truth, overwrite=args.overwrite, suffixes=TRUTH_SUFFIXES)
-    jobs = [("--out", args.out, write_frames), ("--truth", args.truth, write_truth)]
-    if args.out is not None and args.truth is not None and args.out.absolute() == args.truth.absolute():
-        raise ConfigError(f"--out and --truth are the same file: {args.out}")
-    for option, path, write in jobs:
+        refuse_output("--truth", args.truth, overwrite=args.overwrite, suffixes=tuple(TRUTH_WRITERS))
+    for option, path, write in (("--out", args.out, write_frames), ("--truth", args.truth, write_truth)):
         if path is None:
             continue
         with writing(f"{option} {path}"), progress_bar(path.name, len(scene), shown=not args.quiet) as update:
@@ -72,16 +62,6 @@ def run(args: argparse.Namespace) -> int:
         if not args.quiet:
             say(f"{path}: {len(scene)} frames of {scene.name}")
     return 0
-
-
-def _replaces_pictures(path: Path, overwrite: bool) -> bool:
-    """Whether a folder of numbered pictures, and nothing else, may be replaced; other folders are refused."""
-    if not (path.is_dir() and overwrite):
-        return False
-    # Replacing a folder deletes it.
-    if any(item.suffix != ".png" or not item.stem.isdecimal() for item in path.iterdir()):
-        raise ConfigError(f"--out: {path} holds other files than numbered PNG images; name another folder")
-    return True
 
 
 def _list() -> None:

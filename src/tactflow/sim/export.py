@@ -1,4 +1,4 @@
-"""Write a scene to disk: lossless frames, and the truth.
+"""Write a scene to files: its frames, and the truth.
 
 Frames are rendered and written one at a time. Until a file is complete, its name begins with a dot.
 """
@@ -10,29 +10,31 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from tactflow.sim.scenes import Scene
 from tactflow.sim.truth import Truth
 from tactflow.system.files import completed
 
-TRUTH_SUFFIXES = (".jsonl", ".csv")
 Report = Callable[[int], None]
 
 
 def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
     """Write all frames of a scene.
 
-    path : `.npy` (uint8 N x H x W x 3 BGR) or, without a suffix, a folder of numbered PNG files. Overwrites
-        existing files.
+    path : a `.npy` file (uint8 N x H x W x 3 BGR); overwritten.
     report : called with the number of frames written so far.
 
-    Raises ValueError for an unsupported suffix and OSError if the path is not writable.
+    Raises OSError if the path is not writable.
     """
-    write = frames_writer(path)
-    with completed(path) as partial:
-        write(scene, partial, report)
+    # Not memory-mapped, so that a full disk raises OSError instead of SIGBUS.
+    width, height = scene.size
+    header = {"descr": "|u1", "fortran_order": False, "shape": (len(scene), height, width, 3)}
+    with completed(path) as partial, partial.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for index in range(len(scene)):
+            file.write(np.ascontiguousarray(scene.frame(index)).data)
+            report(index + 1)
 
 
 def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
@@ -43,42 +45,11 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
         fy, fz (N). Masks are in `open_scene(name).truth(index)`.
     report : called with the number of frames written so far.
 
-    Raises ValueError for an unsupported suffix and OSError if the path is not writable.
+    Raises KeyError for another suffix and OSError if the path is not writable.
     """
-    suffix = path.suffix.lower()
-    if suffix not in TRUTH_SUFFIXES:
-        raise ValueError(f"required the truth as {' or '.join(TRUTH_SUFFIXES)}, got {path.name!r}")
+    write = TRUTH_WRITERS[path.suffix.lower()]
     with completed(path) as partial:
-        {".jsonl": _write_jsonl, ".csv": _write_forces}[suffix](scene, partial, report)
-
-
-def frames_writer(path: Path) -> Callable[[Scene, Path, Report], None]:
-    """The function that writes frames to such a path; raises ValueError for an unsupported suffix."""
-    if path.is_dir() or not path.suffix:
-        return _write_folder
-    if path.suffix.lower() != ".npy":
-        raise ValueError(f"required frames as .npy or a folder, got {path.name!r}")
-    return _write_npy
-
-
-def _write_npy(scene: Scene, path: Path, report: Report) -> None:
-    # Not memory-mapped, so that a full disk raises OSError instead of SIGBUS.
-    width, height = scene.size
-    header = {"descr": "|u1", "fortran_order": False, "shape": (len(scene), height, width, 3)}
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)
-        for index in range(len(scene)):
-            file.write(np.ascontiguousarray(scene.frame(index)).data)
-            report(index + 1)
-
-
-def _write_folder(scene: Scene, path: Path, report: Report) -> None:
-    path.mkdir()
-    digits = max(6, len(str(len(scene) - 1)))
-    for index in range(len(scene)):
-        encoded = cv2.imencode(".png", scene.frame(index))[1]
-        (path / f"{index:0{digits}d}.png").write_bytes(encoded.tobytes())
-        report(index + 1)
+        write(scene, partial, report)
 
 
 def _truths(scene: Scene, report: Report) -> Iterator[tuple[int, Truth]]:
@@ -113,3 +84,7 @@ def _write_forces(scene: Scene, path: Path, report: Report) -> None:
         table.writerow(["t", "fx", "fy", "fz"])
         for index, truth in _truths(scene, report):
             table.writerow([index / scene.fps, *truth.force])
+
+
+TRUTH_WRITERS = {".jsonl": _write_jsonl, ".csv": _write_forces}
+"""Suffix of a file -> the function that writes the truth to it."""
