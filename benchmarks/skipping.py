@@ -25,7 +25,6 @@ from tactflow import Result
 from tactflow.bench.judge import LARGE
 from tactflow.bench.lockstep import LockstepPipeline, TimedResult
 from tactflow.bench.timing import quiet
-from tactflow.report import figure
 from tactflow.sources import open_source
 from tactflow.system.terminal import show, table
 
@@ -146,9 +145,11 @@ class Tally:
 
 def plot(pairs: Pairs, path: Path) -> None:
     """Draw the cost of each frame along a recording, beside what happens in it."""
+    from matplotlib import pyplot
+
     pairs = [pair for pair in pairs if not pair[1].frame.reference]
     seconds = [fresh.t for _, fresh in pairs]
-    drawing, (cost, happens) = figure(rows=2, size=(8, 4.5), sharex=True)
+    drawing, (cost, happens) = pyplot.subplots(2, figsize=(8, 4.5), sharex=True, layout="constrained")
     for place, label in ((1, "skipping: false"), (0, "skipping: true")):
         cost.step(seconds, [1e3 * pair[place].cpu_s for pair in pairs], where="mid", label=label)
     cost.set(ylabel="CPU of a frame, ms", ylim=(0, None))

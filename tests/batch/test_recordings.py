@@ -53,12 +53,6 @@ def test_options_behind_a_pattern_hold_for_all_that_match(data: Path) -> None:
     assert names("lerobot:a?episode=1", "b/press-2.npy")[0] == f"lerobot:{data / 'a'}?episode=1"
 
 
-def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (data / "b" / "list.txt").write_text("# today\npress-2.npy  # the first\n\nsim:press?seed=3\n../x.dat\n")
-    monkeypatch.chdir("/")
-    assert names(str(data / "b" / "list.txt")) == ["b/press-2.npy", "sim:press?seed=3", "x.dat"]
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -68,14 +62,10 @@ def test_a_list_names_what_lies_beside_it(data: Path, monkeypatch: pytest.Monkey
         (["0"], "is a live source"),
         (["rtsp://camera/1"], "is a live source"),
         (["pictures/1.png"], "name its folder"),
-        (["list.txt"], "there are no recordings"),
-        (["nested.txt"], "lists cannot be nested"),
     ],
 )
 def test_what_names_no_recording_is_said(data: Path, words: list[str], message: str) -> None:
     (data / "a" / "empty").mkdir()
-    (data / "list.txt").write_text("# nothing\n")
-    (data / "nested.txt").write_text("nested.txt\na/press-2.npy\n")
     with pytest.raises(ConfigError, match=message):
         find_recordings(words)
 

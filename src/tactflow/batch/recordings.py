@@ -1,11 +1,11 @@
-"""Resolve the recordings named on a command line: files, folders, patterns, and lists of them."""
+"""Resolve the recordings named on a command line: files, folders and patterns."""
 
 from __future__ import annotations
 
 import glob
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,6 @@ from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
 from tactflow.sources.paths import find_path, locate, split_prefix
 from tactflow.system.files import expanded, is_utf8
 
-LISTS = frozenset([".txt", ".list"])
-"""Suffixes of files that list recordings, one per line."""
 _MAX_MISTAKES = 10
 """Mistakes reported per call: they fit on a terminal."""
 
@@ -49,21 +47,21 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
     """Find the recordings that words name, without duplicates, in natural order within a folder or pattern.
 
     words : each a file, a folder of pictures, a folder of recordings (searched recursively), a pattern of any
-        of these, `sim:NAME?...`, or a text file with one such word per line and `#` for comments.
+        of these, or `sim:NAME?...`.
 
     Raises
     ------
     ConfigError
-        A word matches nothing or names a live source, or there are no recordings; lists all mistakes.
+        A word matches nothing or names a live source; lists all mistakes.
 
     >>> [recording.name for recording in find_recordings(["sim:press?seed=1", "sim:press?seed=2"])]
     ['sim:press?seed=1', 'sim:press?seed=2']
     """
     mistakes: list[str] = []
     sources: dict[str, None] = {}
-    for word, directory in _with_lists(words, mistakes):
+    for word in words:
         try:
-            sources |= dict.fromkeys(_sources(word, directory))
+            sources |= dict.fromkeys(_sources(word))
         except SourceError as error:
             mistakes.append(str(error))
     # Messages and tables are UTF-8.
@@ -72,49 +70,27 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
         mistakes[_MAX_MISTAKES:] = [f"and {len(mistakes) - _MAX_MISTAKES} more"]
     if mistakes:
         raise ConfigError(*mistakes)
-    if not sources:
-        kinds = "video files, .npy, .mcap, folders of pictures"
-        raise ConfigError(f"there are no recordings in {', '.join(words) or 'nothing'}; required {kinds}")
     names = _short_names(list(sources))
     return [Recording(source, name) for source, name in zip(sources, names, strict=True)]
 
 
-def _with_lists(words: Iterable[str], mistakes: list[str]) -> Iterator[tuple[str, Path | None]]:
-    """Expand lists: yield each word, with the folder of the list it comes from."""
-    for word in words:
-        path = expanded(word)
-        if path.suffix.lower() not in LISTS or not path.is_file():
-            yield word, None
-            continue
-        try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            mistakes.append(f"{path}: cannot be read as a list of recordings: {error}")
-            continue
-        # A name may contain `#`: a comment follows a space or begins the line.
-        kept = (re.sub(r"(^|\s)#.*", "", line).strip() for line in lines)
-        yield from ((line, path.parent) for line in kept if line)
-
-
-def _sources(word: str, directory: Path | None) -> Iterator[str]:
-    """The sources that a word names; raises SourceError. directory : of the list that contains the word."""
+def _sources(word: str) -> Iterator[str]:
+    """The sources that a word names; raises SourceError."""
     if word.startswith("sim:"):
         yield word
         return
     if word.isdecimal() or word.startswith("/dev/") or re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", word):
         raise SourceError(f"{word}: is a live source; a batch needs recordings: see `tactflow record`")
-    scheme, word = split_prefix(word, directory)
-    exists = locate(word, directory) is not None
+    scheme, word = split_prefix(word, None)
+    exists = locate(word, None) is not None
     # The name of an existing file may contain wildcards or a question mark.
     plain, mark, options = (word, "", "") if exists else word.partition("?")
     if glob.has_magic(plain) and not exists:
         # In a pattern, `?` is a wildcard unless options follow.
         pattern, tail = (plain, mark + options) if "=" in options else (word, "")
-        yield from (scheme + match + tail for match in _matching(pattern, directory))
+        yield from (scheme + match + tail for match in _matching(pattern))
         return
-    path = find_path(plain, directory)
-    if path.suffix.lower() in LISTS and path.is_file():
-        raise SourceError(f"{word}: is a list of recordings; lists cannot be nested")
+    path = find_path(plain, None)
     if path.is_dir() and not mark and not _is_recording(path.name):
         recordings = list(_inside(path))
         if not recordings:
@@ -128,13 +104,10 @@ def _sources(word: str, directory: Path | None) -> Iterator[str]:
         yield scheme + os.path.abspath(path) + mark + options
 
 
-def _matching(pattern: str, directory: Path | None) -> Iterator[str]:
+def _matching(pattern: str) -> Iterator[str]:
     """Matches of a pattern; if all are pictures, they form a single recording."""
     full = expanded(pattern)
     paths = matching(full)
-    if not paths and directory is not None:
-        full = directory / full
-        paths = matching(full)
     if not paths:
         raise SourceError(f"{pattern}: no file matches this pattern")
     if all(path.suffix.lower() in IMAGE_SUFFIXES for path in paths):

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import base64
-import functools
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
+from html import escape
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from string import Template
 from urllib.parse import quote
 
-import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from tactflow.batch.recordings import Recording
 from tactflow.batch.store import Format, Outcome, Store
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.report import COLORS, Html, Section, Table, figure, link, mark, picture, write_report
 from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
-MAX_DETAILS = 300
-"""Recordings shown in detail: each takes 50 ms to draw and 60 kB of the page, which shall open quickly."""
-NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full"}
+NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full", "pictures"}
 """Internal fields of an outcome."""
+COLUMNS = (
+    *("recording", "status", "frames", "duration, s", "frames/s", "contacts", "touching, %"),
+    *("largest contact, px²", "result", "largest contacts, or what went wrong"),
+)
+"""Headings of the page."""
 _TYPES = {"int": "int64", "float": "float64"}
 """Python type -> Arrow type; all others are strings."""
 
@@ -60,6 +59,7 @@ def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
 
 def write_page(store: Store, runs: Runs, title: str) -> Path:
     """Write `index.html`, overwriting an earlier one; return its path. Raises StageError."""
+    path = store.path / "index.html"
     ordered = sorted(runs, key=lambda run: ("failed", "done", "not done").index(run[1].status))
     done = [outcome for _, outcome in runs if outcome.status == "done"]
     failed = sum(outcome.status == "failed" for _, outcome in runs)
@@ -68,79 +68,34 @@ def write_page(store: Store, runs: Runs, title: str) -> Path:
         f"{sum(o.frames for o in done)} frames, {sum(o.contacts for o in done)} contacts; "
         f"{sum(o.took_s for o in done):.0f} s of work"
     )
-    if problem := missing("plots", "plot", ["matplotlib"]):
-        text += f"\n\nNo plots: {problem}"
-    shown = ordered[:MAX_DETAILS]
-    if len(shown) < len(ordered):
-        text += f"\n\nDetails of {len(shown)} of {len(ordered)} recordings, failed ones first."
+    rows = (f"<tr>{''.join(f'<td>{cell}' for cell in _cells(store, *run))}" for run in ordered)
+    template = Template(files("tactflow.batch").joinpath("page.html").read_text(encoding="utf-8"))
+    columns = "".join(f"<th>{column}" for column in COLUMNS)
+    page = template.substitute(title=escape(title), text=text, columns=columns, rows="\n".join(rows))
     try:
-        sections = [Section("Runs", tables=[_table(ordered)]), *(_details(store, *run) for run in shown)]
+        with completed(path) as partial:
+            partial.write_text(page, encoding="utf-8")
     except OSError as error:
-        raise StageError(f"{store.records}: cannot be used: {error.strerror or error}") from error
-    return write_report(store.path / "index.html", title, sections, text)
+        raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return path
 
 
-def _table(runs: Runs) -> Table:
-    columns = [
-        *("recording", "status", "frames", "duration, s", "frames/s", "contacts"),
-        *("touching, %", "largest contact, px²", "result"),
-    ]
-    rows: list[list[Any]] = []
-    for recording, outcome in runs:
-        row: list[Any] = [recording.name, mark(outcome.status, outcome.status == "done")]
-        if outcome.status == "done":
-            touching = 100.0 * outcome.touching_frames / max(1, outcome.frames)
-            rate = outcome.frames / outcome.took_s if outcome.took_s else None
-            row += [outcome.frames, outcome.duration_s, rate, outcome.contacts, touching]
-            row += [outcome.largest_area_px2, link("open", quote(str(outcome.result)))]
-        rows.append(row + [None] * (len(columns) - len(row)))
-    return Table(columns, rows)
-
-
-def _details(store: Store, recording: Recording, outcome: Outcome) -> Section:
-    """Error of a failed recording, or plot and pictures of a finished one."""
-    path = recording.source if recording.source != recording.name else None
-    text = "\n\n".join(filter(None, (outcome.error, outcome.warnings, path)))
-    pictures = [Html(store.preview_html(recording, _preview))] if outcome.status == "done" else []
-    return Section(recording.name, text, pictures)
-
-
-def _preview(preview: bytes) -> str:
-    """Plot and pictures of `Summary.preview` as HTML; only the pictures without matplotlib."""
-    content = orjson.loads(preview)
-    pictures = [picture(base64.b64decode(jpeg), f"{t:.2f} s") for t, jpeg in content["pictures"]]
-    with suppress(ConfigError):
-        # JSON has null for NaN.
-        pictures.insert(0, picture(_plot(np.array(content["points"], float).reshape(-1, 4))))
-    return "".join(pictures)
-
-
-@functools.cache
-def _axes() -> tuple[Any, Any]:
-    """A figure reused for all recordings: a new one for each takes three times as long (0.2 s)."""
-    drawing, axes = figure(3, 1, size=(4.2, 2.8), sharex=True)
-    for axis, label, color in zip(axes, ("area, px²", "flow, px", "angle, °"), COLORS[:3], strict=True):
-        axis.plot([], [], color=color)
-        axis.set_ylabel(label, fontsize=8)
-        axis.tick_params(labelsize=8)
-    axes[2].set_xlabel("time, s", fontsize=8)
-    drawing.align_ylabels()
-    # Freeze the layout with the widest labels expected, px^2.
-    axes[0].set_ylim(0, 90_000)
-    drawing.draw_without_rendering()
-    drawing.set_layout_engine("none")
-    return drawing, axes
-
-
-def _plot(points: NDArray[np.float64]) -> Any:
-    """Plot the points (N, 4) of a recording."""
-    drawing, axes = _axes()
-    # An axis that turns past 90 degrees continues at -90: no line is drawn between the two.
-    jumps = np.flatnonzero(np.abs(np.diff(points[:, 3])) > 90.0) + 1
-    points = np.insert(points, jumps, np.nan, axis=0)
-    for axis, curve in zip(axes, points.T[1:], strict=True):
-        axis.lines[0].set_data(points[:, 0], curve)
-        axis.relim()
-        axis.autoscale(axis="both")
-    axes[2].set_ylim(-90, 90)
-    return drawing
+def _cells(store: Store, recording: Recording, outcome: Outcome) -> Iterator[str]:
+    """Cells of a row, HTML."""
+    yield escape(recording.name)
+    yield f'<b class="{outcome.status}">{outcome.status}</b>'
+    if outcome.status == "done":
+        yield str(outcome.frames)
+        yield f"{outcome.duration_s:.2f}"
+        yield f"{outcome.frames / outcome.took_s:.0f}" if outcome.took_s else ""
+        yield str(outcome.contacts)
+        yield f"{100.0 * outcome.touching_frames / max(1, outcome.frames):.1f}"
+        yield f"{outcome.largest_area_px2:.0f}"
+        yield f'<a href="{escape(quote(str(outcome.result)))}">open</a>'
+    else:
+        yield from [""] * 7
+    remarks = "\n".join(filter(None, (outcome.error, outcome.warnings)))
+    pictures = zip(store.pictures(recording, len(outcome.pictures)), outcome.pictures, strict=True)
+    addresses = ((escape(quote(file.relative_to(store.path).as_posix())), t) for file, t in pictures)
+    images = (f'<img loading="lazy" src="{address}" title="{t:.2f} s">' for address, t in addresses)
+    yield "".join(images) + escape(remarks).replace("\n", "<br>")

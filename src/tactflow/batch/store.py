@@ -2,8 +2,7 @@
 
     results/NAME            per recording: a folder of Parquet tables, or NAME.jsonl
     records/NAME.json       its outcome, written after the result
-    records/NAME.preview    the points of its plot and its pictures, JSON
-    records/NAME.html       both as HTML, once the page has shown them
+    records/NAME.0.jpg ...  its largest contacts, which the page shows
     unfinished/SHARD/       results being written; removed at the end
     runs.parquet, index.html
 
@@ -16,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -43,7 +42,8 @@ class Outcome:
     number of separate touches; touching_frames : frames with contact. largest_area_px2 : of all contacts.
     started_unix, took_s : start time and processing time. worker : host and process. result : path relative
     to `--out`. warnings : one per line. tactflow : version. pipeline : `pipeline_digest`. recording_is,
-    result_is : fingerprints. disk_full : whether a full disk caused the failure.
+    result_is : fingerprints. disk_full : whether a full disk caused the failure. pictures : times of its
+    pictures, s.
     """
 
     recording: str
@@ -66,6 +66,7 @@ class Outcome:
     recording_is: Fingerprint | None = None
     result_is: Fingerprint | None = None
     disk_full: bool = False
+    pictures: tuple[float, ...] = ()
 
 
 _OUTCOME = TypeAdapter(Outcome)
@@ -137,22 +138,17 @@ class Store:
         except OSError:
             return False
 
-    def save(self, recording: Recording, outcome: Outcome, preview: bytes = b"") -> None:
-        """Write the record of a recording. preview : of `Summary.preview`. Raises OSError."""
-        self._file(recording, "html").unlink(missing_ok=True)
-        for suffix, content in (("preview", preview), ("json", orjson.dumps(asdict(outcome)))):
-            with completed(self._file(recording, suffix)) as partial:
+    def save(self, recording: Recording, outcome: Outcome, pictures: Sequence[bytes] = ()) -> None:
+        """Write the record of a recording, after its pictures (JPEG). Raises OSError."""
+        files = self.pictures(recording, len(pictures))
+        contents = [*zip(files, pictures, strict=True)]
+        for path, content in [*contents, (self._file(recording, "json"), orjson.dumps(asdict(outcome)))]:
+            with completed(path) as partial:
                 partial.write_bytes(content)
 
-    def preview_html(self, recording: Recording, draw: Callable[[bytes], str]) -> str:
-        """Plot and pictures of a recording, possibly empty; drawn once. draw : converts its preview."""
-        path = self._file(recording, "html")
-        if not path.is_file():
-            preview = self._file(recording, "preview")
-            html = draw(preview.read_bytes()) if preview.is_file() else ""
-            with completed(path) as partial:
-                partial.write_text(html, encoding="utf-8")
-        return path.read_text(encoding="utf-8")
+    def pictures(self, recording: Recording, count: int) -> list[Path]:
+        """Files of the pictures of a recording."""
+        return [self._file(recording, f"{number}.jpg") for number in range(count)]
 
     def _file(self, recording: Recording, suffix: str) -> Path:
         return self.records / f"{file_name(recording)}.{suffix}"

@@ -150,9 +150,9 @@ def work(task: Task) -> Outcome:
     )
     unfinished = Path(task.scratch, file_name(task.recording))
     try:
-        done, summary = _run(task, outcome, unfinished)
+        done, pictures = _run(task, outcome, unfinished)
         done = replace(done, took_s=SYSTEM.now() - began)
-        _publish(task, done, unfinished, summary)
+        _publish(task, done, unfinished, pictures)
     except Exception as error:
         with suppress(OSError):
             remove(unfinished)
@@ -162,8 +162,8 @@ def work(task: Task) -> Outcome:
     return done
 
 
-def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, Summary]:
-    """Run the pipeline into the scratch folder."""
+def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, list[bytes]]:
+    """Run the pipeline into the scratch folder; also returns the pictures of the page."""
     path = task.recording.path
     before = None if path is None else fingerprint(path)
     # A worker that died may have left files.
@@ -177,6 +177,7 @@ def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, Summa
         raise result.failure
     if path is not None and fingerprint(path) != before:
         raise SourceError(f"{path}: changed while being read; run again")
+    pictures = summary.pictures()
     done = replace(
         outcome,
         status="done",
@@ -190,18 +191,19 @@ def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, Summa
         recording_is=before,
         result_is=fingerprint(unfinished),
         result=f"results/{unfinished.name}{'.jsonl' if task.request.format == 'jsonl' else ''}",
+        pictures=tuple(picture.t for picture in pictures),
     )
-    return done, summary
+    return done, [picture.jpeg for picture in pictures]
 
 
-def _publish(task: Task, outcome: Outcome, unfinished: Path, summary: Summary) -> None:
+def _publish(task: Task, outcome: Outcome, unfinished: Path, pictures: list[bytes]) -> None:
     """Move a result to its final path, then save the record, which marks it as complete."""
     path = Path(task.out, str(outcome.result))
     if path.is_dir():
         # A rename cannot overwrite a folder.
         remove(path)
     unfinished.replace(path)
-    Store(Path(task.out)).save(task.recording, outcome, summary.preview())
+    Store(Path(task.out)).save(task.recording, outcome, pictures)
 
 
 def _pipeline_for(task: Task, path: Path) -> Pipeline:

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="[PIPELINE] SRC",
         help="a pipeline (FILE.yaml, or the name of a shipped one; default: ./pipeline.yaml, else the "
-        "packaged one), then recordings: files, folders, quoted patterns, or text files that list them",
+        "packaged one), then recordings: files, folders, or quoted patterns",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument(
