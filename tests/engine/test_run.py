@@ -532,7 +532,7 @@ def interrupt_in_join(runner: Runner) -> RunResult:
     """Run, and interrupt as soon as `join` is being called."""
 
     def interrupt(_: object) -> None:
-        if "compute" in runner.calls():
+        if runner._segments["compute"].current == "join":
             raise KeyboardInterrupt
 
     return runner.run(on_progress=interrupt, interval_s=0.001)

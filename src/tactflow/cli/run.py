@@ -22,10 +22,9 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
-from tactflow.fleet.heartbeat import HANG_AFTER, progress_of, start_heartbeat
 from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import Request, run_fleet
-from tactflow.system.arguments import positive, seconds
+from tactflow.system.arguments import positive
 from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
@@ -68,20 +67,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="end the run when standard input ends, and so with the program that started this one",
     )
-    parser.add_argument(
-        "--sign-of-life",
-        type=Path,
-        metavar="FILE",
-        help="touch this file every second while the run makes progress",
-    )
-    parser.add_argument(
-        "--hang-after",
-        type=seconds,
-        default=HANG_AFTER,
-        metavar="SECONDS",
-        help="with several sensors, restart one that has given no sign of life for this time (default: "
-        "%(default)g, also the minimum while it starts); must be longer than the slowest stage takes",
-    )
     add_quiet(parser)
     parser.add_argument(
         "--check", action="store_true", help="check every array against its port type (slower)"
@@ -117,7 +102,6 @@ def _run_all(args: argparse.Namespace, file: Path, sensors: Sequence[str]) -> in
         args.overrides,
         added={option for added in sinks.values() for option in added},
         files={} if args.stats is None else {"--stats": args.stats},
-        hang_after=args.hang_after,
         options=_options(args),
     )
     return run_fleet(request, pipelines)
@@ -160,8 +144,6 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check)
     if args.end_with_stdin:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
-    if args.sign_of_life is not None:
-        start_heartbeat(args.sign_of_life, progress_of(runner.calls))
     with notes(), ended_by_signals(runner) as caught:
         if args.stats is not None and (problem := _statistics_problem(args.stats)):
             raise ConfigError(f"--stats {args.stats}: {problem}")

@@ -195,10 +195,6 @@ class Runner:
     def source(self) -> Source | None:
         return self._source
 
-    def calls(self) -> dict[str, int]:
-        """Segment -> number of its current call of a stage; without waiting segments."""
-        return {name: segment.calls for name, segment in list(self._segments.items()) if segment.at_work}
-
     def recorder(self) -> Recorder | None:
         sinks = [node.sink for node in list(self.nodes.values())]
         return next((sink for sink in sinks if isinstance(sink, Recorder)), None)

@@ -104,12 +104,6 @@ class Segment:
         self.calls = 0
 
     @property
-    def at_work(self) -> bool:
-        """Whether a stage is running. (A running sink may be waiting for its readers.)"""
-        current = self.current
-        return current in self.run.nodes and self.run.nodes[current].sink is None
-
-    @property
     def only_sinks(self) -> bool:
         """Whether it has no stages."""
         return all(node.sink is not None for node in self.nodes)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.fleet.heartbeat import Watchdog
 from tactflow.fleet.names import with_name
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import (
@@ -31,15 +30,14 @@ class Request:
     """What to run for every sensor.
 
     file : the pipeline file. overrides : for `--set`. added : options of the command line that added sinks,
-    as in the marks of these. files : option -> path, of which each sensor gets its own. hang_after : time
-    without a heartbeat, s, after which a process is killed. options : remaining command-line arguments.
+    as in the marks of these. files : option -> path, of which each sensor gets its own. options : remaining
+    command-line arguments.
     """
 
     file: Path
     overrides: Sequence[str]
     added: Collection[str]
     files: Mapping[str, str]
-    hang_after: float
     options: Sequence[str]
 
 
@@ -71,10 +69,8 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
             stack.enter_context(relay(publication, upstream))
         members = []
         for sensor, pipeline in pipelines.items():
-            watchdog = Watchdog(scratch / f"{sensor}.alive", request.hang_after)
             command = _command(request, sensor, pipeline, _side_by_side(sensor, pipeline, shared, scratch))
-            command += ["--sign-of-life", str(watchdog.path)]
-            members.append(Member(sensor, command, watchdog, [WatchedSink(node) for node in pipeline.sinks]))
+            members.append(Member(sensor, command, [WatchedSink(node) for node in pipeline.sinks]))
         return supervisor.run(members)
 
 

@@ -13,7 +13,6 @@ from types import FrameType
 from typing import IO, TextIO
 
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.fleet.heartbeat import Watchdog
 from tactflow.fleet.sinks import WatchedSink
 from tactflow.system.files import discard_output
 from tactflow.system.signals import INTERRUPTED
@@ -49,11 +48,10 @@ def start_process(command: Sequence[str]) -> Process:
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A sensor: the command that runs it, its heartbeat, and its sinks, which say how it is restarted."""
+    """A sensor: the command that runs it, and its sinks, which say how it is restarted."""
 
     sensor: str
     command: Sequence[str]
-    watchdog: Watchdog
     sinks: Sequence[WatchedSink] = ()
 
 
@@ -115,7 +113,7 @@ class Supervisor:
         failures = 0
         while not self._ends:
             started = self._clock()
-            code = yield from self._watch(member, self._start(member))
+            code = yield from self._watch(self._start(member))
             if code in (0, ConfigError.exit_code, INTERRUPTED) or self._ends:
                 # A wrong command line or file is wrong for the whole run: end the others.
                 self._refused |= code == ConfigError.exit_code
@@ -124,7 +122,7 @@ class Supervisor:
             if code == StageError.exit_code and refused is not None:
                 self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
                 return code
-            lasted = self._clock() - started - member.watchdog.silent
+            lasted = self._clock() - started
             failures = 1 if lasted > GOOD_RUN else failures + 1
             if failures > GIVE_UP_AFTER:
                 self._say(member, f"failed {failures} times in a row (exit code {code}); given up")
@@ -136,15 +134,13 @@ class Supervisor:
                 yield
         return 0
 
-    def _watch(self, member: Member, process: Process) -> Generator[None, None, int]:
-        """Forward signals to a process, and kill it if its heartbeat stops. Returns its exit code."""
+    def _watch(self, process: Process) -> Generator[None, None, int]:
+        """Forward signals to a process until it ends. Returns its exit code."""
         sent = 0
-        killed = False
         while (code := process.poll()) is None:
-            if not killed and (self._signals >= KILL_AT or self._hangs(member)):
-                killed = True
+            if self._signals >= KILL_AT:
                 process.kill()
-            elif not killed and sent < self._ends:
+            elif sent < self._ends:
                 # SIGINT would show a traceback in a process that is still importing. One signal at a time:
                 # two at once may be merged.
                 process.send_signal(signal.SIGTERM)
@@ -153,15 +149,6 @@ class Supervisor:
         if process.stdin is not None:
             process.stdin.close()
         return code
-
-    def _hangs(self, member: Member) -> bool:
-        """Whether the heartbeat of a process has stopped."""
-        # It may be blocked by our own reader.
-        blocked = self._results.locked() or self._messages.locked()
-        hangs = member.watchdog.expired(self._clock(), blocked=blocked)
-        if hangs:
-            self._say(member, f"has hung for {member.watchdog.timeout:g} s and is killed")
-        return hangs
 
     def _last_code(self, member: Member, code: int) -> int:
         """Exit code of a sensor that is not restarted."""
@@ -177,7 +164,6 @@ class Supervisor:
         """Start the process of a sensor, and the threads that forward its output."""
         kept = [word for sink in member.sinks for text in sink.overrides for word in ("--set", text)]
         process = self._start_process([*member.command, *kept])
-        member.watchdog.start(self._clock())
         assert process.stdout is not None
         assert process.stderr is not None
         for stream, target, prefix in (
