@@ -22,7 +22,7 @@ from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
 from tactflow.system.terminal import notes, printable, say, typed
-from tactflow.tune.propose import FEWEST_FOUND, Attempt, Sample, distinct_pipelines, divide, propose
+from tactflow.tune.propose import FEWEST_FOUND, OF_ONE, Attempt, Sample, divide, propose
 from tactflow.tune.recording import CHANGE, Kept
 from tactflow.tune.report import changed_pipeline
 from tactflow.view.questions import Questions
@@ -125,9 +125,10 @@ def _cameras(dev: Path) -> list[str]:
 
 def _set_up(args: argparse.Namespace, source: str, reader: FrameReader, questions: Questions) -> None:
     """Ask and propose until a pipeline is accepted, and write it. Raises KeyboardInterrupt if none is."""
-    kinds = {name for names in distinct_pipelines() for name in names} - {"default", "markerless"}
-    named = {name: what for name, what in described_pipelines().items() if name in kinds}
-    kind = questions.ask("Which sensor is this?", {"unknown": "Another one, or unknown"} | named)
+    left_out = OF_ONE | {"default", "markerless"}
+    named = {name: what for name, what in described_pipelines().items() if name not in left_out}
+    answer = questions.ask("Which sensor is this?", {"unknown": "Another one, or unknown"} | named)
+    kind = answer if answer in named else None
     edges = {value: f"{edge} edge" for value, edge in EDGES.items()}
     answer = "again"
     while answer == "again":
@@ -141,7 +142,7 @@ def _set_up(args: argparse.Namespace, source: str, reader: FrameReader, question
             sample = divide(kept.frames)
             questions.show(sample.frames[sample.strongest])
         text = "Where is the end of the gel that points away from the cable? Press it, and choose its edge."
-        rotate = int(questions.ask(text, edges, edges=True))
+        rotate = int(questions.ask(text, edges))
         if reader.live:
             _press(reader, observation, questions, kept)
             observation.pairs[:0] = rest.pairs

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     # Imported here: the simulator and the bench take their time.
     from tactflow.tune import report
     from tactflow.tune.recording import take
-    from tactflow.tune.search import Goal, impossible, search
+    from tactflow.tune.search import Goal, search
     from tactflow.tune.space import candidates
 
     with notes("ERROR"), tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         show(report.lines(tuned))
     if tuned.chosen is None:
-        say(impossible(tuned))
+        say(tuned.impossible())
         return StageError.exit_code
     # YAML takes no control characters, which a name in a comment may have.
     text = "\n".join(map(printable, report.pipeline_text(tuned, file, args.out).split("\n")))

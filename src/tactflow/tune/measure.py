@@ -45,6 +45,8 @@ DRAWS: Final = 200
 """Bootstrap draws: they give the ends of a 90 % interval to a tenth of its width."""
 INTERVAL: Final = (5.0, 95.0)
 """Percentiles of an interval's ends."""
+FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask.method"})
+"""Settings that change nothing but the mean flow."""
 
 
 @dataclass
@@ -62,7 +64,7 @@ class Interval:
         return (self.value + self.high) / 2
 
 
-@dataclass
+@dataclass(eq=False)
 class Trial:
     """A pipeline that is tried, and what was measured.
 
@@ -167,7 +169,8 @@ def _interval(
 
 
 def mark_unsound(trials: Sequence[Trial]) -> None:
-    """Mark trials that are worse than the best by more than a tolerance of `SOUND`."""
+    """Mark trials that are worse than the best by more than a tolerance of `SOUND`, and those with another
+    mean flow where none could be compared with the truth."""
     for key, (tolerance, description) in SOUND.items():
         known = [trial for trial in trials if trial.failure is None and key in trial.quantities]
         sign = math.copysign(1.0, tolerance)
@@ -176,6 +179,10 @@ def mark_unsound(trials: Sequence[Trial]) -> None:
             value = trial.quantities[key]
             if not trial.unsound and sign * value - best > abs(tolerance):
                 trial.unsound = f"{description} {value:.3g} (best {sign * best:.3g})"
+    if not any("flow" in trial.errors for trial in trials):
+        for trial in trials:
+            if trial.settings.keys() & FLOW and trial.usable:
+                trial.unsound = "its mean flow could not be judged: too few dots in the contact"
 
 
 def measure_on_recording(trials: Sequence[Trial], recording: Recording) -> None:

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import takewhile
 from textwrap import shorten
 from typing import Any, Final
@@ -18,8 +17,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.config.load import load_pipeline
-from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.doctor.checks import STEADY
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
@@ -37,8 +34,12 @@ PRESSED: Final = 0.5
 because whether they show a contact is a matter of definition."""
 FEWEST_FOUND: Final = 0.5
 """Share of presses below which a pipeline does not find the contacts of a gel: no better than a coin."""
-GEOMETRY: Final = frozenset({"capture", "preprocess", "visualize"})
-"""Stages that do not distinguish candidates: where frames come from, how they are turned and drawn."""
+TRIED: Final = ("default", "markerless", "tactip")
+"""Shipped pipelines that are tried for every sensor. The others differ from one of them in geometry alone,
+except for `OF_ONE`."""
+OF_ONE: Final = frozenset({"classic", "wedge"})
+"""Shipped pipelines for no kind of sensor: the original script, and one that rectifies the picture of one
+camera."""
 
 
 @dataclass(frozen=True)
@@ -121,30 +122,6 @@ def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Sample:
     return Sample(list(frames), reference, rest, pressed, changes)
 
 
-@cache
-def distinct_pipelines() -> list[list[str]]:
-    """Shipped pipelines by what they compute, as lists of names; those of built-in stages only.
-
-    Pipelines that differ in geometry alone are in one list. Those that rectify the picture of a certain
-    camera are left out. The first list is that of `default`.
-
-    >>> [names[0] for names in distinct_pipelines()]
-    ['default', 'markerless', 'tactip']
-    """
-    alike: dict[str, list[str]] = {}
-    for name in sorted(
-        packaged_pipelines(), key=lambda name: (name != "default", name != "markerless", name)
-    ):
-        nodes = load_pipeline(find_pipeline(name)).nodes
-        if getattr(nodes["preprocess"].params, "homography", None) is None and all(
-            node.component.name == id_ for id_, node in nodes.items() if node.component.kind != "sink"
-        ):
-            computed = {id_: repr(node.params) for id_, node in nodes.items() if id_ not in GEOMETRY}
-            stages = {id_: text for id_, text in computed.items() if nodes[id_].component.kind == "stage"}
-            alike.setdefault(repr(sorted(stages.items())), []).append(name)
-    return list(alike.values())
-
-
 def shrinking(size: tuple[int, int], pitch: float | None) -> int:
     """Factor of `downsample` for frames of a size (width, height), px. pitch : of the dots, px.
 
@@ -168,7 +145,7 @@ def propose(
     kind: str | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[Attempt]:
-    """Try the shipped pipelines, best first.
+    """Try the shipped pipelines of `TRIED` and that of the sensor's kind, best first.
 
     Of pipelines whose scores are within a standard error of the best, one that also tracks steady dots is
     preferred, then the one for the sensor that the user named, then the first.
@@ -179,8 +156,8 @@ def propose(
     height, width = sample.frames[0].shape[:2]
     settings = {"stages.preprocess.rotate": rotate, DOWNSAMPLE: shrinking((width, height), pitch)}
     attempts = []
-    for names in distinct_pipelines():
-        attempts.append(_attempt(kind if kind in names else names[0], settings, sample))
+    for name in dict.fromkeys([*TRIED, kind or TRIED[0]]):
+        attempts.append(_attempt(name, settings, sample))
         report(str(attempts[-1]))
     best = max(attempts, key=lambda attempt: attempt.score)
 

@@ -19,7 +19,6 @@ def lines(tuned: Tuned) -> Iterator[str]:
     facts = [
         f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}",
         "errors: px of the camera image, simulated; time: CPU of a frame with contact, on the recording",
-        *tuned.notes,
     ]
     kinds = [kind for kind in ERRORS if any(kind in trial.errors for trial in tuned.trials)]
     rows = []
@@ -54,7 +53,6 @@ def as_json(tuned: Tuned) -> dict[str, Any]:
         "source": tuned.recording.source,
         "sensor": tuned.look,
         "chosen": None if tuned.chosen is None else tuned.chosen.name,
-        "notes": tuned.notes,
         "candidates": [{key: getattr(trial, key) for key in keys} for trial in tuned.trials],
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -20,8 +20,6 @@ SIMULATED: Final = (Case("press", 140), Case("slide", 80))
 under light pressure is random."""
 ERROR_FACTOR: Final = 1.5
 """Without a budget, the largest acceptable error relative to the smallest. Chosen by hand."""
-FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask.method"})
-"""Settings that change nothing but the mean flow."""
 
 
 @dataclass(frozen=True)
@@ -34,43 +32,55 @@ class Goal:
     def order(self, trials: Sequence[Trial]) -> list[Trial]:
         """Sort by preference: within the budgets first, then by time, or by error if only the time is
         limited."""
+        allowed = self.allowed(trials)
         by_error = self.max_ms is not None and self.max_error is None
-        limit = self.error_limit(trials)
 
         def key(trial: Trial) -> tuple[float, ...]:
-            error, ms = trial.error.value, trial.ms.value
-            rank = (not trial.usable, not self.allows(trial, limit))
-            return (*rank, error, ms) if by_error else (*rank, ms, error)
+            error, ms = trial.error.likely, trial.ms.value
+            return (not trial.usable, trial not in allowed, *((error, ms) if by_error else (ms, error)))
 
         return sorted(trials, key=key)
 
-    def allows(self, trial: Trial, limit: float) -> bool:
-        """Whether a trial is usable and within the budgets. limit : largest acceptable error, px."""
-        return trial.usable and trial.error.value <= limit and trial.ms.value <= (self.max_ms or math.inf)
+    def allowed(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The usable trials that are likely to be within the budgets."""
+        usable = [trial for trial in trials if trial.usable]
+        max_error = self.max_error or math.inf
+        if self.max_error is None and self.max_ms is None:
+            max_error = ERROR_FACTOR * min((trial.error.likely for trial in usable), default=math.inf)
+        max_ms = self.max_ms or math.inf
+        return [trial for trial in usable if trial.error.likely <= max_error and trial.ms.value <= max_ms]
 
-    def error_limit(self, trials: Sequence[Trial]) -> float:
-        """Largest acceptable error, px."""
-        if self.max_error is not None:
-            return self.max_error
-        if self.max_ms is not None:
-            return math.inf
-        return ERROR_FACTOR * min((trial.error.value for trial in trials if trial.usable), default=math.inf)
+    def choose(self, trials: Sequence[Trial]) -> Trial | None:
+        """The best of the allowed trials; the original, unless another is significantly faster."""
+        allowed = self.order(self.allowed(trials))
+        for trial in allowed:
+            if trial.name == ORIGINAL and trial.ms.value <= allowed[0].ms.high:
+                return trial
+        return allowed[0] if allowed else None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Tuned:
     """Result of a search.
 
-    trials : all candidates, best first. chosen : None if none is within the budgets. notes : remarks on the
-    choice.
+    trials : all candidates, best first. chosen : None if none is within the budgets.
     """
 
     recording: Recording
     look: Look
-    goal: Goal
     trials: list[Trial]
     chosen: Trial | None = None
-    notes: list[str] = field(default_factory=list[str])
+
+    def impossible(self) -> str:
+        """Message with the achievable time and error if no candidate is within the budgets."""
+        usable = [trial for trial in self.trials if trial.usable]
+        accurate = min(usable, key=lambda trial: trial.error.likely)
+        fastest = min(usable, key=lambda trial: trial.ms.value)
+        possible = (
+            f"{trial.error.likely:.3g} px in {trial.ms.value:.3g} ms ({trial.name})"
+            for trial in (accurate, fastest)
+        )
+        return f"no pipeline is within the budget. Possible: {', or '.join(possible)}"
 
 
 def search(
@@ -94,23 +104,11 @@ def search(
     say(f"{len(candidates)} candidates on {sum(case.frames for case in SIMULATED)} simulated frames")
     judge(candidates, [Fitted(look, case, folder, case.frames) for case in SIMULATED])
     mark_unsound(candidates)
-    _mark_unjudged_flow(candidates)
     _require_usable(candidates)
     say(f"the same on {recording.frames} frames of the recording")
     measure_on_recording(candidates, recording)
     _require_usable(candidates)
-    tuned = Tuned(recording, look, goal, goal.order(candidates))
-    tuned.chosen = _choose(tuned)
-    return tuned
-
-
-def _mark_unjudged_flow(trials: Sequence[Trial]) -> None:
-    """Mark trials with another mean flow as unsound where none could be compared with the truth."""
-    if any("flow" in trial.errors for trial in trials):
-        return
-    for trial in trials:
-        if trial.settings.keys() & FLOW and trial.usable:
-            trial.unsound = "its mean flow could not be judged: too few dots in the contact"
+    return Tuned(recording, look, goal.order(candidates), goal.choose(candidates))
 
 
 def _require_usable(trials: Sequence[Trial]) -> None:
@@ -122,31 +120,3 @@ def _require_usable(trials: Sequence[Trial]) -> None:
     raise SourceError(
         f"no pipeline works on the simulated sensor: {why}; see tactflow doctor, and tactflow detect"
     )
-
-
-def _choose(tuned: Tuned) -> Trial | None:
-    """The best trial likely to be within the budgets, else the best nominally within."""
-    limit = tuned.goal.error_limit(tuned.trials)
-    allowed = [trial for trial in tuned.trials if tuned.goal.allows(trial, limit)]
-    if tuned.goal.max_error is not None:
-        likely = [trial for trial in allowed if trial.error.likely <= limit]
-        if allowed and not likely:
-            tuned.notes.append("the budget lies within the interval of the chosen pipeline's error")
-        allowed = likely or allowed
-    # Keep the original unless the best is significantly faster.
-    for trial in allowed:
-        if trial.name == ORIGINAL and trial.ms.value <= allowed[0].ms.high:
-            return trial
-    return allowed[0] if allowed else None
-
-
-def impossible(tuned: Tuned) -> str:
-    """Message with the achievable time and error if no candidate is within the budgets."""
-    usable = [trial for trial in tuned.trials if trial.usable]
-    accurate = min(usable, key=lambda trial: trial.error.value)
-    fastest = min(usable, key=lambda trial: trial.ms.value)
-    possible = (
-        f"{trial.error.value:.3g} px in {trial.ms.value:.3g} ms ({trial.name})"
-        for trial in (accurate, fastest)
-    )
-    return f"no pipeline is within the budget. Possible: {', or '.join(possible)}"
