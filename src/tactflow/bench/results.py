@@ -86,10 +86,12 @@ class BenchResult:
         return [measurement for measurement in self.measured if measurement.group == group]
 
     def save(self, path: Path) -> None:
-        """Write everything as JSON."""
+        """Write everything as JSON, one measurement a line."""
         run = {name: value for name, value in asdict(self).items() if name != "measured"}
-        content = {"schema": SCHEMA, **run, "values": {m.key: m.values for m in self.measured}}
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        values = [f'"{m.key}": {json.dumps(m.values, allow_nan=False)}' for m in self.measured]
+        head = json.dumps({"schema": SCHEMA, **run}, allow_nan=False)
+        lines = ",\n".join(values)
+        path.write_text(f'{head[:-1]}, "values": {{\n{lines}\n}}}}\n', encoding="utf-8")
 
 
 def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
