@@ -2,21 +2,17 @@
 
 The pages are README.md, docs/*.md, CONTRIBUTING.md and CHANGELOG.md as they are. Here they are copied into
 one folder, with links to where the site has them, pages for the public names and for the gallery are added,
-and Sphinx makes the site, with warnings as errors. Building twice gives the same bytes.
+and Sphinx makes the site. Its warnings, such as that of a broken link, are errors.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import shutil
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Final
-from urllib.parse import unquote
-from zipfile import ZipFile, ZipInfo
 
 HERE: Final = Path(__file__).resolve().parent
 REPOSITORY: Final = HERE.parents[1]
@@ -107,58 +103,13 @@ def reference() -> str:
     return "\n".join(lines)
 
 
-class Page(HTMLParser):
-    """Collects the local links of a page and its anchors."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.links: set[str] = set()
-        self.anchors: set[str] = set()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:  # noqa: ARG002
-        """Note what the tag leads to and what it is called."""
-        for key, value in attrs:
-            if value and key in ("href", "src") and not re.match(r"\w+:|//", value):
-                self.links.add(value)
-            elif value and key == "id":
-                self.anchors.add(value)
-
-
-def broken_links(site: Path) -> list[str]:
-    """Local links of all pages that lead to no file or no anchor, as `PAGE: LINK`."""
-    pages = {}
-    for file in [file for file in site.rglob("*.html") if "_static" not in file.parts]:
-        pages[file] = Page()
-        pages[file].feed(file.read_text(encoding="utf-8"))
-    broken = []
-    for file, page in pages.items():
-        for link in sorted(page.links):
-            path, _, anchor = unquote(link).partition("#")
-            there = (file.parent / path.partition("?")[0]).resolve() if path else file
-            known = pages[there].anchors if there in pages else set()
-            if not there.exists() or (there in pages and anchor and anchor not in known):
-                broken.append(f"{file.relative_to(site)}: {link}")
-    return broken
-
-
-def without_dates(archive: Path) -> None:
-    """Write a zip file again with the first date of the format for all that it holds."""
-    with ZipFile(archive) as old:
-        contents = {name: old.read(name) for name in old.namelist()}
-    with ZipFile(archive, "w") as new:
-        for name, content in contents.items():
-            new.writestr(ZipInfo(name), content)
-
-
 def main() -> int:
-    """Build, and check the links; returns the exit code."""
+    """Build; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path, help="folder for the site; what is there is removed")
     out = parser.parse_args().out.resolve()
-    # Sphinx and matplotlib write this time, instead of the clock's, into what they make.
-    os.environ["SOURCE_DATE_EPOCH"] = "0"
     from sphinx.cmd.build import build_main
 
     shutil.rmtree(out, ignore_errors=True)
@@ -166,16 +117,7 @@ def main() -> int:
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     stage(work)
-    code = build_main(["--fail-on-warning", "--quiet", "-d", f"{work}/.doctrees", str(work), str(out)])
-    if code == 0:
-        (out / ".buildinfo").unlink(missing_ok=True)
-        (out / ".nojekyll").touch()
-        for archive in out.rglob("*.zip"):
-            without_dates(archive)
-        broken = broken_links(out)
-        print("\n".join([*broken, f"{out}: {len(broken)} broken links"]))
-        code = bool(broken)
-    return code
+    return build_main(["--fail-on-warning", "--quiet", "-d", f"{work}/.doctrees", str(work), str(out)])
 
 
 if __name__ == "__main__":
