@@ -6,7 +6,8 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,44 @@ def browser() -> Iterator[Any]:
     """One headless Chromium for all tests of a file."""
     with chromium.launched() as started:
         yield started
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Opens pages. A complaint in the console, a script error or a request to elsewhere fails the test.
+
+    everywhere : they may ask other ports of this machine. lost : they may lose the server. browser : another
+    one. options : of the browser's context.
+    """
+    complaints: list[str] = []
+    with ExitStack() as stack:
+
+        def open_(
+            url: str, *, everywhere: bool = False, lost: bool = False, browser: Any = browser, **options: Any
+        ) -> Any:
+            options = {"viewport": {"width": 1400, "height": 900}, "color_scheme": "dark"} | options
+            page = stack.enter_context(closing(browser.new_context(**options))).new_page()
+            page.set_default_timeout(chromium.PATIENCE)
+
+            def complain(message: Any) -> None:
+                # Chromium reports each attempt to reach a server that is gone.
+                expected = lost and "ERR_CONNECTION_REFUSED" in message.text
+                if message.type in ("error", "warning") and not expected:
+                    complaints.append(message.text)
+
+            def check_target(request: Any) -> None:
+                origin = "http://127.0.0.1:" if everywhere else url
+                if not request.url.startswith(origin):
+                    complaints.append(f"asked for {request.url}")
+
+            page.on("console", complain)
+            page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.on("request", check_target)
+            page.goto(url)
+            return page
+
+        yield open_
+    assert complaints == []
 
 
 @pytest.fixture

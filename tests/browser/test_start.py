@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -20,8 +17,8 @@ import yaml
 from tactflow import open_scene
 from tactflow.cli import start as start_command
 from tactflow.cli.main import main
-from tests.chromium import PATIENCE
 from tests.clock import until
+from tests.program import Program
 
 
 class Camera:
@@ -73,61 +70,6 @@ class Camera:
         self._server.server_close()
 
 
-class Start:
-    """`tactflow start` in a process of its own, in an empty folder."""
-
-    def __init__(self, folder: Path, *words: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "tactflow", "start", *words],
-            cwd=folder,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        self.errors: list[str] = []
-        self._told = threading.Condition()
-        self._heard = 0
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            with self._told:
-                self.errors.append(line)
-                self._told.notify_all()
-
-    def said(self, pattern: str) -> str:
-        """Wait for a further line that has a pattern; returns its first group, or all of it."""
-
-        def found() -> re.Match[str] | None:
-            while self._heard < len(self.errors):
-                self._heard += 1
-                if match := re.search(pattern, self.errors[self._heard - 1]):
-                    return match
-            return None
-
-        with self._told:
-            match = self._told.wait_for(found, PATIENCE / 1000)
-        assert match, "".join(self.errors)
-        return match[match.re.groups]
-
-    def type(self, text: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(text + "\n")
-        self.process.stdin.flush()
-
-    def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-        self._reader.join()
-        for stream in (self.process.stdin, self.process.stderr):
-            assert stream is not None
-            stream.close()
-
-
 @pytest.fixture
 def camera() -> Iterator[Callable[[str], Camera]]:
     """Makes simulated cameras."""
@@ -136,30 +78,10 @@ def camera() -> Iterator[Callable[[str], Camera]]:
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., Start]]:
-    """Runs `tactflow start`."""
+def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
+    """Runs `tactflow start` in an empty folder."""
     with ExitStack() as stack:
-        yield lambda *words: stack.enter_context(closing(Start(tmp_path, *words)))
-
-
-@pytest.fixture
-def page(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Opens the page; a script error fails the test."""
-    errors: list[str] = []
-    contexts: list[Any] = []
-
-    def open_page(url: str, **options: Any) -> Any:
-        contexts.append(browser.new_context(**({"viewport": {"width": 1400, "height": 900}} | options)))
-        opened = contexts[-1].new_page()
-        opened.set_default_timeout(PATIENCE)
-        opened.on("pageerror", lambda error: errors.append(str(error)))
-        opened.goto(url)
-        return opened
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert errors == []
+        yield lambda *words: stack.enter_context(closing(Program("start", *words, cwd=tmp_path)))
 
 
 def asked(page: Any, text: str) -> None:
@@ -174,11 +96,14 @@ def choose(page: Any, label: str) -> None:
 
 
 def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
-    camera: Callable[[str], Camera], start: Callable[..., Start], page: Callable[..., Any], tmp_path: Path
+    camera: Callable[[str], Camera],
+    start: Callable[..., Program],
+    open_page: Callable[..., Any],
+    tmp_path: Path,
 ) -> None:
     gel = camera("press")
     running = start(gel.address)
-    shown = page(running.said(r"on the page: (http\S+)"))
+    shown = open_page(running.said(r"on the page: (http\S+)"), lost=True)
     asked(shown, "Which sensor")
     choose(shown, "Another one, or unknown")
     asked(shown, "untouched")
@@ -195,7 +120,7 @@ def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
     shown.wait_for_function("() => document.body.dataset.asks === 'false'")
     shown.wait_for_function("() => document.getElementById('value-area').textContent !== '–'")
     running.process.send_signal(signal.SIGINT)
-    assert running.process.wait(PATIENCE / 1000) == 0, "".join(running.errors)
+    assert running.exit_code() == 0, "".join(running.errors)
     assert not [line for line in running.errors if "the server failed" in line]
     pipeline = yaml.safe_load(written.read_text())
     assert pipeline["stages"]["capture"]["source"] == gel.address
@@ -204,7 +129,7 @@ def test_a_sensor_is_set_up_on_the_page_and_goes_on_live(
 
 
 def test_a_touch_at_rest_is_noticed_and_the_terminal_answers_as_the_page_does(
-    camera: Callable[[str], Camera], start: Callable[..., Start], tmp_path: Path
+    camera: Callable[[str], Camera], start: Callable[..., Program], tmp_path: Path
 ) -> None:
     gel = camera("press")
     running = start(gel.address, "--no-run")
@@ -232,7 +157,7 @@ def test_a_touch_at_rest_is_noticed_and_the_terminal_answers_as_the_page_does(
     gel.pressed.clear()
     running.said("Leave the gel untouched")
     running.process.send_signal(signal.SIGINT)
-    assert running.process.wait(PATIENCE / 1000) == 130
+    assert running.exit_code() == 130
     running.said("stopped; nothing was written")
     assert list(tmp_path.iterdir()) == []
 

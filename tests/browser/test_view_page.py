@@ -11,11 +11,10 @@ import os
 import re
 import signal
 import struct
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from tactflow.message.result import Result
 from tactflow.view.compact import encode_packet
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers
 from tests.chromium import CHROMIUM, FLAGS, PATIENCE
+from tests.program import Program
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGE = REPOSITORY / "src" / "tactflow" / "view" / "page"
@@ -43,66 +43,25 @@ DRAWN = """() => ['area', 'angle', 'flow'].every(
 """A contact, its direction and its flow are shown."""
 
 
-class Run:
+class Run(Program):
     """A run in a process of its own, and the address of its page."""
 
-    def __init__(self, *options: str, cwd: Path = REPOSITORY, port: int = 0, pipeline: str = "pipeline.yaml"):
+    def __init__(self, *options: str, cwd: Path = REPOSITORY, port: int = 0) -> None:
         shipped = ("--set", "sinks.zmq=null", "--set", "sinks.jsonl=null") if cwd == REPOSITORY else ()
-        self.process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "tactflow", "run", pipeline, *shipped),
-                *("--set", f"sinks.view={{use: view, port: {port}, max_fps: 10}}", *options),
-            ],
-            cwd=cwd,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        self.errors: list[str] = []
-        self.url = ""
-        told = threading.Event()
-
-        def read() -> None:
-            assert self.process.stderr is not None
-            for line in self.process.stderr:
-                self.errors.append(line)
-                if found := re.search(r"view: (http://\S+)", line):
-                    self.url = found[1]
-                    told.set()
-            told.set()
-
-        self._reader = threading.Thread(target=read)
-        self._reader.start()
-        assert told.wait(PATIENCE / 1000)
-        assert self.url, "".join(self.errors)
+        view = ("--set", f"sinks.view={{use: view, port: {port}, max_fps: 10}}")
+        super().__init__("run", "pipeline.yaml", *shipped, *view, *options, cwd=cwd)
+        self.url = self.said(r"view: (http://\S+)")
 
     @property
     def port(self) -> int:
         return int(self.url.rstrip("/").rpartition(":")[2])
 
-    def exit_code(self) -> int:
-        return self.process.wait(PATIENCE / 1000)
-
-    def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-        self._reader.join()
-        assert self.process.stderr is not None
-        self.process.stderr.close()
-
 
 @pytest.fixture
 def run() -> Iterator[Callable[..., Run]]:
     """Starts runs; what is left of them is ended after the test."""
-    runs: list[Run] = []
-
-    def start(*options: str, **keywords: Any) -> Run:
-        runs.append(Run(*options, **keywords))
-        return runs[-1]
-
-    yield start
-    for started in runs:
-        started.close()
+    with ExitStack() as stack:
+        yield lambda *words, **options: stack.enter_context(closing(Run(*words, **options)))
 
 
 @pytest.fixture(scope="module")
@@ -121,45 +80,6 @@ def browser_without_webgl(browser: Any) -> Iterator[Any]:
     )
     yield flat
     flat.close()
-
-
-@pytest.fixture
-def open_page(browser: Any, request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
-    """Opens pages. A complaint in the console, a script error or a request to elsewhere fails the test."""
-    contexts: list[Any] = []
-    complaints: list[str] = []
-
-    def open_(
-        url: str, *, everywhere: bool = False, lost: bool = False, webgl: bool = True, **options: Any
-    ) -> Any:
-        options = {"viewport": {"width": 1400, "height": 900}, "color_scheme": "dark"} | options
-        opened = browser if webgl else request.getfixturevalue("browser_without_webgl")
-        context = opened.new_context(**options)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(PATIENCE)
-
-        def complain(message: Any) -> None:
-            # Attempts to reach a run that is gone are the page's business, and Chromium reports each.
-            expected = lost and "ERR_CONNECTION_REFUSED" in message.text
-            if message.type in ("error", "warning") and not expected:
-                complaints.append(message.text)
-
-        def check_target(request: Any) -> None:
-            origin = "http://127.0.0.1:" if everywhere else url
-            if not request.url.startswith(origin):
-                complaints.append(f"asked for {request.url}")
-
-        page.on("console", complain)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", check_target)
-        page.goto(url)
-        return page
-
-    yield open_
-    for context in contexts:
-        context.close()
-    assert complaints == []
 
 
 @pytest.fixture(scope="module")
@@ -357,15 +277,8 @@ class Stage:
 @pytest.fixture
 def staged() -> Iterator[Callable[..., Stage]]:
     """Opens servers of the test's own."""
-    stages: list[Stage] = []
-
-    def open_(*greet: str | bytes) -> Stage:
-        stages.append(Stage(*greet))
-        return stages[-1]
-
-    yield open_
-    for stage in stages:
-        stage.close()
+    with ExitStack() as stack:
+        yield lambda *greet: stack.enter_context(closing(Stage(*greet)))
 
 
 def frame(sensor: str, number: int, colour: int, *, contact: bool = False, directed: bool = False) -> bytes:
@@ -568,10 +481,14 @@ def middle(png: bytes) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize("webgl", [True, False], ids=["webgl", "no webgl"])
 def test_the_surface_is_shaded_and_can_be_turned_where_there_is_webgl(
-    webgl: bool, staged: Callable[..., Stage], open_page: Callable[..., Any]
+    webgl: bool,
+    staged: Callable[..., Stage],
+    open_page: Callable[..., Any],
+    request: pytest.FixtureRequest,
 ) -> None:
     stage = staged(hello("main"), state("main"), calibrated(1))
-    page = open_page(stage.url, webgl=webgl)
+    name = "browser" if webgl else "browser_without_webgl"
+    page = open_page(stage.url, browser=request.getfixturevalue(name))
     watch(page)
     until(page, "() => !document.getElementById('layer-surface').hidden")
     assert page.is_hidden("#surface")

@@ -28,9 +28,6 @@ log = logging.getLogger("tactflow")
 STATS_SECONDS = 0.5
 """Interval at which pages receive the statistics of the run, s."""
 
-REST_MS = 250
-"""Longest pause that a page on a busy machine may request before its next frame, ms."""
-
 ON_DEMAND = frozenset({"field", "surface"})
 """Layers sent only to pages that show them."""
 
@@ -303,14 +300,6 @@ class Hub:
         # A hidden page draws when it becomes visible again, which does not count as latency.
         if message.get("late") is not True and page.captured > 0:
             page.screen_s.append(time.perf_counter() - page.captured)
-        rest = message.get("rest")
-        # On a busy machine shared with the browser, leave half of the time to the pipeline.
-        if isinstance(rest, int) and rest > 0:
-            asyncio.get_running_loop().call_later(min(rest, REST_MS) / 1000, self._ready, page)
-        else:
-            self._ready(page)
-
-    def _ready(self, page: Page) -> None:
         page.credit = True
         self._recount()
         page.wake.set()

@@ -28,7 +28,6 @@ SENSOR: Final = "setup"
 """Name of the tab of the page."""
 SHOW_SECONDS: Final = 1 / 30
 """Shortest interval between frames on the page, s."""
-EDGES: Final = ("top", "right", "bottom", "left")
 
 Choices = Mapping[str, str]
 """Answer -> its label; the first is the proposal."""
@@ -91,20 +90,14 @@ class Questions:
         if self._server is not None:
             self._server.close()
 
-    def begin(
-        self, text: str, choices: Choices | None = None, *, notes: Sequence[str] = (), edges: bool = False
-    ) -> None:
-        """Ask. notes : lines above. edges : the choices are edges of the picture, clockwise from the top."""
+    def begin(self, text: str, choices: Choices | None = None, *, notes: Sequence[str] = ()) -> None:
+        """Ask. notes : lines above."""
         self._choices = choices or {}
-        places = EDGES if edges else (None,) * len(self._choices)
         self._state = {
             "now": text,
             "number": self._state["number"] + 1,
             "notes": "\n".join(notes),
-            "choices": [
-                {"value": value, "label": label, "at": place}
-                for (value, label), place in zip(self._choices.items(), places, strict=True)
-            ],
+            "choices": [{"value": value, "label": label} for value, label in self._choices.items()],
         }
         numbered = [f"{number} {label}" for number, label in enumerate(self._choices.values(), 1)]
         self._say("\n".join([*notes, text, *([] if self.unattended else numbered)]))
@@ -133,15 +126,7 @@ class Questions:
             self._say(f"required a number from 1 to {len(answers)}; Enter is 1")
         return answer
 
-    def ask(
-        self,
-        text: str,
-        choices: Choices,
-        *,
-        notes: Sequence[str] = (),
-        edges: bool = False,
-        still: bool = False,
-    ) -> str:
+    def ask(self, text: str, choices: Choices, *, notes: Sequence[str] = (), still: bool = False) -> str:
         """Ask, and show frames until there is an answer. still : show the last picture instead.
 
         Raises
@@ -151,7 +136,7 @@ class Questions:
         """
         if self.unattended:
             return next(iter(choices))
-        self.begin(text, choices, notes=notes, edges=edges)
+        self.begin(text, choices, notes=notes)
         while (answer := self.poll()) is None:
             if still or self.reader is None:
                 time.sleep(SHOW_SECONDS)

@@ -156,22 +156,19 @@ function drawGuide(guide) {
   else drawPresses(guide);
 }
 
-// A question of `tactflow start`. An edge of the picture is chosen at the picture.
+// A question of `tactflow start`.
 function drawQuestion({ number, now, notes, choices }) {
   if (asked === number) return;
   asked = number;
   set("guide-title", "Set up");
   set("guide-now", now);
   set("guide-last", notes);
-  const buttons = choices.map(({ value, label, at }) => {
+  $("choices").replaceChildren(...choices.map(({ value, label }) => {
     const button = document.createElement("button");
     Object.assign(button, { type: "button", textContent: label });
-    if (at) button.dataset.at = at;
     button.addEventListener("click", () => command("answer", [number, value]));
     return button;
-  });
-  $("edges").replaceChildren(...buttons.filter((button) => button.dataset.at));
-  $("choices").replaceChildren(...buttons.filter((button) => !button.dataset.at));
+  }));
 }
 
 function drawPresses(guide) {

@@ -8,7 +8,6 @@ import { Picture } from "./picture.js";
 import { Plot, SECONDS } from "./plot.js";
 import { Surface } from "./surface.js";
 
-const BUSY_MS = 20;  // a frame that took longer is followed by a pause: the machine is busy
 const NEWS_MS = 200;  // interval between updates of all but the picture
 
 let connection = null;
@@ -141,9 +140,7 @@ async function frame(header, blob, heights) {
   }
   addFrame(s, header, heights);
   // The run sends the next frame after this: a slow page gets fewer frames instead of old ones.
-  const busy = performance.now() - received;
-  const late = hiddenSince > received;
-  connection.send({ ack: header.number, late, rest: late || busy < BUSY_MS ? 0 : Math.round(busy) });
+  connection.send({ ack: header.number, late: hiddenSince > received });
 }
 
 function addFrame(s, header, heights) {
