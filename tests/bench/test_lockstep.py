@@ -59,20 +59,6 @@ def recorded(pipeline: Pipeline, tmp_path: Path, *levels: int) -> Pipeline:
     return on_recording(pipeline, path)
 
 
-def test_a_block_is_so_many_frames_and_the_last_one_is_what_is_left(
-    pipeline: Pipeline, tmp_path: Path
-) -> None:
-    lockstep = LockstepPipeline(recorded(pipeline, tmp_path, 0, 10, 20, 30, 40))
-    blocks = [lockstep.block(2) for _ in range(5)]
-    lockstep.close()
-    assert [[r.seq for r in results] for results in blocks] == [[0, 1], [2, 3], [4], [], []]
-    results = [result for block in blocks for result in block]
-    assert [r.frame.reference for r in results] == [True, False, False, False, False]
-    assert [r.contact.area if r.contact else None for r in results] == [None, 10, 20, 30, 40]
-    assert all(r.mapping is None for r in results)
-    assert not (tmp_path / "never_written.jsonl").exists()
-
-
 @pytest.mark.usefixtures("pipeline")
 def test_a_frames_time_is_its_own(tmp_path: Path) -> None:
     slow = load_pipeline(tmp_path / "pipeline.yaml", ["stages.mean.use=./stages.py:Works"])

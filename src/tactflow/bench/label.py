@@ -226,7 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add, which = parser.add_argument, parser.add_mutually_exclusive_group().add_argument
     add("recordings", nargs="+", metavar="RECORDING", help="a folder of pictures, a video, ...")
     add("--labels", type=Path, required=True, metavar="FILE", help="JSON file to read and write")
-    which("--every", type=positive, default=10, metavar="N", help="one frame of so many (default: 10)")
+    which("--every", type=positive, default=10, metavar="N", help="every Nth frame (default: 10)")
     which("--frames", metavar="A,B,...", help="these: names of pictures without suffix, or indices from 0")
     add("--reference", metavar="FRAME", help="the untouched gel, as in --frames (default: the first frame)")
     add("--dots", action="store_true", help="clicks mark dots instead of outlines")

@@ -60,7 +60,7 @@ class LockstepPipeline:
         self._thread.start()
 
     def block(self, frames: int = BLOCK) -> list[TimedResult]:
-        """Run so many more frames without a pause between them, and return their results.
+        """Run a number of further frames without a pause between them, and return their results.
 
         Returns fewer where the recording ends or the pipeline fails; the call after that returns none.
 

@@ -1,7 +1,8 @@
-"""The result as sections of text and tables."""
+"""The result as sections of text and tables, in Markdown."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from statistics import median
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from tactflow.bench.pipelines import CLASSIC, PIPELINE
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import TIMES, BenchResult, Measurement
-from tactflow.report import Section, Table
+from tactflow.system.terminal import markdown
 
 TITLES = {
     PIPELINE: "Whole pipelines",
@@ -50,7 +51,7 @@ SCENE_COLUMNS = {
 """Heading -> quantities, for the table of scenes."""
 
 
-def sections(result: BenchResult) -> list[Section]:
+def lines(result: BenchResult) -> Iterator[str]:
     """Everything that was measured, from the summary to single scenes."""
     machine = ", ".join(f"{key} {value}" for key, value in result.machine.items())
     kind = "quick" if result.quick else "full"
@@ -58,16 +59,16 @@ def sections(result: BenchResult) -> list[Section]:
         f"A {kind} run of {result.wall_s:.0f} s on {machine}. Times are CPU times of a frame in one thread, "
         f"medians; one copy of a raw frame of 800 x 600 px took {result.copy_ms:.3f} ms."
     )
-    groups = dict.fromkeys(m.group for m in result.measured)
-    found = [Section("Machine", summary), *(_methods(result, group) for group in groups)]
-    found.append(_scenes(result))
+    yield from markdown("Machine", summary)
+    for group in dict.fromkeys(m.group for m in result.measured):
+        yield from _methods(result, group)
+    yield from _scenes(result)
     if result.failures:
         rows = [[key, why.partition("\n")[0]] for key, why in result.failures.items()]
-        found.append(Section("Failures", tables=[Table(["group/method/scene", "why"], rows)]))
-    return found
+        yield from markdown("Failures", "", ["group/method/scene", "why"], rows)
 
 
-def _methods(result: BenchResult, group: str) -> Section:
+def _methods(result: BenchResult, group: str) -> Iterator[str]:
     """One row per method of a group."""
     measured = result.measurements(group)
     quantities = [QUANTITIES[key] for key in PRIMARY.get(group, ())]
@@ -85,15 +86,15 @@ def _methods(result: BenchResult, group: str) -> Section:
             row.append(f"{_number(median(errors))} ({_number(worst)})" if errors else "-")
         rows.append(row)
     text = "Median over the scenes, in brackets the worst one."
-    return Section(TITLES.get(group, group), text, tables=[Table(heads, rows)])
+    return markdown(TITLES.get(group, group), text, heads, rows)
 
 
-def _scenes(result: BenchResult) -> Section:
+def _scenes(result: BenchResult) -> Iterator[str]:
     """One row for each pipeline on each simulated scene."""
     rows = [[m.scene, m.method, *_cells(m, SCENE_COLUMNS)] for m in result.measurements(PIPELINE)]
     text = f"Time of a frame with contact, and mean errors. `{CLASSIC}` is the original script."
-    table = Table(["scene", "pipeline", "ms", *SCENE_COLUMNS], rows)
-    return Section("Whole pipelines, scene by scene", text, tables=[table])
+    columns = ["scene", "pipeline", "ms", *SCENE_COLUMNS]
+    return markdown("Whole pipelines, scene by scene", text, columns, rows)
 
 
 def _cells(measurement: Measurement, columns: dict[str, tuple[str, ...]]) -> list[str]:

@@ -14,7 +14,7 @@ ROUND: Final = 1.7
 """Longer over shorter axis of a contact above which it is not a ball's. Chosen by hand: presses of a ball on
 a real gel (mini_ball) reach 1.57."""
 PARTS: Final = 3
-"""The gel is divided into so many columns and rows of parts, each of which needs presses. Chosen by hand."""
+"""Columns and rows of parts into which the gel is divided; each part needs presses. Chosen by hand."""
 _ROWS: Final = ("upper", "middle", "lower")
 _COLUMNS: Final = ("left", "centre", "right")
 _FIRST: Final = ((1, 1), (0, 0), (2, 2), (0, 2), (2, 0), (0, 1), (2, 1), (1, 0), (1, 2))

@@ -8,11 +8,10 @@ from pathlib import Path
 from tactflow.bench.pipelines import CLASSIC
 from tactflow.bench.results import load_errors, regressions
 from tactflow.bench.run import DEFAULT, MARKERLESS, run_bench
-from tactflow.bench.tables import sections
+from tactflow.bench.tables import lines
 from tactflow.cli.options import refuse_output, writing
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
-from tactflow.report import markdown
 from tactflow.system.terminal import notes, progress_bar, say, show
 
 WORSE = 3
@@ -62,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
             scenes=scenes,
             progress=lambda what, n, total: update(description=what, completed=n, total=total),
         )
-    show(markdown(sections(result)))
+    show(lines(result))
     with writing(args.json):
         args.json.parent.mkdir(parents=True, exist_ok=True)
         result.save(args.json)

@@ -63,6 +63,33 @@ def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
 
 
+def markdown(
+    title: str, text: str = "", columns: Sequence[str] = (), rows: Sequence[Sequence[object]] = ()
+) -> Iterator[str]:
+    """Lines of a section in Markdown: a heading, a text and a table with aligned columns.
+
+    >>> print(*markdown("Times", "CPU", ["method", "ms"], [["fast", 1.25], ["exact", 31]]), sep="\\n")
+    ### Times
+    <BLANKLINE>
+    CPU
+    <BLANKLINE>
+    | method | ms   |
+    | ------ | ---- |
+    | fast   | 1.25 |
+    | exact  | 31   |
+    <BLANKLINE>
+    """
+    yield from (f"### {title}", "", *([*text.splitlines(), ""] if text else []))
+    if columns:
+        cells = [
+            [str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in (columns, *rows)
+        ]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        cells.insert(1, ["-" * width for width in widths])
+        yield from (f"| {' | '.join(map(str.ljust, row, widths))} |" for row in cells)
+        yield ""
+
+
 @contextmanager
 def notes(level: str = "INFO") -> Iterator[None]:
     """Show the notes of tactflow from this level on, on standard error, while the block lasts."""

@@ -67,7 +67,7 @@ class Kept:
         changes = [change for change, _ in self._window]
         change = change_between(self._first[0], image)
         if len(changes) == room:
-            # The strongest press comes to lie in the middle, and stays there.
+            # Once the strongest press has reached the middle, it stays there.
             if change <= max(changes) and int(np.argmax(changes)) <= room // 2:
                 return
             self._window.popleft()

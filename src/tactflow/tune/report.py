@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from tactflow.engine.errors import ConfigError
-from tactflow.report import Section, Table, markdown
+from tactflow.system.terminal import markdown
 from tactflow.tune.measure import CHECKS, ERRORS, Interval
 from tactflow.tune.search import Tuned
 
@@ -29,15 +29,11 @@ def lines(tuned: Tuned) -> Iterator[str]:
     columns = ["", "pipeline", "time, ms", *(f"{kind}, px" for kind in kinds), "remarks"]
     legend = "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds)
     legend = f"In brackets: 90 % intervals. {legend}"
-    parts = [
-        Section("How", "\n\n".join(facts)),
-        Section("Time and error", legend, tables=[Table(columns, rows)]),
-    ]
+    yield from markdown("How", "\n\n".join(facts))
+    yield from markdown("Time and error", legend, columns, rows)
     if tuned.chosen is not None:
         checks = [[CHECKS[name], f"{value:.3g}"] for name, value in tuned.chosen.checks.items()]
-        table = Table(["check", "value"], checks)
-        parts.append(Section("The chosen pipeline on the recording", tables=[table]))
-    return markdown(parts)
+        yield from markdown("The chosen pipeline on the recording", "", ["check", "value"], checks)
 
 
 def _cell(interval: Interval | None, digits: int) -> str:
