@@ -1,10 +1,8 @@
 """Create the pictures of README.md and view.md: results.jpg, view-dark.jpg, view-phone.jpg.
 
-    python docs/pictures.py
-
-Calibrates the simulated sensor, draws its results, and takes screenshots of the live page in Chromium. It
-needs the packages of the browser tests, and an idle machine because the page shows latency. It takes two
-minutes.
+It calibrates the simulated sensor, draws its results with the stage `visualize`, and takes screenshots of the
+live page in Chromium. It needs the packages of the browser tests, and an idle machine because the page shows
+latency. It takes two minutes.
 """
 
 from __future__ import annotations
