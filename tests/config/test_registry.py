@@ -98,18 +98,6 @@ def test_a_plug_in_that_cannot_be_imported_is_reported_with_its_line(
         resolve("edges", "stages", tmp_path)
 
 
-def test_a_loose_file_is_relative_to_the_pipeline_not_to_the_current_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "mine" / "edges.py").write_text(STAGE.format(name="Edges"))
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    component = resolve("./edges.py:Edges", "stages", tmp_path / "mine")
-    assert component.cls.__name__ == "Edges"
-    assert component.name == "./edges.py:Edges"
-
-
 def test_a_loose_file_is_taken_from_the_first_folder_that_has_it(tmp_path: Path) -> None:
     for folder, name in (("a", "First"), ("b", "Second")):
         (tmp_path / folder).mkdir()

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from tactflow.engine.conformance import build, component
-from tactflow.engine.contract import Recorder, Sink, Source, Stage, StageParams
+from tactflow.engine.contract import Sink, Source, Stage, StageParams
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.frame import Frame
 from tactflow.ports import Image
 
 
@@ -19,15 +17,6 @@ class Good(Stage):
 
     def process(self, image: Image) -> Image:
         return image
-
-
-class GoodSink(Sink):
-    def write(self, image: Image) -> None: ...
-
-
-class GoodSource(Source):
-    def frames(self) -> Iterator[Frame]:
-        yield from ()
 
 
 class TakenKey(StageParams):
@@ -43,19 +32,6 @@ def wrong(base: type[Any], **changes: Any) -> str:
     with pytest.raises(ConfigError) as caught:
         component(type("Changed", (base,), changes), "changed", "a test", {"when"})
     return str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("cls", "kind"),
-    [
-        (Good, "stage"),
-        (GoodSink, "sink"),
-        (GoodSource, "source"),
-        (type("R", (Recorder, GoodSink), {}), "sink"),
-    ],
-)
-def test_a_class_is_of_the_kind_that_it_inherits_from(cls: type, kind: str) -> None:
-    assert component(cls, "it", "a test", ()).kind == kind
 
 
 @pytest.mark.parametrize(

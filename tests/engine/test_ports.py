@@ -16,7 +16,6 @@ from tactflow.engine.ports import (
     Port,
     ResultParameter,
     SignalPort,
-    describe_type,
     mismatch,
     port_type,
     read_ports,
@@ -217,16 +216,3 @@ def test_annotations_that_break_the_contract_are_reported_with_their_line(
 )
 def test_an_output_fits_an_input_or_says_why_not(given: Any, wanted: Any, reason: str | None) -> None:
     assert mismatch(Port("given", given), Port("wanted", wanted)) == reason
-
-
-@pytest.mark.parametrize(
-    ("annotation", "words"),
-    [
-        (Image, "(H, W, 3) uint8, grey levels, BGR"),
-        (Touching, "signal"),
-        (Contact, "Contact"),
-        (list[int], "list[int]"),
-    ],
-)
-def test_a_type_is_described_in_words(annotation: Any, words: str) -> None:
-    assert describe_type(annotation) == words
