@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Point, PolygonStamped, PoseStamped, Vector3Stamped, WrenchStamped
+from geometry_msgs.msg import PolygonStamped, PoseStamped, Vector3Stamped, WrenchStamped
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
@@ -42,7 +42,6 @@ TOPICS = {
     "object_pose": PoseStamped,
     "depth": Image,
     "image/compressed": CompressedImage,
-    "/tactile": Point,
     "/diagnostics": DiagnosticArray,
     "/clock": Clock,
     "/hold/width": Float64,

@@ -58,7 +58,6 @@ class Pair:
             "endpoint": self.sink.endpoint,
             "control": self.control,
             "frame_id": "gel",
-            "tactile": "true",
             "publish_clock": "true",
             "use_sim_time": "true",
             "timeout": "0.5",
@@ -181,8 +180,6 @@ def test_touch_slip_force_depth_and_picture_arrive(pair: Pair) -> None:
     pose = pair.receive("object_pose")["pose"]
     assert list(pose["position"].values()) == pytest.approx([1.5e-3, 2e-3, -0.25e-3])
     assert list(pose["orientation"].values()) == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
-    tactile = pair.receive("/tactile")
-    assert (tactile["x"], tactile["y"], tactile["z"]) == (1.5, -2.0, -0.577)
     depth = pair.receive("depth")
     assert (depth["width"], depth["height"], depth["encoding"]) == (60, 40, "32FC1")
     metres = np.frombuffer(bytes(depth["data"]), np.float32).reshape(40, 60)

@@ -15,7 +15,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, PolygonStamped, PoseStamped, Vector3Stamped, WrenchStamped
+from geometry_msgs.msg import PolygonStamped, PoseStamped, Vector3Stamped, WrenchStamped
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock as Steady
 from rclpy.clock import ClockType
@@ -50,7 +50,6 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "object_frame": ("", "frame of the object on /tf, a child of frame_id; empty for no transform"),
     "reliability": ("best_effort", "of the topics: best_effort or reliable"),
     "timeout": (2.0, "time without a message before /diagnostics reports it, s"),
-    "tactile": (False, "also publish /tactile: mean flow x, y in pixels, and slope"),
     "publish_clock": (False, "also publish /clock, from the capture times of a recording"),
     "autostart": (True, "configure and activate automatically"),
 }
@@ -216,8 +215,6 @@ class Bridge(LifecycleNode):
             kinds |= {name: kind, f"{name}_pixels": kind}
         for name, kind in kinds.items():
             self._topics[name] = self._publisher(kind, f"~/{name}", qos)
-        if self.value("tactile"):
-            self._topics["/tactile"] = self._publisher(Point, "/tactile", qos)
         if self.value("publish_clock"):
             self._topics["/clock"] = self._publisher(Clock, "/clock", qos)
         if self.value("object_frame"):
@@ -262,7 +259,6 @@ class Bridge(LifecycleNode):
         self._offer("wrench", lambda: messages.wrench(message, head))
         self._offer("object_pose", lambda: messages.object_pose(message, head))
         self._offer("/tf", lambda: self._object_transform(message, head))
-        self._offer("/tactile", lambda: messages.tactile(message))
 
     def _object_transform(self, message: messages.Message, head: Any) -> Any:
         place = messages.object_transform(message, head, self.value("object_frame"))

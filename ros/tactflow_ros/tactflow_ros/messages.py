@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
-    Point,
     Point32,
     PolygonStamped,
     PoseStamped,
@@ -210,15 +209,6 @@ def wrench(message: Message, head: Header) -> WrenchStamped | None:
     # Pressing is negative because z points out of the gel.
     result.wrench.force.x, result.wrench.force.y, result.wrench.force.z = x, y, -pressed
     return result
-
-
-def tactile(message: Message) -> Point | None:
-    """The original script's message: mean flow x, y, px, and slope; None without a slope."""
-    contact, mean = message["contact"], message["flow"] and message["flow"]["mean"]
-    if contact is None or contact["slope"] is None:
-        return None
-    x, y = mean or (0.0, 0.0)
-    return Point(x=float(x), y=float(y), z=float(contact["slope"]))
 
 
 def picture(message: Message, data: bytes, frame_id: str) -> CompressedImage:
