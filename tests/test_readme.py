@@ -68,7 +68,7 @@ def test_every_command_and_stage_that_the_pages_name_is_there(capsys: pytest.Cap
     capsys.readouterr()
     assert main(["stages"]) == 0
     listed = capsys.readouterr().out
-    assert {"capture", "hull", "slip"} <= stages
+    assert {"capture", "hull", "hold"} <= stages
     for stage in stages:
         assert stage in listed
 

@@ -54,3 +54,6 @@ Changed = Annotated[bool, SignalPort("changed", closed="unchanged", otherwise="r
 
 Suspect = Annotated[bool, SignalPort("suspect", closed="at_rest", otherwise="repeat")]
 """True when the contact may differ from that in the last fully processed frame."""
+
+Held = Annotated[bool, SignalPort("held", closed=None)]
+"""Another signal, extended in time."""

@@ -127,6 +127,17 @@ def test_when_makes_gates(text: str, expected: list[Gate], load: Load) -> None:
     assert list(load(BODY, f"stages.outline.when={text}").nodes["outline"].gates) == expected
 
 
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_gate_on_a_held_signal_means_what_the_signal_itself_means(times: int, load: Load) -> None:
+    text = BODY
+    for count in range(times):
+        giver = f"held_{count - 1}.held" if count else "compare.touching"
+        held = f"  held_{count}: {{use: hold, hold: 3, in: {{signal: {giver}}}}}\n"
+        text = text.replace("  outline:", f"{held}  outline:")
+    gates = load(text, "stages.outline.when=held").nodes["outline"].gates
+    assert list(gates) == [Gate(Ref(f"held_{times - 1}", "held"), "no_contact")]
+
+
 @pytest.mark.parametrize(
     ("override", "attribute", "expected"),
     [

@@ -19,8 +19,6 @@ from tests.clock import PATIENCE, until
 MakeRunner = Callable[..., Runner]
 
 REPEAT = {"signal": "pulse.active", "otherwise": "repeat"}
-LONGER: dict[str, Any] = {"longer": {"use": "Longer", "in": {"active": "pulse.active"}}}
-"""A stateful stage that gives a signal."""
 
 
 def rows(runner: Runner, sink: str = "out") -> list[Any]:
@@ -68,7 +66,9 @@ def test_an_observer_never_changes_values(toy_runner: MakeRunner, extra: str, sk
         "rated": {"use": "ThreadedCollect", "max_rate": 7},
         "small": {"use": "OnlyLevel"},
     }
-    gates = LONGER | {"gated": {"when": {"signal": "longer.active", "otherwise": "repeat"}}}
+    gates = held(hold=1, at_least_every=5) | {
+        "gated": {"when": {"signal": "keep.held", "otherwise": "repeat"}}
+    }
     alone = toy_runner(gates, {"out": sinks["out"]}, skipping=skipping)
     ran(alone)
     others = [name for name in sinks if name not in ("out", extra)]
@@ -80,6 +80,11 @@ def test_an_observer_never_changes_values(toy_runner: MakeRunner, extra: str, sk
             assert rows(runner) == rows(alone)
             for name in {"far", "lazy", "rated"} & set(chosen):
                 assert set(map(str, rows(runner, name))) <= set(map(str, rows(alone)))
+
+
+def held(**params: int) -> dict[str, dict[str, Any]]:
+    """A stage that holds the signal of the toy graph."""
+    return {"keep": {"use": "Hold", "in": {"signal": "pulse.active"}, **params}}
 
 
 SEGMENTS: dict[str, dict[str, dict[str, Any]]] = {
@@ -95,18 +100,18 @@ SEGMENTS: dict[str, dict[str, dict[str, Any]]] = {
 
 @pytest.mark.parametrize("cut", SEGMENTS)
 @pytest.mark.parametrize("otherwise", ["absent", "repeat"])
-@pytest.mark.parametrize("longer", [False, True])
+@pytest.mark.parametrize("hold", [{}, {"hold": 2}, {"at_least_every": 3}])
 def test_how_a_graph_is_cut_into_segments_changes_no_value(
-    toy_runner: MakeRunner, cut: str, longer: bool, otherwise: str
+    toy_runner: MakeRunner, cut: str, hold: dict[str, int], otherwise: str
 ) -> None:
-    gate = {"signal": "longer.active" if longer else "pulse.active", "otherwise": otherwise}
-    stages: dict[str, Any] = {"gated": {"when": gate}, **(LONGER if longer else {})}
+    gate = {"signal": "keep.held" if hold else "active", "otherwise": otherwise}
+    stages: dict[str, Any] = {"gated": {"when": gate}, **(held(**hold) if hold else {})}
     default = toy_runner(stages)
     ran(default)
     for name, body in SEGMENTS[cut].items():
         stages[name] = {**stages.get(name, {}), **body}
-    if longer and cut == "one":
-        stages["longer"] = stages["longer"] | {"segment": "capture"}
+    if hold and cut == "one":
+        stages["keep"]["segment"] = "capture"
     runner = toy_runner(stages)
     ran(runner)
     assert rows(runner) == rows(default)

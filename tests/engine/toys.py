@@ -15,6 +15,7 @@ from tactflow.engine import contract
 from tactflow.engine.contract import Sink, Stage, StageParams
 from tactflow.engine.frame import Absent, Frame, Tick
 from tactflow.engine.ports import ArrayPort, SignalPort
+from tactflow.stages.hold import Hold as Hold
 
 Grid = Annotated[NDArray[np.uint8], ArrayPort("grid", ("H", "W"), "uint8", "1")]
 Active = Annotated[bool, SignalPort("active", closed="idle")]
@@ -140,17 +141,6 @@ class Even(Counted, Stage):
     def process(self, frame: Frame) -> ActivePorts:
         self.saw(frame.seq)
         return ActivePorts(frame.seq % 2 == 0)
-
-
-class Longer(Counted, Stage):
-    """True for one frame more than its input."""
-
-    memory = "stateful"
-    before = False
-
-    def process(self, active: Active) -> ActivePorts:
-        longer, self.before = active or self.before, active
-        return ActivePorts(longer)
 
 
 class HeavyPorts(NamedTuple):

@@ -247,7 +247,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
         # A source of the command line that cannot be opened is not an error in the file.
         mark = origin
     gates = [
-        Gate(ref, gate.reason or signal.closed, gate.otherwise or signal.otherwise)
+        Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
         for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
     ]
     marked = {"segment", "queue"} & document.mapping(*draft.keys).keys()

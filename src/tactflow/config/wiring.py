@@ -237,5 +237,15 @@ class _Wiring:
             needed = "a gate takes a signal (a bool port such as touching)"
             self._document.report(place, f"{needed}, but {ref} ({producer.mark}) gives {kind}")
             return
-        draft.gates.append((ref, signal))
+        draft.gates.append((ref, self._meaning(ref, signal)))
         draft.edges.append((ref, self._document.mark(*place)))
+
+    def _meaning(self, ref: Ref, signal: SignalPort, visited: Sequence[str] = ()) -> SignalPort:
+        """The signal that defines a closed gate: for a stage that holds a signal, the held one."""
+        producer = self._by_id[ref.node]
+        only_holds = signal.closed is None and producer.id not in visited
+        for source in producer.inputs.values() if only_holds else ():
+            held = self._signal(source) if source else None
+            if source and held:
+                return self._meaning(source, held, [*visited, producer.id])
+        return signal

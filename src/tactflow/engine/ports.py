@@ -39,11 +39,12 @@ class SignalPort:
     """Type of a boolean port that can gate stages.
 
     closed : the reason while it is False. otherwise : outputs of a gated stage then, unless its `when:` says
-    otherwise: "absent", or "repeat" for the last ones.
+    otherwise: "absent", or "repeat" for the last ones. closed None: both are taken from the input signal, for
+    a stage that only holds a signal.
     """
 
     name: str
-    closed: str
+    closed: str | None
     otherwise: Literal["absent", "repeat"] = "absent"
 
 
