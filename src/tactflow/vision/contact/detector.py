@@ -32,10 +32,11 @@ from typing import Final, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
-from tactflow.vision.arrays import Floats32, check_color_image
+from tactflow.vision.arrays import Flags, Floats32, check_color_image
 from tactflow.vision.contact.background import CELL, BackgroundModel, Change
-from tactflow.vision.contact.components import Component, contact_components, union, wide_change
+from tactflow.vision.contact.components import contact_cells, wide_change
 from tactflow.vision.contact.contact_outline import contact_level, draw_level
 from tactflow.vision.contact.heights import HeightModel
 from tactflow.vision.contact.level_lines import ContactFinder
@@ -92,12 +93,7 @@ def chi_square_threshold(probability: float) -> float:
     """
     if not 0 < probability < 1:
         raise ValueError(f"required a probability in (0, 1), got {probability}")
-    low, high = 0.0, 1500.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        tail = math.erfc(math.sqrt(middle / 2)) + math.sqrt(2 * middle / math.pi) * math.exp(-middle / 2)
-        low, high = (middle, high) if tail > probability else (low, middle)
-    return high
+    return float(2 * special.gammainccinv(1.5, probability))
 
 
 class ContactDetector:
@@ -182,10 +178,10 @@ class ContactDetector:
         """Forget the reference."""
         self._last: NDArray[np.uint8] | None = None
         self._background: BackgroundModel | None = None
-        self._before: NDArray[np.bool_] | None = None
+        self._before: Flags | None = None
         self._strongest = self._strongest_wide = 0.0
         self._evidence: Floats32 | None = None
-        self._suspected: NDArray[np.bool_] | None = None
+        self._suspected: Flags | None = None
         self._mask: NDArray[np.uint8] | None = None
         self._heights, self._contacts = HeightModel(), ContactFinder()
 
@@ -238,19 +234,18 @@ class ContactDetector:
         self._evidence = change.evidence
         strength = math.sqrt(max(change.largest, change.largest_colour))
         found = self._clear(change, before)
-        faint = not found
-        if faint:
+        faint = found is None
+        if found is None:
             found = self._faint(change, before)
         else:
             self._suspected = None
-        self._strongest = max(self._strongest * FORGET, change.largest if found else 0.0)
-        self._strongest_wide = max(
-            self._strongest_wide * FORGET_WIDE, change.largest_colour if found else 0.0
-        )
-        if not found:
+        largest, widest = (0.0, 0.0) if found is None else (change.largest, change.largest_colour)
+        self._strongest = max(self._strongest * FORGET, largest)
+        self._strongest_wide = max(self._strongest_wide * FORGET_WIDE, widest)
+        if found is None:
             self._mask = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
-        self._before = union(found, change.squared.shape)
+        self._before = found
         fading = faint and change.remaining < 1 - self._creep and self._mask is not None
         if not fading:
             self._mask = self._outlined(change, image.shape[:2])
@@ -277,7 +272,7 @@ class ContactDetector:
             draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL)
         return mask
 
-    def _clear(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
+    def _clear(self, change: Change, before: Flags | None) -> Flags | None:
         """Contact by the size of the change, so that its outline can be seen.
 
         before : cells in contact in the previous frame.
@@ -287,17 +282,17 @@ class ContactDetector:
         if not self._relaxation < change.remaining < 1 - self._creep:
             stay = max(stay, remembered)
         if change.largest < (start if before is None else stay):
-            return []
-        return contact_components(change.squared, CONNECTED * limit, start, stay, before)
+            return None
+        return contact_cells(change.squared, CONNECTED * limit, start, stay, before)
 
-    def _faint(self, change: Change, before: NDArray[np.bool_] | None) -> list[Component]:
+    def _faint(self, change: Change, before: Flags | None) -> Flags | None:
         """Contact by the extent of a change of colour, in two frames; or one that fades while it is lifted.
 
         before : as for `_clear`.
         """
         suspected, self._suspected = self._suspected, None
         if change.remaining <= GONE:
-            return []
+            return None
         fading = change.remaining < 1 - self._creep
         limit = self._limit(change.colour.size)
         belongs = wide_change(change.colour, self._extent(change.colour.size))
@@ -309,12 +304,12 @@ class ContactDetector:
         if before is None:
             # One frame may be a flash, a cable's shadow, a damaged picture.
             if belongs is None or suspected is None or not (belongs & suspected).any():
-                return []
+                return None
         elif fading and change.evidence[before].max() >= limit * STAY**2:
             belongs = before if belongs is None else before | belongs
         if belongs is None:
-            return []
-        return contact_components(change.evidence, CONNECTED * limit, math.inf, 0.0, belongs)
+            return None
+        return contact_cells(change.evidence, CONNECTED * limit, math.inf, 0.0, belongs)
 
     def _extent(self, cells: int) -> float:
         """Cells that a change of colour covers which is contact for its extent."""
