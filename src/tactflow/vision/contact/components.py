@@ -36,8 +36,8 @@ def wide_change(colour: Floats32, extent: float) -> Flags | None:
     changed = (colour > WIDE_DEVIATION).view(np.uint8)
     if cv2.countNonZero(changed) < extent:
         return None
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
-    wide = stats[:, cv2.CC_STAT_AREA] >= extent
+    _, labels = cv2.connectedComponents(changed, connectivity=8)
+    wide = np.bincount(labels.ravel()) >= extent
     wide[0] = False
     return np.asarray(wide[labels], np.bool_) if wide.any() else None
 
@@ -58,7 +58,7 @@ def contact_cells(
     (np.int64(16), None)
     """
     changed = cv2.morphologyEx((squared > weak).view(np.uint8), cv2.MORPH_CLOSE, SQUARE)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
+    count, labels = cv2.connectedComponents(changed, connectivity=8)
     contact = np.zeros(count, np.bool_)
     contact[labels[squared >= start]] = True
     if before is not None:
@@ -66,6 +66,6 @@ def contact_cells(
         lasting[labels[before]] = True
         strong[labels[squared >= stay]] = True
         contact |= lasting & strong
-    contact &= stats[:, cv2.CC_STAT_AREA] >= min(MIN_CELLS, squared.size // 4)
+    contact &= np.bincount(labels.ravel(), minlength=count) >= min(MIN_CELLS, squared.size // 4)
     contact[0] = False
     return np.asarray(contact[labels], np.bool_) if contact.any() else None
