@@ -139,8 +139,11 @@ def inputs(spec: str, calibration: Path) -> Iterator[tuple[Any, ...]]:
     settings: dict[str, Any] = {"calibration": str(calibration)}
     if pipeline is None:
         settings["stages.slip"] = {}
+    mapping = None
     for result in tactflow.stream(pipeline, source=f"sim:{spec}", settings=settings):
-        pose = scene.truth(result.seq, result["mapping"]).pose
+        # One object for all frames, by which the scene remembers its pixels: each result has a copy.
+        mapping = mapping or result["mapping"]
+        pose = scene.truth(result.seq, mapping).pose
         true = None
         if pose is not None:
             true = np.eye(4)

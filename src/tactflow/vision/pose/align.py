@@ -28,8 +28,8 @@ CONVERGED: Final = 0.3
 """Length of a step after which it ends, in standard errors."""
 FREE: Final = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
 """Standard deviation of a motion of which nothing is seen, mm and radians."""
-PRIOR: Final = np.diag(FREE**-2.0)
-"""Information on the motion before anything is seen."""
+PRIOR: Final = np.column_stack([np.diag(1 / FREE), np.zeros(6)])
+"""(6, 7): rows of the system, see `_Comparison`, for what is known before anything is seen; errors are 0."""
 NORMAL_NOISE: Final = 0.02
 """Standard deviation of what is common to the normals of a patch, 1 degree: weighs the parts before residuals
 are known. Normals on other sensors of a kind err by 1 to 4 degrees, most of it alike in both imprints."""
@@ -73,26 +73,25 @@ class Alignment(NamedTuple):
     signal: float
 
 
-class _Part(NamedTuple):
-    """Derivatives (M, 6), residuals (M,) and weights (M,)."""
-
-    by: Floats
-    error: Floats
-    weight: Floats
-
-
 class _Comparison(NamedTuple):
-    """Imprints at one motion: how many points both show, the errors of their normals (N, 2) and how they
-    count (N,), the information of these and of all parts (6, 6), the gradient (6,) and half of the sum of
-    squares."""
+    """Imprints at one motion.
+
+    shown : how many points both show. error : (N, 2), of their normals. weight : (N,), how they count.
+    by_normals : (6, 6), the information of these. system : (7, 7), normal equations: the sum of the outer
+    products of rows of six derivatives and an error, over standard deviations. So it holds the information
+    (6, 6), the gradient (6,), and in the corner the sum of squares.
+    """
 
     shown: int
     error: Floats
     weight: Floats
     by_normals: Floats
-    information: Floats
-    gradient: Floats
-    cost: float
+    system: Floats
+
+    @property
+    def information(self) -> Floats:
+        """(6, 6): of all parts."""
+        return self.system[:6, :6]
 
 
 def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> Alignment | None:
@@ -107,10 +106,10 @@ def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> A
         return None
     scale = 1.0
     for _ in range(STEPS):
-        step = np.asarray(scale * np.linalg.solve(found.information, -found.gradient), np.float64)
+        step = np.asarray(scale * np.linalg.solve(found.information, -found.system[:6, 6]), np.float64)
         tried = motion @ rigid(step)
         better = _compared(template, now, tried, gel)
-        if better is None or better.cost > found.cost:
+        if better is None or better.system[6, 6] > found.system[6, 6]:
             # The step is too long for normals to change in proportion to it.
             scale /= 2
         else:
@@ -135,37 +134,31 @@ def _compared(template: Template, now: Imprint, motion: Floats, gel: Gel | None)
     """Both imprints at a motion; None where they do not overlap."""
     count = len(template.points)
     error, weight = np.zeros((count, 2)), np.zeros(count)
-    by_normals, gradient, height, totals = np.zeros((6, 6)), np.zeros(6), np.zeros(8), np.zeros(3)
+    normals, height, totals = np.zeros((7, 7)), np.zeros(8), np.zeros(2)
     first = now.first - template.center[:2]
     compare_points(
         now.planes, first, now.cell, motion, template.points, template.by, template.center[2],
-        error, weight, by_normals, gradient, height, totals,
+        error, weight, normals, height, totals,
     )  # fmt: skip
-    shown = int(totals[0])
+    shown, mean = int(totals[0]), height / totals[1] if totals[1] else height
     if shown < FEWEST:
         return None
     patches = min(BLOCKS**2, shown * template.every / PATCH**2)
     unit = patches / (NORMAL_NOISE**2 * totals[1])
+    normals *= unit
     weight *= unit
-    by_normals *= unit
-    free = vector(motion)
-    information = by_normals + PRIOR
-    gradient = unit * gradient + PRIOR @ free
-    cost = unit * totals[2] + float(free @ PRIOR @ free)
-    parts = [_height_part(height / totals[1], now.error)]
-    parts += [] if gel is None else [_gel_part(template, now, gel, motion)]
-    for part in parts:
-        weighted = part.by.T * part.weight
-        information += weighted @ part.by
-        gradient += weighted @ part.error
-        cost += float(part.weight @ part.error**2)
-    return _Comparison(shown, error, weight, by_normals, information, gradient, cost / 2)
+    rows = np.empty((7 if gel is None else 10, 7))
+    rows[:6] = PRIOR
+    rows[:6, 6] = vector(motion) / FREE
+    rows[6] = mean[:7] / math.hypot(HEIGHT_NOISE, now.error * mean[7])
+    if gel is not None:
+        rows[7:] = _gel_rows(template, now, gel, motion)
+    return _Comparison(shown, error, weight, normals[:6, :6], normals + rows.T @ rows)
 
 
 @kernel(
     "void(float32[:, :, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], "
-    "float64[:, :, ::1], float64, float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], "
-    "float64[::1], float64[::1])"
+    "float64[:, :, ::1], float64, float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], float64[::1])"
 )
 def compare_points(
     planes: Floats32,
@@ -177,8 +170,7 @@ def compare_points(
     middle: float,
     error: Floats,
     weight: Floats,
-    information: Floats,
-    gradient: Floats,
+    normals: Floats,
     height: Floats,
     totals: Floats,
 ) -> None:
@@ -188,11 +180,11 @@ def compare_points(
     by : of the template. middle : height of its centre, mm.
     error : (N, 2) of 0, filled: of the normals. weight : (N,) of 0, filled. Both stay 0 where the imprint
         does not show a point.
-    information, gradient, height, totals : (6, 6), (6,), (8,) and (3,) of 0, to which sums over weighted
-        points are added: of the normals; of the derivatives of the height, of its error, and of how far
-        points have sunk; how many points are shown, their weights, the squares of the normals' errors.
+    normals : (7, 7) of 0, filled: the system of the normals, see `_Comparison`, by these weights.
+    height, totals : (8,) and (2,) of 0, to which sums over weighted points are added: of the derivatives of
+        the height, of its error, and of how far points have sunk; how many points are shown, their weights.
     """
-    seen = np.empty(4)
+    seen, row_of = np.empty(4), np.empty(7)
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         moved_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z
@@ -209,12 +201,11 @@ def compare_points(
         for k in range(2):
             back = motion[0, k] * seen[0] + motion[1, k] * seen[1] + motion[2, k] * upright
             error[n, k] = back - points[n, 3 + k]
-            totals[2] += share * error[n, k] * error[n, k]
-            for i in range(6):
-                weighted = share * by[n, k, i]
-                gradient[i] += weighted * error[n, k]
-                for j in range(6):
-                    information[i, j] += weighted * by[n, k, j]
+            row_of[:6], row_of[6] = by[n, k], error[n, k]
+            for i in range(7):
+                weighted = share * row_of[i]
+                for j in range(i + 1):
+                    normals[i, j] += weighted * row_of[j]
         depth = seen[2] - middle - motion[2, 3]
         for i in range(6):
             height[i] += share * by[n, 2, i]
@@ -223,6 +214,9 @@ def compare_points(
         weight[n] = share
         totals[0] += 1
         totals[1] += share
+    for i in range(7):
+        for j in range(i):
+            normals[j, i] = normals[i, j]
 
 
 @helper
@@ -236,24 +230,17 @@ def _interpolate(planes: Floats32, column: float, row: float, values: Floats) ->
         values[k] = (1 - low) * above + low * below
 
 
-def _height_part(mean: Floats, relative: float) -> _Part:
-    """The mean height. mean : (8,), `height` of `compare_points`. relative : error of all heights."""
-    variance = HEIGHT_NOISE**2 + (relative * mean[7]) ** 2
-    return _Part(mean[None, :6], mean[6:7], np.array([1 / variance]))
-
-
-def _gel_part(template: Template, now: Imprint, gel: Gel, motion: Floats) -> _Part:
-    """The gel, at the mean height of both contacts: how it strains from the rim to the deepest point is not
-    known."""
+def _gel_rows(template: Template, now: Imprint, gel: Gel, motion: Floats) -> Floats:
+    """(3, 7): rows of the system for the gel, at the mean height of both contacts: how it strains from the
+    rim to the deepest point is not known."""
     turn = motion[:3, :3]
     x, y, z = np.array([gel.before.real, gel.before.imag, template.imprint.height]) - template.center
     after = np.array([gel.now.real, gel.now.imag, now.height]) - template.center
-    error = np.zeros(3)
-    error[:2] = (after - motion[:3, 3]) @ turn[:, :2] - (x, y)
+    right, down = (after - motion[:3, 3]) @ turn[:, :2] - (x, y)
     yaw = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-    error[2] = math.remainder(yaw - gel.turn, math.tau)
-    by = np.array([[-1, 0, 0, 0, -z, y], [0, -1, 0, z, 0, -x], [0, 0, 0, 0, 0, 1]])
-    return _Part(by, error, np.array([1, 1, gel.spread]) / gel.variance)
+    lever, turned = math.sqrt(gel.spread), math.remainder(yaw - gel.turn, math.tau)
+    rows = [[-1, 0, 0, 0, -z, y, right], [0, -1, 0, z, 0, -x, down], [0, 0, 0, 0, 0, lever, lever * turned]]
+    return np.array(rows) / math.sqrt(gel.variance)
 
 
 def _efficiency(found: _Comparison, blocks: Indices) -> float:
