@@ -88,8 +88,9 @@ class PhotometricEntry(_Entry):
 
     ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. radius_error : median
     of the fitted radius over the true one, less 1. sphere_rms : of the heights from the fitted ball, mm.
-    depth_stderr, volume_stderr : of balls, relative to the value. between : the part of `depth_stderr` that
-    is the difference of sensors of the kind. steepest : see `SurfaceErrors`. explained : share of the slopes
+    depth_stderr, volume_stderr : of balls, relative to the value; for people, since the errors of a height
+    map are those of `SurfaceErrors`. between : the part of `depth_stderr` that is the difference of sensors
+    of the kind. steepest : see `SurfaceErrors`. explained : share of the slopes
     of a ball that the fit explains, see `Misfit`; None in files of earlier versions.
     """
 
