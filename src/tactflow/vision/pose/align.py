@@ -25,7 +25,7 @@ from tactflow.vision.pose.rigid import rigid, vector
 STEPS: Final = 12
 """Steps of Gauss-Newton at most."""
 CONVERGED: Final = 0.3
-"""Length of a step after which it ends, in standard errors."""
+"""Length of a step, in standard errors, that is the last one: it need not be tried."""
 FREE: Final = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
 """Standard deviation of a motion of which nothing is seen, mm and radians."""
 PRIOR: Final = np.column_stack([np.diag(1 / FREE), np.zeros(6)])
@@ -108,14 +108,15 @@ def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> A
     for _ in range(STEPS):
         step = np.asarray(scale * np.linalg.solve(found.information, -found.system[:6, 6]), np.float64)
         tried = motion @ rigid(step)
+        if step @ found.information @ step < CONVERGED**2:
+            motion = tried
+            break
         better = _compared(template, now, tried, gel)
         if better is None or better.system[6, 6] > found.system[6, 6]:
             # The step is too long for normals to change in proportion to it.
             scale /= 2
         else:
             motion, found, scale = tried, better, 1.0
-        if step @ found.information @ step < CONVERGED**2:
-            break
     total = float(found.weight.sum())
     misfit = float(found.weight @ (found.error**2).sum(axis=1))
     noise = max(misfit, 2 * total * NORMAL_NOISE**2)

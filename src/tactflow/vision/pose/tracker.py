@@ -41,12 +41,19 @@ class _Frame(NamedTuple):
 
 
 class _Keyframe(NamedTuple):
-    """A frame that others are compared with. motion, covariance : from the start to it, mm and radians.
-    by_slopes : (6,), what of the motion is in proportion to the slopes."""
+    """A frame that others are compared with.
+
+    center : (3,), of its template, from that of the first one, mm. motion, back : (4, 4), from the start to
+    it about its centre, and its inverse. carry : (6, 6), of `back`, see `adjoint`. covariance : (6, 6), of
+    the motion. by_slopes : (6,), what of the motion is in proportion to the slopes.
+    """
 
     frame: _Frame
     template: Template
+    center: Floats
     motion: Floats
+    back: Floats
+    carry: Floats
     covariance: Floats
     by_slopes: Floats
 
@@ -106,8 +113,8 @@ class PoseTracker:
         key = self._key
         if key is None:
             template = template_of(frame.imprint)
-            self._key = _Keyframe(frame, template, np.eye(4), np.zeros((6, 6)), np.zeros(6))
             self._since, self._origin = seq, template.center
+            self._key = self._keyframe(frame, template, np.eye(4), np.zeros((6, 6)), np.zeros(6))
             return self._pose("tracked", np.eye(4), np.zeros((6, 6)))
         self._slid |= slipping
         found, gel = self._aligned(key, frame)
@@ -119,7 +126,7 @@ class PoseTracker:
         self._last = motion
         overlap = found.overlap if gel is None else min(found.overlap, gel.overlap)
         if overlap < OVERLAP or (self._slid and not slipping):
-            self._key = _Keyframe(frame, template_of(frame.imprint), motion, covariance, by_slopes)
+            self._key = self._keyframe(frame, template_of(frame.imprint), motion, covariance, by_slopes)
             self._slid = slipping
         error = frame.imprint.error
         return self._pose("tracked", motion, covariance + error**2 * np.outer(by_slopes, by_slopes))
@@ -148,23 +155,27 @@ class PoseTracker:
 
     def _matched(self, key: _Keyframe, now: _Frame, gel: Gel | None) -> Alignment | None:
         """From where it was in the frame before; None if it does not fit."""
-        to_center = self._to_center(key)
-        start = inverse(to_center) @ self._last @ inverse(key.motion) @ to_center
+        start = self._last @ key.back
+        start[:3, 3] -= key.center
         found = align(key.template, now.imprint, start, gel)
         return found if found is not None and found.residual < UNLIKE * found.signal else None
 
-    def _to_center(self, key: _Keyframe) -> Floats:
-        to_center = np.eye(4)
-        to_center[:3, 3] = key.template.center - self._origin
-        return to_center
+    def _keyframe(
+        self, frame: _Frame, template: Template, motion: Floats, covariance: Floats, by_slopes: Floats
+    ) -> _Keyframe:
+        """A frame that others are compared with. motion : from the start to it, about the first centre."""
+        center = template.center - self._origin
+        about = motion.copy()
+        about[:3, 3] -= center
+        back = inverse(about)
+        return _Keyframe(frame, template, center, about, back, adjoint(back), covariance, by_slopes)
 
     def _since_start(self, key: _Keyframe, found: Alignment) -> tuple[Floats, Floats, Floats]:
         """Motion, covariance and `by_slopes` from the start to now."""
-        to_center = self._to_center(key)
-        motion = to_center @ found.motion @ inverse(to_center) @ key.motion
-        carry = adjoint(inverse(key.motion) @ to_center)
-        covariance = key.covariance + carry @ found.covariance @ carry.T
-        return motion, covariance, key.by_slopes + carry @ (BY_SLOPES * vector(found.motion))
+        motion = found.motion @ key.motion
+        motion[:3, 3] += key.center
+        covariance = key.covariance + key.carry @ found.covariance @ key.carry.T
+        return motion, covariance, key.by_slopes + key.carry @ (BY_SLOPES * vector(found.motion))
 
     def _same_gel(self, before: _Frame, now: _Frame) -> Gel | None:
         """How the gel that is in contact in both frames has moved."""
