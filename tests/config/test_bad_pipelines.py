@@ -150,11 +150,7 @@ CASES = [
         "no stage above gives touching .. write compare.touching",
     ),
     ("file", "stages:\n  capture: {use: @Source, §when: touching}\nSINK", "a source cannot be gated"),
-    (
-        "compare",
-        "  o: {use: @Outline, §when: {otherwise: repeat}}",
-        "stages.o.when.signal: required, but not given .. bool port",
-    ),
+    ("compare", "  o: {use: @Outline, when: §{signal: touching}}", "should be a valid string or a list"),
     (
         "prepare",
         "  compare: {use: @Compare, segment: §a}\n  outline: {use: @Outline, segment: b}\n"

@@ -112,14 +112,7 @@ def test_a_stage_with_nothing_after_its_name_has_the_defaults(load: Load) -> Non
     [
         ("touching", [Gate(Ref("compare", "touching"), "no_contact")]),
         ("compare.touching", [Gate(Ref("compare", "touching"), "no_contact")]),
-        (
-            "{signal: touching, otherwise: repeat, reason: rest}",
-            [Gate(Ref("compare", "touching"), "rest", "repeat")],
-        ),
-        (
-            "[touching, {signal: touching, reason: rest}]",
-            [Gate(Ref("compare", "touching"), "no_contact"), Gate(Ref("compare", "touching"), "rest")],
-        ),
+        ("[touching, compare.touching]", [Gate(Ref("compare", "touching"), "no_contact")] * 2),
         ("null", []),
     ],
 )

@@ -18,7 +18,7 @@ from tests.clock import PATIENCE, until
 
 MakeRunner = Callable[..., Runner]
 
-REPEAT = {"signal": "pulse.active", "otherwise": "repeat"}
+REPEAT = "pulse.repeating"
 
 
 def rows(runner: Runner, sink: str = "out") -> list[Any]:
@@ -66,9 +66,7 @@ def test_an_observer_never_changes_values(toy_runner: MakeRunner, extra: str, sk
         "rated": {"use": "ThreadedCollect", "max_rate": 7},
         "small": {"use": "OnlyLevel"},
     }
-    gates = held(hold=1, at_least_every=5) | {
-        "gated": {"when": {"signal": "keep.held", "otherwise": "repeat"}}
-    }
+    gates = held("repeating", hold=1, at_least_every=5) | {"gated": {"when": "keep.held"}}
     alone = toy_runner(gates, {"out": sinks["out"]}, skipping=skipping)
     ran(alone)
     others = [name for name in sinks if name not in ("out", extra)]
@@ -82,9 +80,9 @@ def test_an_observer_never_changes_values(toy_runner: MakeRunner, extra: str, sk
                 assert set(map(str, rows(runner, name))) <= set(map(str, rows(alone)))
 
 
-def held(**params: int) -> dict[str, dict[str, Any]]:
-    """A stage that holds the signal of the toy graph."""
-    return {"keep": {"use": "Hold", "in": {"signal": "pulse.active"}, **params}}
+def held(signal: str, **params: int) -> dict[str, dict[str, Any]]:
+    """A stage that holds a signal of the toy graph."""
+    return {"keep": {"use": "Hold", "in": {"signal": f"pulse.{signal}"}, **params}}
 
 
 SEGMENTS: dict[str, dict[str, dict[str, Any]]] = {
@@ -99,13 +97,13 @@ SEGMENTS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("cut", SEGMENTS)
-@pytest.mark.parametrize("otherwise", ["absent", "repeat"])
+@pytest.mark.parametrize("signal", ["active", "repeating"])
 @pytest.mark.parametrize("hold", [{}, {"hold": 2}, {"at_least_every": 3}])
 def test_how_a_graph_is_cut_into_segments_changes_no_value(
-    toy_runner: MakeRunner, cut: str, hold: dict[str, int], otherwise: str
+    toy_runner: MakeRunner, cut: str, hold: dict[str, int], signal: str
 ) -> None:
-    gate = {"signal": "keep.held" if hold else "active", "otherwise": otherwise}
-    stages: dict[str, Any] = {"gated": {"when": gate}, **(held(**hold) if hold else {})}
+    gate = "keep.held" if hold else f"pulse.{signal}"
+    stages: dict[str, Any] = {"gated": {"when": gate}, **(held(signal, **hold) if hold else {})}
     default = toy_runner(stages)
     ran(default)
     for name, body in SEGMENTS[cut].items():
@@ -159,14 +157,12 @@ def test_behind_a_closed_gate_another_gate_is_not_even_looked_at(toy_runner: Mak
 
 
 def test_a_repeating_gate_gives_its_last_value_and_says_why(toy_runner: MakeRunner) -> None:
-    runner = toy_runner(
-        {"gated": {"when": {"signal": "active", "otherwise": "repeat", "reason": "unchanged"}}}
-    )
+    runner = toy_runner({"gated": {"when": REPEAT}})
     ran(runner)
     by_frame = {row[0]: row for row in rows(runner)}
     assert by_frame[2][3] is None
     assert by_frame[9][3] == by_frame[6][3] == 36.5
-    assert by_frame[9][4] == {"gated": "unchanged"}
+    assert by_frame[9][4] == {"gated": "idle"}
     assert by_frame[6][4] == {}
 
 
@@ -199,10 +195,7 @@ def test_a_pure_stage_is_not_run_again_on_inputs_it_has_seen(
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_what_one_gate_says_is_nothing_is_not_repeated_by_another(toy_runner: MakeRunner, order: int) -> None:
-    gates = [
-        {"signal": "pulse.active", "otherwise": "absent"},
-        {"signal": "even.active", "otherwise": "repeat"},
-    ]
+    gates = ["pulse.active", "even.repeating"]
     runner = toy_runner({"even": {"use": "Even"}, "gated": {"when": gates[::order]}})
     ran(runner)
     got = {row[0]: row[3] for row in rows(runner)}

@@ -19,6 +19,7 @@ from tactflow.stages.hold import Hold as Hold
 
 Grid = Annotated[NDArray[np.uint8], ArrayPort("grid", ("H", "W"), "uint8", "1")]
 Active = Annotated[bool, SignalPort("active", closed="idle")]
+Repeating = Annotated[bool, SignalPort("repeating", closed="idle", otherwise="repeat")]
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,14 @@ class Level(Counted, Stage):
 
 
 class ActivePorts(NamedTuple):
+    """The same signal for gates of both kinds."""
+
     active: Active
+    repeating: Repeating
+
+
+def both(signal: bool) -> ActivePorts:
+    return ActivePorts(signal, signal)
 
 
 class Pulse(Counted, Stage):
@@ -132,7 +140,7 @@ class Pulse(Counted, Stage):
 
     def process(self, frame: Frame) -> ActivePorts:
         self.saw(frame.seq)
-        return ActivePorts(3 <= frame.seq % 10 <= 6)
+        return both(3 <= frame.seq % 10 <= 6)
 
 
 class Even(Counted, Stage):
@@ -140,7 +148,7 @@ class Even(Counted, Stage):
 
     def process(self, frame: Frame) -> ActivePorts:
         self.saw(frame.seq)
-        return ActivePorts(frame.seq % 2 == 0)
+        return both(frame.seq % 2 == 0)
 
 
 class HeavyPorts(NamedTuple):

@@ -246,10 +246,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
     if draft.component.kind == "source" and not (origin := document.mark(*draft.keys, "source")).line:
         # A source of the command line that cannot be opened is not an error in the file.
         mark = origin
-    gates = [
-        Gate(ref, gate.reason or signal.closed or ref.port, gate.otherwise or signal.otherwise)
-        for gate, (ref, signal) in zip(entry.when, draft.gates, strict=True)
-    ]
+    gates = [Gate(ref, signal.closed or ref.port, signal.otherwise) for ref, signal in draft.gates]
     marked = {"segment", "queue"} & document.mapping(*draft.keys).keys()
     return Node(
         id=draft.id,

@@ -7,7 +7,7 @@ are checked elsewhere in this package.
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
@@ -51,26 +51,6 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-class Gate(Part):
-    """A stage runs only while a signal is true."""
-
-    signal: str = Field(description="the signal: the name of a bool port, or stage.port")
-    otherwise: Literal["absent", "repeat"] | None = Field(
-        None,
-        description="what the outputs are while the gate is closed: absent, or repeat for the last ones "
-        "again; null: the signal's own choice",
-    )
-    reason: Word | None = Field(
-        None, description="what `skipped` in the results says then; null: the signal's own word"
-    )
-
-
-def _gates(value: Any) -> Any:
-    """Normalise one or several gates, or names of signals, to a list of mappings."""
-    gates = value if isinstance(value, list) else [] if value is None else [value]
-    return [gate if isinstance(gate, dict) else {"signal": gate} for gate in gates]
-
-
 def _on_error(value: Any) -> Any:
     return value if isinstance(value, dict | None) else {"action": value}
 
@@ -86,10 +66,9 @@ class Entry(Part):
         description="input -> the output it takes, as stage.port, or as stage where that has one output; "
         "null: an optional input takes nothing; by default the nearest output of its name above",
     )
-    when: Annotated[
-        list[Gate],
-        BeforeValidator(_gates, json_schema_input_type=None | str | Gate | list[str | Gate]),
-    ] = Field([], description="the signals that must all be true for it to run")
+    when: str | list[str] | None = Field(
+        None, description="the signals that must all be true for it to run: bool ports, as port or stage.port"
+    )
     segment: Word | None = Field(
         None, description="the segment it runs in, one thread each; null: the planner's choice"
     )

@@ -111,15 +111,11 @@ def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, 
     part of it."""
     place, rest = keys, list(detail["loc"])
     while rest:
-        value = document.get(*place)
-        if isinstance(value, dict) and rest[0] in value:
-            place = (*place, rest.pop(0))
-        elif isinstance(rest[0], int) and (not isinstance(value, list) or rest[0] < len(value)):
-            # A list of one may be written as its item.
-            index = rest.pop(0)
-            place = (*place, index) if isinstance(value, list) else place
-        else:
+        value, step = document.get(*place), rest[0]
+        is_index = isinstance(value, list) and isinstance(step, int) and step < len(value)
+        if not (is_index or (isinstance(value, dict) and step in value)):
             break
+        place = (*place, rest.pop(0))
     if detail["type"] == "missing" and len(rest) == 1:
         place = (*place, rest.pop())
     return place, tuple(rest)

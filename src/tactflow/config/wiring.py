@@ -139,12 +139,8 @@ class _Wiring:
             message = "a source cannot be gated; gate the stages behind it"
             self._document.report(place, message, at_key=True)
             return
-        for index, gate in enumerate(when if isinstance(when, list) else [when]):
-            keys = (*place, index) if isinstance(when, list) else place
-            if isinstance(gate, dict):
-                self._gate(gate.get("signal"), (*keys, "signal"), draft)
-            else:
-                self._gate(gate, keys, draft)
+        for index, signal in enumerate(when if isinstance(when, list) else [when]):
+            self._gate(signal, (*place, index) if isinstance(when, list) else place, draft)
 
     def _reference(self, text: Any, place: Keys, user: Draft, by_port: bool = False) -> Ref | None:
         """The output named by `stage.port`, `stage`, or (with `by_port`) the name of a port."""

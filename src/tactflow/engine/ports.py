@@ -38,9 +38,8 @@ class ArrayPort:
 class SignalPort:
     """Type of a boolean port that can gate stages.
 
-    closed : the reason while it is False. otherwise : outputs of a gated stage then, unless its `when:` says
-    otherwise: "absent", or "repeat" for the last ones. closed None: both are taken from the input signal, for
-    a stage that only holds a signal.
+    closed : the reason while it is False. otherwise : outputs of a gated stage then: "absent", or "repeat"
+    for the last ones. closed None: both are those of the input signal, for a stage that only holds a signal.
     """
 
     name: str
