@@ -129,6 +129,13 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
 
 
 @pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    """Closes what a test opened, last first."""
+    with ExitStack() as opened:
+        yield opened
+
+
+@pytest.fixture
 def terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Terminal:
     """The command line in an empty folder, `tmp_path`."""
     monkeypatch.chdir(tmp_path)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.cli.main import main
+from tests.terminal import Terminal
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = Path(__file__).with_name("parts.py")
@@ -175,24 +175,21 @@ def pipeline(text: str, base: str = "file") -> str:
     return re.sub(r"@([A-Z]\w*)", r"'./parts.py:\1'", text)
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A current directory with the parts in it."""
-    shutil.copy(PARTS, tmp_path / "parts.py")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+@pytest.fixture(autouse=True)
+def parts(terminal: Terminal) -> None:
+    """The current folder has the parts in it."""
+    assert not terminal.out
+    shutil.copy(PARTS, "parts.py")
 
 
 @pytest.mark.parametrize(("base", "text", "words"), CASES)
-def test_a_mistake_is_reported_at_its_place(
-    base: str, text: str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_is_reported_at_its_place(base: str, text: str, words: str, terminal: Terminal) -> None:
     before, _, after = pipeline(text, base).partition(HERE)
-    (folder / "bad.yaml").write_text(before + after)
+    Path("bad.yaml").write_text(before + after)
     line = before.count("\n") + 1
     column = len(before) - before.rfind("\n")
-    assert main(["check", "bad.yaml"]) == 2
-    out, err = capsys.readouterr()
+    assert terminal("check", "bad.yaml") == 2
+    out, err = terminal.out, terminal.err
     assert out == ""
     assert "Traceback" not in err
     found, *below = err[err.index(f"bad.yaml:{line}:{column}  ") :].splitlines()
@@ -205,58 +202,49 @@ def test_a_mistake_is_reported_at_its_place(
 
 
 @pytest.mark.parametrize("command", ["run", "check", "explain", "graph"])
-def test_every_command_that_reads_a_pipeline_refuses_a_bad_one(
-    command: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (folder / "bad.yaml").write_text(pipeline("  prepare: {}", "source"))
-    assert main([command, "bad.yaml", "--set", "sinks.out.path=3"]) == 2
-    out, err = capsys.readouterr()
+def test_every_command_that_reads_a_pipeline_refuses_a_bad_one(command: str, terminal: Terminal) -> None:
+    Path("bad.yaml").write_text(pipeline("  prepare: {}", "source"))
+    assert terminal(command, "bad.yaml", "--set", "sinks.out.path=3") == 2
+    out, err = terminal.out, terminal.err
     assert out == ""
     assert "bad.yaml:3:3  stages.prepare: there is no stage called prepare" in err
     assert "--set sinks.out.path=3: sinks.out.path: should be a valid string, got 3" in err
     assert "Traceback" not in err
 
 
-def test_all_mistakes_come_at_once_in_the_order_of_the_file(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (folder / "bad.yaml").write_text(
+def test_all_mistakes_come_at_once_in_the_order_of_the_file(terminal: Terminal) -> None:
+    Path("bad.yaml").write_text(
         pipeline("sensor: a b\n" + PREPARE + "  o: {use: @Outline, min_aera: 3, when: tuching}\nsink: {}")
     )
-    assert main(["check", "bad.yaml"]) == 2
-    err = capsys.readouterr().err
+    assert terminal("check", "bad.yaml") == 2
+    err = terminal.err
     places = re.findall(r"^bad\.yaml:(\d+):\d+  ", err, re.MULTILINE)
     assert places == ["1", "5", "5", "5", "6"]
     assert err.startswith("tactflow: 5 mistakes\n")
 
 
-def test_bytes_that_are_not_utf8_have_a_place(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "bad.yaml").write_bytes(b"sensor: main\nskipping: \xff\n")
-    assert main(["check", "bad.yaml"]) == 2
-    assert "bad.yaml:2:11  byte 0xff is not UTF-8 text" in capsys.readouterr().err
+def test_bytes_that_are_not_utf8_have_a_place(terminal: Terminal) -> None:
+    Path("bad.yaml").write_bytes(b"sensor: main\nskipping: \xff\n")
+    assert terminal("check", "bad.yaml") == 2
+    assert "bad.yaml:2:11  byte 0xff is not UTF-8 text" in terminal.err
 
 
 @pytest.mark.parametrize("name", ["long.yaml", "/dev/zero"])
-def test_a_file_without_end_is_not_read_to_the_end(
-    name: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_without_end_is_not_read_to_the_end(name: str, terminal: Terminal) -> None:
     if not Path("/dev/zero").exists():
         pytest.skip("there is no /dev/zero on this system")
-    (folder / "long.yaml").write_text("stages:\n" + "- a\n" * 300_000)
-    assert main(["check", name]) == 2
-    assert f"cannot read {name}: larger than 1024 KiB" in capsys.readouterr().err
+    Path("long.yaml").write_text("stages:\n" + "- a\n" * 300_000)
+    assert terminal("check", name) == 2
+    assert f"cannot read {name}: larger than 1024 KiB" in terminal.err
 
 
 @pytest.mark.parametrize(
     ("argument", "words"),
     [("nowhere.yaml", "there is no file nowhere.yaml"), (".", "is a folder"), ("parts.py/x", "cannot read")],
 )
-def test_a_file_that_cannot_be_read(
-    argument: str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert folder.is_dir()
-    assert main(["check", argument]) == 2
-    assert words in capsys.readouterr().err
+def test_a_file_that_cannot_be_read(argument: str, words: str, terminal: Terminal) -> None:
+    assert terminal("check", argument) == 2
+    assert words in terminal.err
 
 
 @pytest.mark.parametrize(
@@ -272,13 +260,11 @@ def test_a_file_that_cannot_be_read(
         ),
     ],
 )
-def test_a_mistake_in_an_own_file_is_shown_with_its_line(
-    body: str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (folder / "own.py").write_text(body)
-    (folder / "bad.yaml").write_text(pipeline("  own: {use: ./own.py}", "prepare"))
-    assert main(["check", "bad.yaml"]) == 2
-    err = capsys.readouterr().err
+def test_a_mistake_in_an_own_file_is_shown_with_its_line(body: str, words: str, terminal: Terminal) -> None:
+    Path("own.py").write_text(body)
+    Path("bad.yaml").write_text(pipeline("  own: {use: ./own.py}", "prepare"))
+    assert terminal("check", "bad.yaml") == 2
+    err = terminal.err
     assert "bad.yaml:4:14  stages.own.use: " in err
     assert re.search(words, err), err
     assert "Traceback" not in err

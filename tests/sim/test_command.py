@@ -7,25 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactflow.cli.main import main
 from tactflow.sim import scene_descriptions
-
-Capture = pytest.CaptureFixture[str]
-
-
-def test_it_writes_frames_and_truth(tmp_path: Path, capsys: Capture) -> None:
-    out, truth = tmp_path / "new" / "a.npy", tmp_path / "a.jsonl"
-    assert main(["sim", "sim:press?frames=5", "--out", str(out), "--truth", str(truth)]) == 0
-    assert np.load(out, mmap_mode="r").shape == (5, 600, 800, 3)
-    assert len(truth.read_text().splitlines()) == 5
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert "5 frames of press" in printed.err
+from tests.terminal import Terminal
 
 
-def test_the_list_names_every_scene_and_every_setting(capsys: Capture) -> None:
-    assert main(["sim", "--list"]) == 0
-    words = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+def test_it_writes_frames_and_truth(terminal: Terminal) -> None:
+    assert terminal("sim", "sim:press?frames=5", "--out", "new/a.npy", "--truth", "a.jsonl") == 0
+    assert np.load("new/a.npy", mmap_mode="r").shape == (5, 600, 800, 3)
+    assert len(Path("a.jsonl").read_text().splitlines()) == 5
+    assert terminal.out == ""
+    assert "5 frames of press" in terminal.err
+
+
+def test_the_list_names_every_scene_and_every_setting(terminal: Terminal) -> None:
+    assert terminal("sim", "--list") == 0
+    words = {line.split()[0] for line in terminal.out.splitlines()}
     assert {*scene_descriptions(), "noise", "frames", "light"} <= words
 
 
@@ -43,27 +39,20 @@ def test_the_list_names_every_scene_and_every_setting(capsys: Capture) -> None:
     ],
 )
 def test_mistakes_are_explained_and_nothing_is_written(
-    arguments: list[str],
-    complaint: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: Capture,
+    arguments: list[str], complaint: str, terminal: Terminal
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     Path("there.npy").write_bytes(b"kept")
     Path("folder.jsonl").mkdir()
-    before = sorted(tmp_path.rglob("*"))
-    assert main(["sim", *arguments]) == 2
-    printed = capsys.readouterr()
-    assert complaint in printed.err
-    assert "Traceback" not in printed.err
-    assert printed.out == ""
-    assert sorted(tmp_path.rglob("*")) == before
+    before = sorted(Path().rglob("*"))
+    assert terminal("sim", *arguments) == 2
+    assert complaint in terminal.err
+    assert "Traceback" not in terminal.err
+    assert terminal.out == ""
+    assert sorted(Path().rglob("*")) == before
     assert Path("there.npy").read_bytes() == b"kept"
 
 
-def test_overwrite_replaces_a_file(tmp_path: Path) -> None:
-    out = tmp_path / "a.npy"
-    assert main(["sim", "idle?frames=3", "--out", str(out), "--quiet"]) == 0
-    assert main(["sim", "idle?frames=2", "--out", str(out), "--quiet", "--overwrite"]) == 0
-    assert np.load(out, mmap_mode="r").shape[0] == 2
+def test_overwrite_replaces_a_file(terminal: Terminal) -> None:
+    assert terminal("sim", "idle?frames=3", "--out", "a.npy", "--quiet") == 0
+    assert terminal("sim", "idle?frames=2", "--out", "a.npy", "--quiet", "--overwrite") == 0
+    assert np.load("a.npy", mmap_mode="r").shape[0] == 2

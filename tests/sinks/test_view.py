@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 from unittest.mock import Mock, call
@@ -105,13 +105,6 @@ class Page:
                 self.socket.recv(PATIENCE)
         except ConnectionClosed:
             return self.socket.close_code
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    """Closes what a test opened, last first."""
-    with ExitStack() as opened:
-        yield opened
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket as system_socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast
@@ -28,12 +28,6 @@ WAIT = round(PATIENCE * 1000)
 
 Open = Callable[..., Zmq]
 Subscribe = Callable[..., "zmq.Socket[bytes]"]
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as opened:
-        yield opened
 
 
 @pytest.fixture
