@@ -51,7 +51,7 @@ class Page:
     """State of one open page.
 
     credit : whether the next frame may be sent. shows : layers of `ON_DEMAND` that it shows. sent, answered :
-    numbers of the last frame sent and acknowledged. captured, sent_at : `time.perf_counter` of the frame
+    numbers of the last frame sent and acknowledged. captured : `time.perf_counter` of the frame
     sent, s. screen_s : recent times from capture to screen, s. texts : unsent messages, only the newest of
     each kind, which bounds the queue of a page that does not read. wake : set when there is something to
     send. ended : the run is over.
@@ -63,7 +63,6 @@ class Page:
     sent: int = 0
     answered: int = 0
     captured: float = 0.0
-    sent_at: float = 0.0
     screen_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
     texts: dict[str, str] = field(default_factory=dict)
     wake: asyncio.Event = field(default_factory=asyncio.Event)
@@ -73,11 +72,6 @@ class Page:
         """Queue a text message, replacing an unsent one of the same kind."""
         self.texts[kind] = text
         self.wake.set()
-
-    @property
-    def stuck(self) -> bool:
-        """Whether the acknowledgement is overdue, because the page is hidden or the connection slow."""
-        return not self.credit and time.perf_counter() - self.sent_at > 2 * STATS_SECONDS
 
 
 class Hub:
@@ -198,13 +192,12 @@ class Hub:
             page.post("state", text)
 
     def post_stats(self) -> None:
-        """Send statistics and state to the pages that are not stuck."""
-        listeners = [page for page in self.pages if page.ended or not page.stuck]
-        if not listeners:
+        """Send statistics and state to every page."""
+        if not self.pages:
             return
         snapshot = self._commands.snapshot()
         state = self.state()
-        for page in listeners:
+        for page in self.pages:
             delays = sorted(page.screen_s)
             median = delays[len(delays) // 2] * 1000 if delays else None
             page.screen_s.clear()
@@ -264,7 +257,6 @@ class Hub:
                 page.credit = False
                 page.sent = packet.number
                 page.captured = packet.captured
-                page.sent_at = time.perf_counter()
                 self._sent += 1
                 self._recount()
                 await page.socket.send(packet.data)
