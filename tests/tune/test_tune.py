@@ -114,9 +114,10 @@ def test_what_is_changed_stands_in_the_file_and_removed_stages_are_gone(
     recorded: Recording, tmp_path: Path
 ) -> None:
     settings = {"stages.preprocess.downsample": 4, "stages.fusion": None, "skipping": False}
-    chosen = make_trial("chosen", 1, 1, settings=settings)
+    pipeline = tactflow.load("default", settings=settings)
+    chosen = make_trial("chosen", 1, 1, settings=settings, pipeline=pipeline)
     tuned = Tuned(recorded, SMALL, [chosen], chosen)
-    text = report.pipeline_text(tuned, find_pipeline("default"), tmp_path / "tuned.yaml")
+    text = report.pipeline_text(tuned, tmp_path / "tuned.yaml")
     assert "# stages.preprocess.downsample: 4" in text
     assert "# stages.fusion: removed" in text
     document = yaml.safe_load(text)
@@ -131,9 +132,8 @@ def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
     odd = replace(recorded, source="press\nsinks:\u2028evil: {}\n.npy")
     chosen = make_trial("chosen", 1, 1)
     tuned = Tuned(odd, SMALL, [chosen], chosen)
-    file = find_pipeline("default")
-    text = report.pipeline_text(tuned, file, tmp_path / "tuned.yaml")
-    assert yaml.safe_load(text) == yaml.safe_load(file.read_text())
+    text = report.pipeline_text(tuned, tmp_path / "tuned.yaml")
+    assert yaml.safe_load(text) == yaml.safe_load(find_pipeline("default").read_text())
     assert "# sinks:" in text
 
 

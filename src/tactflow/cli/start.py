@@ -12,6 +12,8 @@ from typing import Final
 
 from tactflow.cli.cameras import NO_CAMERA
 from tactflow.cli.options import add_overwrite, refuse_output, writing
+from tactflow.config.load import load_pipeline
+from tactflow.config.overrides import from_settings
 from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.doctor import Observation, examine
 from tactflow.doctor.observation import watch
@@ -21,10 +23,10 @@ from tactflow.sources.cameras import list_cameras
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
-from tactflow.system.terminal import notes, printable, say, typed
+from tactflow.system.terminal import notes, say, typed
 from tactflow.tune.propose import FEWEST_FOUND, OF_ONE, Attempt, Sample, divide, propose
 from tactflow.tune.recording import CHANGE, Kept
-from tactflow.tune.report import changed_pipeline
+from tactflow.tune.report import commented
 from tactflow.view.questions import Questions
 
 SETTLE_SECONDS: Final = 3.0
@@ -236,8 +238,8 @@ def _write(out: Path, source: str, attempts: Sequence[Attempt], remarks: Sequenc
     """Write the first pipeline, with what was measured as comments."""
     file = find_pipeline(attempts[0].pipeline)
     title = f"Made by tactflow start for {public_address(source)}, from {file.name}. Tried on its pictures:"
-    comments = [printable(line) for line in (title, *(f"  {attempt}" for attempt in attempts), *remarks)]
     settings = {"stages.capture.source": source, **attempts[0].settings}
-    text = changed_pipeline(file, settings, comments, out)
+    pipeline = load_pipeline(file, from_settings(settings))
+    text = commented(pipeline, [title, *(f"  {attempt}" for attempt in attempts), *remarks], out)
     with writing(out), completed(out) as unfinished:
         unfinished.write_text(text, encoding="utf-8")

@@ -13,7 +13,7 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import StageError
 from tactflow.system.arguments import number
 from tactflow.system.files import completed
-from tactflow.system.terminal import notes, printable, say, show, show_json, typed
+from tactflow.system.terminal import notes, say, show, show_json, typed
 
 _above_0 = number(float, sys.float_info.min, sys.float_info.max, "a number above 0")
 
@@ -81,8 +81,7 @@ def run(args: argparse.Namespace) -> int:
     if tuned.chosen is None:
         say(tuned.impossible())
         return StageError.exit_code
-    # YAML takes no control characters, which a name in a comment may have.
-    text = "\n".join(map(printable, report.pipeline_text(tuned, file, args.out).split("\n")))
+    text = report.pipeline_text(tuned, args.out)
     with writing(args.out), completed(args.out) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     say(f"{args.out} is written; try: {typed('tactflow', 'run', str(args.out), '--source', args.source)}")

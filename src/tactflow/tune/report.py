@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from tactflow.engine.errors import ConfigError
-from tactflow.system.terminal import markdown
+from tactflow.engine.graph import Pipeline
+from tactflow.system.terminal import markdown, printable
 from tactflow.tune.measure import CHECKS, ERRORS, Interval
 from tactflow.tune.search import Tuned
 
@@ -53,54 +54,34 @@ def as_json(tuned: Tuned) -> dict[str, Any]:
     }
 
 
-def pipeline_text(tuned: Tuned, file: Path, out: Path) -> str:
-    """The chosen pipeline as YAML, with the measurements as comments.
-
-    file : the user's pipeline. out : path of the file to write.
-
-    Raises
-    ------
-    ConfigError
-        The pipeline names files relative to itself, and `out` is in another folder.
-    """
-    assert tuned.chosen is not None
-    title = f"Chosen by tactflow tune for {tuned.recording.source}, from {file.name}: {tuned.chosen.name}."
-    settings = tuned.chosen.settings
-    changes = [f"{key}: {'removed' if value is None else value}" for key, value in settings.items()]
-    return changed_pipeline(file, settings, [title, *changes, "", *lines(tuned)], out)
+def pipeline_text(tuned: Tuned, out: Path) -> str:
+    """The chosen pipeline as YAML, with the measurements as comments; the rest as for `commented`."""
+    chosen = tuned.chosen
+    assert chosen is not None
+    file = Path(chosen.pipeline.file).name
+    title = f"Chosen by tactflow tune for {tuned.recording.source}, from {file}: {chosen.name}."
+    changes = [f"{key}: {'removed' if value is None else value}" for key, value in chosen.settings.items()]
+    return commented(chosen.pipeline, [title, *changes, "", *lines(tuned)], out)
 
 
-def changed_pipeline(file: Path, settings: Mapping[str, Any], comments: Sequence[str], out: Path) -> str:
-    """A pipeline with other settings as YAML, below comments.
-
-    settings : as `stages.preprocess.downsample` -> value; None removes an entry. out : path of the file to
-    write.
+def commented(pipeline: Pipeline, comments: Sequence[str], out: Path) -> str:
+    """A pipeline as YAML, below comments. out : path of the file to write.
 
     Raises
     ------
     ConfigError
         The pipeline names files relative to itself, and `out` is in another folder.
     """
-    document: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
-    if "./" in yaml.safe_dump(document) and out.absolute().parent != file.absolute().parent:
+    body = yaml.safe_dump(
+        dict(pipeline.settings), sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
+    )
+    if "./" in body and out.absolute().parent != pipeline.directory.absolute():
         raise ConfigError(
-            f"--out: {file} names files relative to itself; required a path in the same folder, such as "
-            f"{file.parent / out.name}"
+            f"--out: {pipeline.file} names files relative to itself; required a path in the same folder, "
+            f"such as {pipeline.directory / out.name}"
         )
-    for key, value in settings.items():
-        _set(document, key, value)
-    body = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None)
-    # The name of a recording may contain line breaks; all lines must stay comments.
-    header = "\n".join(f"# {line}".rstrip() for part in comments for line in part.splitlines() or [""])
+    # The name of a recording may contain line breaks and control characters.
+    header = "\n".join(
+        f"# {printable(line)}".rstrip() for part in comments for line in part.splitlines() or [""]
+    )
     return f"{header}\n\n{body}"
-
-
-def _set(document: dict[str, Any], key: str, value: Any) -> None:
-    """Set a value of the pipeline file, or remove it if None. key : as `stages.preprocess.downsample`."""
-    *parents, last = key.split(".")
-    for parent in parents:
-        document[parent] = document.get(parent) or {}
-        document = document[parent]
-    document[last] = value
-    if value is None:
-        del document[last]
