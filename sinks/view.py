@@ -6,18 +6,17 @@ import logging
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from tactflow.engine.contract import StageParams
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.control import Control
 from tactflow.message.result import Result
 from tactflow.network.address import is_loopback
 from tactflow.ports import Valid
 from tactflow.view.address import Neighbours, address, bind
 from tactflow.view.compact import encode_packet
-from tactflow.view.guided import Guiding
 
 if TYPE_CHECKING:
     from tactflow.view.hub import Hub
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 
-class View(Guiding):
+class View(Sink):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
     While no open page is ready for another frame, none is requested or encoded. A view that cannot be served
@@ -36,6 +35,9 @@ class View(Guiding):
     threaded = True
     when_live = "latest"
     observer = True
+    session: ClassVar[Any] = None
+    """A guided session that the page shows, such as the presses of a calibration; a subclass sets it. Its
+    attribute `state`, a mapping, is replaced as a whole and may be read from any thread."""
 
     class Params(StageParams):
         """Address of the page, and amount of data."""

@@ -42,7 +42,6 @@ from tactflow.message.result import Result
 from tactflow.system.arguments import number, positive
 from tactflow.system.signals import INTERRUPTED, Interrupted
 from tactflow.system.terminal import notes, say, show, typed
-from tactflow.view.guided import Guiding
 from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
@@ -511,11 +510,9 @@ def _load(
 def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[str, Node]:
     """The live page of the pipeline, or else one with defaults, showing the guided session."""
     own, added = _load(args, pipeline), _load(args, pipeline, {"sinks.view": {}})
-    for node in (*own.sinks, *added.sinks):
-        if issubclass(node.component.cls, Guiding):
-            component = replace(node.component, cls=node.component.cls.through(guide))
-            return {node.id: replace(node, component=component)}
-    raise AssertionError("the sink view guides")
+    node = next(node for node in (*own.sinks, *added.sinks) if node.component.name == "view")
+    guided = type("View", (node.component.cls,), {"session": guide})
+    return {node.id: replace(node, component=replace(node.component, cls=guided))}
 
 
 def _darkness_words(found: DarknessEntry) -> str:
