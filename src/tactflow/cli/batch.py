@@ -8,12 +8,12 @@ import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from tactflow.batch.recordings import Recording, find_recordings
-from tactflow.batch.report import Runs, require_pyarrow, write_page, write_runs
-from tactflow.batch.run import Batch, Plan, Result, make_plan
+from tactflow.batch.report import require_pyarrow, write_page, write_runs
+from tactflow.batch.run import Batch, Result, make_plan
 from tactflow.batch.store import Outcome, Store
 from tactflow.batch.work import Request, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
@@ -86,92 +86,68 @@ def run(args: argparse.Namespace) -> int:
             f"{file} has the sensors {', '.join(sensors)}; a recording is of one: give --sensor {sensors[0]}"
         )
     request = resolved(file, args.overrides, args.sensor, args.format)
-    call = _Call(args, request, find_recordings(words))
-    result = call.run()
-    if call.signals and result.undone:
+    recordings, store = find_recordings(words), Store(args.out.absolute())
+    tell = _silent if args.quiet else say
+    signals: list[int] = []
+    number, of = args.shard
+    with (
+        store.claimed(f"{number}-of-{of}") as scratch,
+        ending_handled(lambda signal, _: signals.append(signal)),
+    ):
+        plan = make_plan(store, recordings[number - 1 :: of], request)
+        tell(f"{request.file}: {plan}{'' if of == 1 else f' (part {number} of {of})'}")
+        result = Result(dict(plan.done))
+        if plan.left and not signals:
+            workers = (
+                DaskCluster(args.scheduler)
+                if args.scheduler is not None
+                else LocalProcesses(args.workers or _processors())
+            )
+            tell(f"on {workers.description}")
+            batch = Batch(store, scratch, request, workers, lambda: len(signals), args.fail_fast)
+            with _progress(len(plan.left), tell, shown=not args.quiet) as batch.on_outcome:
+                result = batch.run(plan)
+        # Before the table is written, which a full disk may not take.
+        for line in _closing(result, len(plan.done)):
+            tell(line)
+        runs = [(recording, _outcome(recording, result, store, request)) for recording in recordings]
+        write_runs(store, runs, args.format)
+        page = write_page(store, runs, f"{file.stem}: {len(runs)} recordings")
+        tell(f"report: {page}")
+    if signals and result.undone:
         return INTERRUPTED
     return StageError.exit_code if result.undone or result.failed else 0
 
 
-class _Call:
-    """One call of the command."""
+def _silent(_text: str) -> None:
+    """Say nothing."""
 
-    def __init__(self, args: argparse.Namespace, request: Request, recordings: Sequence[Recording]) -> None:
-        self.signals = 0
-        self._args = args
-        self._request = request
-        self._store = Store(args.out.absolute())
-        self._recordings = recordings
 
-    def _say(self, text: str) -> None:
-        if not self._args.quiet:
-            say(text)
+def _outcome(recording: Recording, result: Result, store: Store, request: Request) -> Outcome:
+    """The outcome of a recording, also of another shard."""
+    outcome = result.outcomes.get(recording.source) or store.outcome(recording)
+    if outcome is None or outcome.pipeline != request.digest:
+        return Outcome(recording.source, recording.name, "not done")
+    return outcome
 
-    def _count_signal(self, _number: int, _frame: object) -> None:
-        self.signals += 1
 
-    def run(self) -> Result:
-        """Do what is missing; write the table of runs and the page."""
-        request, store = self._request, self._store
-        number, of = self._args.shard
-        with ExitStack() as stack:
-            scratch = stack.enter_context(store.claimed(f"{number}-of-{of}"))
-            stack.enter_context(ending_handled(self._count_signal))
-            plan = make_plan(store, self._recordings[number - 1 :: of], request)
-            self._say(f"{request.file}: {plan}{'' if of == 1 else f' (part {number} of {of})'}")
-            result = Result(dict(plan.done))
-            if plan.left and not self.signals:
-                result = self._work(scratch, plan)
-            # Before the table is written, which a full disk may not take.
-            for line in _closing(result, len(plan.done)):
-                self._say(line)
-            runs = self._runs(result)
-            write_runs(store, runs, self._args.format)
-            page = write_page(store, runs, f"{Path(request.file).stem}: {len(runs)} recordings")
-            self._say(f"report: {page}")
-        return result
+@contextmanager
+def _progress(total: int, tell: Callable[[str], None], *, shown: bool) -> Iterator[Callable[[Outcome], None]]:
+    """Names each recording that fails; on a terminal, shows how far the batch is."""
+    with progress_bar("starting", total, shown=shown) as update:
+        done = failed = frames = 0
 
-    def _work(self, scratch: Path, plan: Plan) -> Result:
-        args = self._args
-        workers = (
-            DaskCluster(args.scheduler)
-            if args.scheduler is not None
-            else LocalProcesses(args.workers or _processors())
-        )
-        self._say(f"on {workers.description}")
-        batch = Batch(self._store, scratch, self._request, workers, lambda: self.signals, args.fail_fast)
-        with self._progress(len(plan.left)) as batch.on_outcome:
-            return batch.run(plan)
+        def on_outcome(outcome: Outcome) -> None:
+            nonlocal done, failed, frames
+            done += 1
+            failed += outcome.status != "done"
+            frames += outcome.frames
+            if outcome.status != "done":
+                reason = (outcome.error or "").partition("\n")[0]
+                tell(f"failed: {outcome.name}: {textwrap.shorten(reason, LONGEST, placeholder=' ...')}")
+            update(completed=done, description=f"{done} of {total}, {failed} failed, {frames} frames")
 
-    def _runs(self, result: Result) -> Runs:
-        """All recordings, also those of other shards, each with its outcome."""
-        runs = []
-        for recording in self._recordings:
-            outcome = result.outcomes.get(recording.source) or self._store.outcome(recording)
-            if outcome is None or outcome.pipeline != self._request.digest:
-                outcome = Outcome(recording.source, recording.name, "not done")
-            runs.append((recording, outcome))
-        return runs
-
-    @contextmanager
-    def _progress(self, total: int) -> Iterator[Callable[[Outcome], None]]:
-        """Names each recording that fails; on a terminal, shows how far the batch is."""
-        with progress_bar("starting", total, shown=not self._args.quiet) as update:
-            done = failed = frames = 0
-
-            def on_outcome(outcome: Outcome) -> None:
-                nonlocal done, failed, frames
-                done += 1
-                failed += outcome.status != "done"
-                frames += outcome.frames
-                if outcome.status != "done":
-                    reason = (outcome.error or "").partition("\n")[0]
-                    reason = textwrap.shorten(reason, LONGEST, placeholder=" ...")
-                    self._say(f"failed: {outcome.name}: {reason}")
-                text = f"{done} of {total}, {failed} failed, {frames} frames"
-                update(completed=done, description=text)
-
-            yield on_outcome
+        yield on_outcome
 
 
 def _pipeline_and_sources(words: Sequence[str]) -> tuple[Path, Sequence[str]]:
