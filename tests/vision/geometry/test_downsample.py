@@ -1,4 +1,4 @@
-"""Downsampling by two: the same bits as OpenCV's block averages."""
+"""Downsampling: by two, the same bits as block averages of OpenCV; means over larger cells."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.geometry import Preprocessor
+from tactflow.vision.geometry.downsample import cell_means
 
 Image = NDArray[np.uint8]
 
@@ -42,3 +43,18 @@ def test_a_processed_frame_is_cropped_halved_and_turned(
             expected = np.asarray(cv2.rotate(expected, ROTATIONS[rotate]), np.uint8)
         processed = Preprocessor((79, 61), rotate=rotate, downsample=downsample, crop=crop)(raw)
         assert np.array_equal(processed, expected)
+
+
+@pytest.mark.parametrize("channels", [(), (3,)])
+@pytest.mark.parametrize("side", [2, 4, 8])
+def test_means_over_cells_leave_out_what_fills_none(side: int, channels: tuple[int, ...]) -> None:
+    picture = np.random.default_rng(1).integers(
+        0, 256, (5 * side + 1, 3 * side + side - 1, *channels), np.uint8
+    )
+    blocks = picture[: 5 * side, : 3 * side].reshape(5, side, 3, side, *channels)
+    exact = blocks.mean(axis=(1, 3))
+    np.testing.assert_allclose(cell_means(picture.astype(np.float32), side), exact, rtol=1e-5)
+    rounded = cell_means(picture, side)
+    # Each halving rounds a half up.
+    assert rounded.dtype == np.uint8
+    np.testing.assert_allclose(rounded, exact, atol=1.5)
