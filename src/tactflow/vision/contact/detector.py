@@ -48,10 +48,8 @@ CONNECTED: Final = 0.25
 standard deviations. Chosen by hand."""
 STAY: Final = 0.7
 """Part of the threshold, in standard deviations, that is enough to stay in contact. Chosen by hand."""
-FORGET: Final = 0.96
-"""How fast the strongest recent change is forgotten, per frame: half in 17 frames. Chosen by hand."""
-FORGET_WIDE: Final = 0.98
-"""The same for wide, faint changes, which a gel that creeps back shows longest. Chosen by hand."""
+FORGET: Final = 0.98
+"""How fast the strongest recent change is forgotten, per frame: half in 34 frames. Chosen by hand."""
 WIDE: Final = 0.01
 """Part of the picture that a wide change covers at least: more than the noise of compression, which comes in
 blocks of 16 px of the camera (4 cells without contact where 48 would be contact)."""
@@ -241,7 +239,7 @@ class ContactDetector:
             self._suspected = None
         largest, widest = (0.0, 0.0) if found is None else (change.largest, change.largest_colour)
         self._strongest = max(self._strongest * FORGET, largest)
-        self._strongest_wide = max(self._strongest_wide * FORGET_WIDE, widest)
+        self._strongest_wide = max(self._strongest_wide * FORGET, widest)
         if found is None:
             self._mask = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
