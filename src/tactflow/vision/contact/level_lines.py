@@ -24,8 +24,9 @@ LEVELS: Final = 12
 FLATTER: Final = 0.5
 """Part of the steepest line's mean slope that lines around it have at least where the gel still climbs to the
 object."""
-BESIDE: Final = 2
-"""Cells beside that line in which the outline is looked for: cells are means over three by three."""
+BESIDE: Final = 3
+"""Cells beside that line in which the outline is looked for: cells are means over three by three, of which
+the surface has waves of four. From 2 to 6 outlines overlap as well with real ones within 0.01."""
 SMALLEST: Final = 9
 """Cells inside the smallest line: three by three."""
 DECIDED: Final = 5.0
