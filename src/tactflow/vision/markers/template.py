@@ -63,6 +63,16 @@ class Alignment(NamedTuple):
     stderr: Floats32
     seen: Flags
 
+    def put(self, marks: Indices, others: Alignment) -> None:
+        """Write the places of others, (k,), over those of the marks with these indices, (k,), in place."""
+        self.position[marks] = others.position
+        self.stderr[marks] = others.stderr
+        self.seen[marks] = others.seen
+
+    def take(self, marks: Indices) -> Alignment:
+        """Those of the marks with these indices, (k,)."""
+        return Alignment(self.position[marks], self.stderr[marks], self.seen[marks])
+
 
 class _Model(NamedTuple):
     """What the alignment of marks of one size needs.

@@ -240,9 +240,7 @@ class MarkerTracker:
         reach = np.minimum(REACH * self._apart, self._farthest)
         marks, chosen = grow(found.position, inliers, spots, self._interpolator, reach)
         if len(marks):
-            aligned = self._templates.align(image, spots[chosen], marks)
-            for whole, part in zip(found, aligned, strict=True):
-                whole[marks] = part
+            found.put(marks, self._templates.align(image, spots[chosen], marks))
             found.seen[self._evidence.left] = False
         return found
 
@@ -269,8 +267,7 @@ class MarkerTracker:
             for grid in torn:
                 if np.count_nonzero(there[grid]) > np.count_nonzero(inliers[grid]):
                     inliers[grid] = there[grid]
-                    for whole, part in zip(found, other, strict=True):
-                        whole[grid] = part[grid]
+                    found.put(grid, other.take(grid))
         return inliers
 
 
