@@ -23,7 +23,8 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
 from tactflow.fleet.names import name_problems, with_name
-from tactflow.fleet.run import Request, run_fleet
+from tactflow.fleet.run import run_fleet
+from tactflow.fleet.sinks import added
 from tactflow.system.arguments import positive
 from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
@@ -97,19 +98,22 @@ def _run_all(args: argparse.Namespace, file: Path, sensors: Sequence[str]) -> in
         raise ConfigError("\n".join(problems))
     sinks = {sensor: _added_sinks(args, sensor) for sensor in sensors}
     pipelines = {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors}
-    request = Request(
-        file,
-        args.overrides,
-        added={option for added in sinks.values() for option in added},
-        files={} if args.stats is None else {"--stats": args.stats},
-        options=_options(args),
-    )
-    return run_fleet(request, pipelines)
+    arguments = {
+        sensor: _arguments(args, file, pipeline, sinks[sensor]) for sensor, pipeline in pipelines.items()
+    }
+    return run_fleet(pipelines, arguments)
 
 
-def _options(args: argparse.Namespace) -> list[str]:
-    """The options of this run for the process of every sensor, except those about sinks and files."""
-    words = [] if args.max_frames is None else ["--max-frames", str(args.max_frames)]
+def _arguments(args: argparse.Namespace, file: Path, pipeline: Pipeline, sinks: Sinks) -> list[str]:
+    """The command line of the process that runs one sensor. sinks : added by options of this one."""
+    # Its end with standard input is the one with this process.
+    words = ["run", str(file), "--sensor", pipeline.sensor, "--end-with-stdin"]
+    for text in (*args.overrides, *(added(node) for node in pipeline.sinks if str(node.mark) in sinks)):
+        words += ["--set", text]
+    if args.stats is not None:
+        words += ["--stats", with_name(args.stats, pipeline.sensor)]
+    if args.max_frames is not None:
+        words += ["--max-frames", str(args.max_frames)]
     flags = (("--realtime", args.realtime), ("--quiet", args.quiet), ("--check", args.check))
     return words + [flag for flag, is_set in flags if is_set]
 

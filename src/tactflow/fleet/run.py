@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.fleet.names import with_name
 from tactflow.fleet.relay import relay
 from tactflow.fleet.sinks import (
     Shared,
     WatchedSink,
-    added,
     changes,
     clash_problems,
     shared_addresses,
@@ -25,26 +22,10 @@ from tactflow.system.children import python_command
 from tactflow.system.signals import ending_handled
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What to run for every sensor.
-
-    file : the pipeline file. overrides : for `--set`. added : options of the command line that added sinks,
-    as in the marks of these. files : option -> path, of which each sensor gets its own. options : remaining
-    command-line arguments.
-    """
-
-    file: Path
-    overrides: Sequence[str]
-    added: Collection[str]
-    files: Mapping[str, str]
-    options: Sequence[str]
-
-
-def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
+def run_fleet(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequence[str]]) -> int:
     """Run every sensor's pipeline in a process of its own until all have ended.
 
-    pipelines : sensor -> its pipeline, checked.
+    pipelines : sensor -> its pipeline, checked. arguments : sensor -> command line of its process.
 
     Returns
     -------
@@ -69,22 +50,11 @@ def run_fleet(request: Request, pipelines: Mapping[str, Pipeline]) -> int:
             stack.enter_context(relay(publication, upstream))
         members = []
         for sensor, pipeline in pipelines.items():
-            command = _command(request, sensor, pipeline, _side_by_side(sensor, pipeline, shared, scratch))
+            command = python_command("-m", "tactflow", *arguments[sensor])
+            for text in _side_by_side(sensor, pipeline, shared, scratch):
+                command += ["--set", text]
             members.append(Member(sensor, command, [WatchedSink(node) for node in pipeline.sinks]))
         return supervisor.run(members)
-
-
-def _command(request: Request, sensor: str, pipeline: Pipeline, changed: Sequence[str]) -> list[str]:
-    """The command that runs one sensor. changed : settings added to the user's."""
-    sinks = [added(node) for node in pipeline.sinks if str(node.mark) in request.added]
-    command = python_command("-m", "tactflow", "run", str(request.file), "--sensor", sensor)
-    # So that it ends when the supervisor is killed.
-    command.append("--end-with-stdin")
-    for text in (*request.overrides, *sinks, *changed):
-        command += ["--set", text]
-    for option, path in request.files.items():
-        command += [option, with_name(path, sensor)]
-    return [*command, *request.options]
 
 
 def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scratch: Path) -> list[str]:
