@@ -2,7 +2,7 @@
 
     python benchmarks/start.py --data RECORDINGS
 
-Six simulated and twelve recorded sensors, each with `--yes`: nothing is told but the source. Simulated ones
+Six simulated and twelve recorded sensors, each with `--yes` and nothing but the source. Simulated ones
 are judged on another seed, recorded ones on the frames that a person outlined (`tactflow.bench.judge`). Exit
 code 1 if a proposal misses more contacts than the pipeline chosen by hand, or has more false ones.
 """
