@@ -1,7 +1,7 @@
 """The checks of `tactflow doctor`, one function each.
 
 To add a check, write a function below `@check(name, unit, warning=..., fault=...)`. It takes an `Observation`
-and returns a `Measured`, or the reason why this source cannot be checked. Limits without a comment are
+and returns a `Finding`, or the reason why this source cannot be checked. Limits without a comment are
 measured: they double, or increase fivefold, an error of the default pipeline on the simulated scene `press`.
 """
 
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 import numpy as np
 
@@ -20,37 +20,27 @@ from tactflow.doctor.observation import Observation
 Verdict = Literal["good", "warning", "fault", "unknown"]
 
 
-class Measured(NamedTuple):
-    """number : in the unit of the check. says : its description. effect : consequence of a fault for the
-    errors.
-    advice : remedy. limits : for warning and fault, if they depend on the source."""
-
-    number: float
-    says: str
-    effect: str
-    advice: str
-    limits: tuple[float, float] | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of a check.
+    """Result of a check; a check function fills in all but the last three fields.
 
-    verdict : `unknown` if the source cannot be checked. number : measured value, or None. says : description
-    of the value, or why it is unknown. effect : consequence for the errors, advice : remedy; both empty if
-    good.
+    number : measured value, in the unit of the check; None if the source cannot be checked. says : its
+    description, or why it is unknown. effect : consequence of a fault for the errors, advice : remedy; both
+    empty if good. limits : for warning and fault; by default those of the check. verdict : `unknown` if the
+    source cannot be checked.
     """
 
-    name: str
-    verdict: Verdict
+    number: float | None
     says: str
-    number: float | None = None
-    unit: str = ""
     effect: str = ""
     advice: str = ""
+    limits: tuple[float, float] | None = None
+    name: str = ""
+    unit: str = ""
+    verdict: Verdict = "unknown"
 
 
-Measure = Callable[[Observation], Measured | str]
+Measure = Callable[[Observation], Finding | str]
 CHECKS: list[Callable[[Observation], Finding]] = []
 """All checks, in the order of the table."""
 
@@ -60,16 +50,16 @@ def check(name: str, unit: str, *, warning: float, fault: float) -> Callable[[Me
 
     def register(measure: Measure) -> Measure:
         def run(observed: Observation) -> Finding:
-            measured = measure(observed)
-            if isinstance(measured, str):
-                return Finding(name, "unknown", measured)
-            number, says, effect, advice, limits = measured
-            low, high = limits or (warning, fault)
+            found = measure(observed)
+            if isinstance(found, str) or found.number is None:
+                return Finding(None, str(found), name=name, unit=unit)
+            low, high = limits = found.limits or (warning, fault)
             sign = -1.0 if high < low else 1.0
-            if sign * number < sign * low:
-                return Finding(name, "good", says, number, unit)
-            verdict: Verdict = "fault" if sign * number >= sign * high else "warning"
-            return Finding(name, verdict, says, number, unit, effect, advice)
+            number = sign * found.number
+            found = replace(found, name=name, unit=unit, limits=limits)
+            if number < sign * low:
+                return replace(found, verdict="good", effect="", advice="")
+            return replace(found, verdict="fault" if number >= sign * high else "warning")
 
         CHECKS.append(run)
         return measure
@@ -106,7 +96,7 @@ MIN_FRAMES: Final = 3
 
 # The slowest cameras of such sensors have 25 frames/s; automatic exposure in the dark halves the rate.
 @check("rate", "1/s", warning=20.0, fault=12.0)
-def _rate(observed: Observation) -> Measured | str:
+def _rate(observed: Observation) -> Finding | str:
     if isinstance(gaps := observed.gaps, str):
         return gaps
     rate = 1.0 / float(gaps.mean())
@@ -121,7 +111,7 @@ def _rate(observed: Observation) -> Measured | str:
         if observed.dots
         else ""
     )
-    return Measured(
+    return Finding(
         rate,
         f"{rate:.3g} frames/s{nominal}, jitter {jitter:.0f} %",
         f"contacts shorter than {1000 / rate:.0f} ms may be missed{reach}",
@@ -133,7 +123,7 @@ def _rate(observed: Observation) -> Measured | str:
 
 # Chosen by hand.
 @check("drop-outs", "%", warning=1.0, fault=10.0)
-def _drop_outs(observed: Observation) -> Measured:
+def _drop_outs(observed: Observation) -> Finding:
     late = 0
     if not isinstance(gaps := observed.gaps, str):
         usual = max(float(np.median(gaps)), 1e-9)
@@ -142,7 +132,7 @@ def _drop_outs(observed: Observation) -> Measured:
     total = observed.frames + missing
     repeated = 100.0 * observed.repeated / total - (0.0 if observed.live else CODEC_REPEATS)
     stopped = f"; then: {observed.stopped}" if observed.stopped else ""
-    return Measured(
+    return Finding(
         100.0 if stopped else 100.0 * missing / total + max(0.0, repeated),
         f"{missing} of {total} frames missing, {observed.repeated} repeated{stopped}",
         "contacts are detected late, and dots move further between frames",
@@ -152,11 +142,11 @@ def _drop_outs(observed: Observation) -> Measured:
 
 # Three and nine frames at 30 a second; chosen by hand.
 @check("latency", "ms", warning=100.0, fault=300.0)
-def _latency(observed: Observation) -> Measured | str:
+def _latency(observed: Observation) -> Finding | str:
     if not observed.delays:
         return "frames have no capture time" if observed.live else "a recording has no latency"
     delay = 1000.0 * float(np.median(observed.delays))
-    return Measured(
+    return Finding(
         delay,
         f"frames are {delay:.0f} ms old when they are read",
         "a controller reacts that much later",
@@ -166,9 +156,9 @@ def _latency(observed: Observation) -> Measured | str:
 
 # At 46 grey levels, dots have 1.3 times the error; at 23 they are not detected.
 @check("exposure", "grey levels", warning=50.0, fault=30.0)
-def _exposure(observed: Observation) -> Measured:
+def _exposure(observed: Observation) -> Finding:
     level = float(np.median([level for level, _ in observed.exposures]))
-    return Measured(
+    return Finding(
         level,
         f"the brighter gel has {level:.0f} of 255 grey levels",
         "dots and shading disappear in the noise; below 24 grey levels the gel is classified as background",
@@ -177,9 +167,9 @@ def _exposure(observed: Observation) -> Measured:
 
 
 @check("clipping", "%", warning=1.5, fault=10.0)
-def _clipping(observed: Observation) -> Measured:
+def _clipping(observed: Observation) -> Finding:
     share = 100.0 * float(np.mean([clipped for _, clipped in observed.exposures]))
-    return Measured(
+    return Finding(
         share,
         f"{round(share, 2):.2g} % of the gel is clipped",
         "a contact there has no shading, and a wrong centre",
@@ -189,7 +179,7 @@ def _clipping(observed: Observation) -> Measured:
 
 # Without dots: 0.5 % of the width, which doubles the error of the contact's centre, and 1 %.
 @check("focus", "px", warning=math.nan, fault=math.nan)
-def _focus(observed: Observation) -> Measured | str:
+def _focus(observed: Observation) -> Finding | str:
     blur, dots, width = measures.blur(observed.typical), observed.dots, observed.typical.shape[1]
     if blur is None:
         return "the picture has no sharp edges"
@@ -199,13 +189,13 @@ def _focus(observed: Observation) -> Measured | str:
         says += f", dots of radius {dots.dot_radius:.1f} px"
         effect, limits = "displacements of dots are less exact", (0.28, 0.42)
     advice = "focus the lens on the gel's surface, clean it; a shorter exposure if the gel moves fast"
-    return Measured(blur, says, effect, advice, (limits[0] * width, limits[1] * width))
+    return Finding(blur, says, effect, advice, (limits[0] * width, limits[1] * width))
 
 
 @check("noise", "grey levels", warning=7.0, fault=16.0)
-def _noise(observed: Observation) -> Measured:
+def _noise(observed: Observation) -> Finding:
     noise = measures.noise_of(observed.pairs)
-    return Measured(
+    return Finding(
         noise,
         f"{noise:.1f} grey levels",
         "displacements of dots are less exact, and faint contacts are missed",
@@ -216,11 +206,11 @@ def _noise(observed: Observation) -> Measured:
 # From 2 to 3 %, the factor on the error grows from 1.3 to 8.5. Large contacts cause up to 0.9 % on real gels
 # (sts_640).
 @check("banding", "%", warning=1.5, fault=2.5)
-def _banding(observed: Observation) -> Measured | str:
+def _banding(observed: Observation) -> Finding | str:
     if len(observed.pairs) < MIN_FRAMES:
         return f"{len(observed.pairs)} frames are too few"
     amplitude, axis = measures.bands(observed.grays)
-    return Measured(
+    return Finding(
         100.0 * amplitude,
         f"bands of {100 * amplitude:.1f} % of the light across the {axis}",
         "bands are detected as contacts, and shift the centres of contacts",
@@ -231,12 +221,12 @@ def _banding(observed: Observation) -> Measured | str:
 
 # Real grids have up to 13 % empty positions, including perspective views; chosen by hand.
 @check("dots", "% missing", warning=15.0, fault=40.0)
-def _dots(observed: Observation) -> Measured | str:
+def _dots(observed: Observation) -> Finding | str:
     dots = observed.dots
     if dots is None:
         return "none detected; for a gel without dots use the pipeline markerless"
     grid = measures.lattice(dots, observed.typical)
-    return Measured(
+    return Finding(
         100.0 * grid.missing,
         f"{grid.found} {dots.polarity} dots {dots.pitch:.0f} px apart, {100 * grid.closed:.0f} % regular, "
         f"{100 * grid.missing:.0f} % missing, contrast {grid.contrast:.0f} grey levels",
@@ -248,7 +238,7 @@ def _dots(observed: Observation) -> Measured | str:
 # Drift adds to the error of displacements, 0.01 px on a resting simulated gel; the measurement itself has an
 # error of up to 0.05 px. Chosen by hand.
 @check("drift", "px", warning=0.15, fault=1.0)
-def _drift(observed: Observation) -> Measured | str:
+def _drift(observed: Observation) -> Finding | str:
     first, second_half = observed.pairs[0].image, []
     points = measures.points(first) if observed.dots is None else observed.dots.centers.astype(np.float32)
     for pair in observed.pairs[1:]:
@@ -264,7 +254,7 @@ def _drift(observed: Observation) -> Measured | str:
         return "too few untouched frames in the second half"
     x, y = np.median(second_half[-max(MIN_FRAMES, len(second_half) // 3) :], axis=0)
     drift = math.hypot(x, y)
-    return Measured(
+    return Finding(
         drift,
         f"the resting gel has moved by {drift:.2f} px ({x:+.2f}, {y:+.2f})",
         f"every displacement, and the flow, is off by {drift:.2f} px",
