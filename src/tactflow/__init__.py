@@ -3,9 +3,9 @@
 >>> import tactflow
 >>> for result in tactflow.stream(source="sim:press", max_frames=60):
 ...     if result.contact is not None:
-...         print(f"{result.t:.2f} s: contact of {result.contact.area:.0f} px^2")
+...         print(f"{result.t:.2f} s: contact at x = {result.contact.center[0]:.0f} px")
 ...         break
-0.53 s: contact of 804 px^2
+0.53 s: contact at x = 115 px
 
 What `__all__` lists is public and changes only with a line in CHANGELOG.md. Nothing is imported before it is
 used.
