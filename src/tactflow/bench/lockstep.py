@@ -24,6 +24,7 @@ from typing import Any
 from tactflow.api import make_runner
 from tactflow.bench.timing import BLOCK, CopyUnit, Times, quiet
 from tactflow.engine.collect import with_collector
+from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline, Queue
@@ -128,18 +129,14 @@ class LockstepPipeline:
         return replace(collecting, nodes=nodes, opencv_threads=1)
 
 
-def with_params(pipeline: Pipeline, stage: str, **params: Any) -> Pipeline:
-    """The same pipeline with other parameters of a stage; defaults for those that are left out."""
-    node = pipeline.nodes[stage]
-    changed = replace(node, params=node.component.params.model_validate(params))
-    return replace(pipeline, nodes={**pipeline.nodes, stage: changed})
+def with_params(pipeline: Pipeline, stage: str, params: StageParams) -> Pipeline:
+    """The same pipeline with other parameters of a stage."""
+    return replace(pipeline, nodes={**pipeline.nodes, stage: replace(pipeline.nodes[stage], params=params)})
 
 
 def on_recording(pipeline: Pipeline, path: Path) -> Pipeline:
     """The same pipeline reading another recording."""
-    source = pipeline.source
-    kept = source.params.model_dump(exclude_unset=True)
-    return with_params(pipeline, source.id, **{**kept, "source": str(path)})
+    return with_params(pipeline, pipeline.source.id, pipeline.source.params.changed(source=str(path)))
 
 
 def take_turns(

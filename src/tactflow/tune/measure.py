@@ -131,9 +131,8 @@ def _on_sensor(pipeline: Pipeline) -> Pipeline:
     if "preprocess" not in pipeline.nodes:
         return pipeline
     params = pipeline.nodes["preprocess"].params
-    return with_params(
-        pipeline, "preprocess", **params.model_dump(include={"downsample", "method"}, exclude_unset=True)
-    )
+    kept = params.model_dump(include={"downsample", "method"}, exclude_unset=True)
+    return with_params(pipeline, "preprocess", type(params)(**kept))
 
 
 def _set_errors(trial: Trial, tally: Tally, scale: float) -> None:

@@ -13,7 +13,6 @@ from typing import Final
 import cv2
 import numpy as np
 
-from tactflow.bench.lockstep import with_params
 from tactflow.doctor.measures import DIM, Pair
 from tactflow.doctor.observation import Observation, watch
 from tactflow.engine.errors import SourceError
@@ -153,8 +152,6 @@ def _geometry(pipeline: Pipeline) -> Callable[[ColorImage], ColorImage]:
     """The geometry of the pipeline's `preprocess` without downsampling, a function on (H, W, 3) uint8."""
     if "preprocess" not in pipeline.nodes:
         return np.array
-    params = pipeline.nodes["preprocess"].params
-    kept = params.model_dump(exclude={"downsample"}, exclude_unset=True, by_alias=True)
-    node = with_params(pipeline, "preprocess", **kept).nodes["preprocess"]
-    process = node.component.cls(node.params).process
+    node = pipeline.nodes["preprocess"]
+    process = node.component.cls(node.params.changed(downsample=1)).process
     return lambda image: np.array(process(Frame("tune", 0, 0.0, np.array(image))).image)
