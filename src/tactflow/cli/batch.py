@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         )
     request = resolved(file, args.overrides, args.sensor, args.format)
     recordings, store = find_recordings(words), Store(args.out.absolute())
-    tell = _silent if args.quiet else say
+    tell: Callable[[str], None] = (lambda _: None) if args.quiet else say
     signals: list[int] = []
     number, of = args.shard
     with (
@@ -117,10 +117,6 @@ def run(args: argparse.Namespace) -> int:
     if signals and result.undone:
         return INTERRUPTED
     return StageError.exit_code if result.undone or result.failed else 0
-
-
-def _silent(_text: str) -> None:
-    """Say nothing."""
 
 
 def _outcome(recording: Recording, result: Result, store: Store, request: Request) -> Outcome:
