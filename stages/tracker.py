@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Literal
 
 import numpy as np
@@ -15,8 +14,6 @@ from tactflow.ports import Image, Valid
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.tracking import MarkerTracker
 from tactflow.vision.types import Markers
-
-logger = logging.getLogger("tactflow")
 
 
 class Tracker(Stage):
@@ -72,8 +69,6 @@ class Tracker(Stage):
         self._detection = detect_markers(
             image, dot_radius=self.params.dot, polarity=self.params.polarity, valid=valid
         )
-        if self._detection.doubt is not None:
-            logger.warning("tracker: %s", self._detection.doubt)
         return self._tracker_of([image], self._detection)
 
     def _tracker_of(self, references: list[NDArray[np.uint8]], detection: Detection) -> MarkerTracker:

@@ -52,16 +52,6 @@ def test_several_reference_frames_are_averaged_and_keep_the_index_of_every_marke
     assert size[8] < 0.8 * size[1]
 
 
-def test_a_close_choice_between_two_grids_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    dark = picture((0, 0)) // 2 + 40
-    bright = render((205, 210), TRUTH[:30] + 15.0, 4.2, bright=True, light=0.0, contrast=0.2)
-    feed(Tracker(Tracker.Params()), np.asarray(dark + bright, np.uint8), 0)
-    assert "tracker: the marks might be others" in caplog.text
-    caplog.clear()
-    feed(Tracker(Tracker.Params()), picture((0, 0)), 0)
-    assert caplog.text == ""
-
-
 def test_reset_takes_a_new_reference() -> None:
     stage = Tracker(Tracker.Params())
     feed(stage, picture((0, 0)), 0)

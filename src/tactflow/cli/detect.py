@@ -110,8 +110,6 @@ def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
     yield from _best(rival, "next best")
     if rival is None:
         yield "nothing else in the picture looks like dots"
-    if marks.doubt is not None:
-        yield f"warning: {marks.doubt}"
 
 
 def _best(spots: Candidate | None, what: str = "best") -> Iterator[str]:

@@ -123,7 +123,7 @@ class MarkerTracker:
         dark = detection.polarity == "dark"
         self._origin = np.array(detection.centers, np.float64)
         if len(grays) > 1:
-            self._origin = refine_centers(mean if dark else 255 - mean, self._origin, self._radius)
+            self._origin = refine_centers(mean if dark else 255 - mean, self._origin, _radii(detection))
         self._templates = MarkerTemplates(mean, self._origin, _radii(detection), dark)
         self._sigma = max(self._radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
         peaks, strength = find_peaks(mean, self._sigma, self._polarity, 0.0)
