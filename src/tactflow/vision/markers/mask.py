@@ -15,6 +15,7 @@ from tactflow.vision.arrays import check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers
+from tactflow.vision.markers.spots import ONE_SIZE
 
 Bytes = NDArray[np.uint8]
 Polarity = Literal["dark", "bright"]
@@ -29,10 +30,6 @@ for the gel. Chosen by hand."""
 CONTRAST_FRACTION: Final = 0.25
 """Fraction of the dots' median contrast from which on a spot is a dot. Worn dots keep that much.
 Chosen by hand."""
-
-ONE_MASK: Final = 1.6
-"""Ratio of the radii of dots for which one circle serves: it lies a radius outside a dot, so one of 1.6 times
-the radius is still within it. Chosen on handmade_dots."""
 
 LEAST_CONTRAST: Final = 6.0
 """Least contrast of a dot, grey levels: 120 / 20, the threshold of the original script over its gain."""
@@ -103,9 +100,9 @@ def _other_sizes(found: Detection) -> tuple[float, ...]:
     """Radii, px, of marks that a circle around one of the usual size would cut or lead past."""
     if found.radii is None:
         return ()
-    step = np.rint(np.log(found.radii / found.dot_radius) / np.log(ONE_MASK))
+    step = np.rint(np.log(found.radii / found.dot_radius) / np.log(ONE_SIZE))
     sizes, counts = np.unique(step, return_counts=True)
-    return tuple(found.dot_radius * ONE_MASK ** float(s) for s in sizes[(counts > 1) & (sizes != 0)])
+    return tuple(found.dot_radius * ONE_SIZE ** float(s) for s in sizes[(counts > 1) & (sizes != 0)])
 
 
 def marker_mask(image: Bytes, dot: Dot) -> Bytes:

@@ -8,6 +8,7 @@ import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
 from tactflow.vision.compiled import kernel
+from tactflow.vision.markers.lattice import BESIDE
 from tactflow.vision.markers.matching import LEAST_SHARE, surroundings
 
 REST: Final = 0.1
@@ -21,9 +22,6 @@ but one of them (measured)."""
 LEAVING_EVIDENCE: Final = 5.0
 """Evidence that a mark stays while those around it move, from which on it leaves: very strong (Kass and
 Raftery, "Bayes factors", 1995)."""
-
-NEAREST: Final = 4
-"""Marks around, of which one has to move: those next to it on a square grid."""
 
 
 class MotionEvidence:
@@ -110,7 +108,7 @@ def weigh_motion(
         moving = moving or moves[n]
     for n in range(len(displacement) if moving else 0):
         beside = False
-        for k in range(min(NEAREST, around.shape[1])):
+        for k in range(min(BESIDE, around.shape[1])):
             beside = beside or (moves[around[n, k]] and seen[around[n, k]])
         if moves[n] or not (seen[n] and beside):
             continue

@@ -17,8 +17,8 @@ from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import lattice
-from tactflow.vision.markers.lattice import LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, Spots, joined
+from tactflow.vision.markers.lattice import BESIDE, LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
+from tactflow.vision.markers.spots import ONE_SIZE, RADIUS_PER_SIGMA, Spots, joined
 
 Sign = Literal["dark", "bright"]
 
@@ -28,9 +28,6 @@ LEAST_STRENGTH: Final = 0.35
 
 BETWEEN: Final = 0.55
 """Distance, pitches, below which the weaker of two spots lies between marks. Chosen by hand."""
-
-LONELY: Final = 2.3
-"""Distance of the second nearest mark, pitches, beyond which a spot is lonely. Chosen by hand."""
 
 RANDOM_SHARE: Final = 0.3
 """Share of parallelograms that close among spots in no lattice: 0.1 to 0.25 on rendered textures, 0.31 where
@@ -43,10 +40,6 @@ else. Chosen on tactip_video, whose pins have a bright rim around them."""
 APART: Final = 0.9
 """Distance of two marks, sums of their radii, at least: with 1, marks that crowd are lost (sts_torque160)."""
 
-ALONE: Final = 0.75
-"""Clearance of a spot that needs no lattice to be a mark. Dots on even ground have 0.8 to 1, pieces of edges
-and lines 0.3 to 0.7 (tactip_video, sts_640)."""
-
 CLEAR: Final = 0.55
 """Clearance of a spot that is a mark where a single corner or line of the lattice wants one. Chosen on
 sts_640."""
@@ -54,10 +47,6 @@ sts_640."""
 NEAR: Final = 3.2
 """Ratio of the responses of a spot and of the marks around, either way, at most, where the lattice
 wants a mark: light and dirt weaken marks."""
-
-ALIKE: Final = 1.5
-"""Ratio of the radii of a spot and of the marks around, either way, at most; and of their responses, where
-only a clear ring or even ground says that it is a mark."""
 
 LEAST_BEND: Final = 0.15
 """Bend of a mark over that of most marks, at least: a piece of an edge or a line has 0. Of the dots marked on
@@ -73,9 +62,6 @@ LIKENESS: Final = 0.64
 """Likeness of a spot to the marks around, at least, to be one of them where the lattice wants one and other
 marks are too near for the ring to tell. Chosen on pictures of eight sensors, shrunk until their marks were 3
 to 8 px apart: 0.6 finds 0.2 % more of them and 0.2 % more that are none."""
-
-MARKS_AROUND: Final = 4
-"""Nearest marks that are compared with such a spot. Chosen by hand."""
 
 LEAST_CLUSTER: Final = 6
 """Marks of a lattice beside a larger one, at least: four or five spots form a parallelogram by chance
@@ -145,7 +131,7 @@ def evidence(gray: NDArray[np.float32], marks: Spots) -> Floats:
     How much its response differs from those around, as the absolute logarithm of their ratio; how much it
     looks like them, -1 to 1; and the share of parallelograms that it is part of and that close, 0 to 1.
     """
-    _, around = nearest(marks.points, MARKS_AROUND)
+    _, around = nearest(marks.points, BESIDE)
     if not around.size:
         return np.full((len(marks.points), 3), np.nan)
     strength = np.log(marks.strength / np.median(marks.strength[around], axis=1))
@@ -199,7 +185,7 @@ def _alike(spots: Spots) -> Spots:
         distances, near = nearest(kept.points, 2)
         pitch = float(np.median(distances[:, 0]))
         between = (distances[:, 0] < BETWEEN * pitch) & (kept.strength < kept.strength[near[:, 0]])
-        lonely = distances[:, 1] > LONELY * pitch
+        lonely = distances[:, 1] > LONGEST_LINK * pitch
         if not (between | lonely).any():
             break
         kept = kept.at(~(between | lonely))
@@ -207,18 +193,16 @@ def _alike(spots: Spots) -> Spots:
 
 
 def _in_lattice(marks: Spots) -> Spots:
-    """The marks that are part of a lattice, or stand alone on even ground."""
-    if len(marks.points) < 4:
+    """The marks that are part of a lattice."""
+    if len(marks.points) < LEAST_CLUSTER:
         return marks
     share, cluster = lattice.own_shares(marks.points, links(marks.points))
-    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE)
-    alike = _ratio(marks.strength, np.median(marks.strength)) < ALIKE
-    return marks.at(member | (alike & (marks.clear > ALONE)))
+    return marks.at((cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE))
 
 
 def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     """The marks, and spots where their lattice wants one, a row at a time."""
-    while len(marks.points) >= MARKS_AROUND:
+    while len(marks.points) >= BESIDE:
         touching = APART * (spots.radius[:, None] + marks.radius)
         spots = spots.at(np.all(cdist(spots.points, marks.points) > touching, axis=1))
         new = _wanted(gray, marks, spots)
@@ -233,12 +217,12 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     support = lattice.support(spots.points, expected_marks(marks.points))
     wanted, support = spots.at(support > 0), support[support > 0]
     away = cdist(wanted.points, marks.points)
-    around = np.argsort(away, axis=1, kind="stable")[:, :MARKS_AROUND]
+    around = np.argsort(away, axis=1, kind="stable")[:, :BESIDE]
     usual = np.median(marks.radius[around], axis=1)
     radius = _ratio(wanted.radius, usual)
     strength = _ratio(wanted.strength, np.median(marks.strength[around], axis=1))
-    fits = (radius < ALIKE) & (strength < NEAR)
-    sure = (wanted.clear > CLEAR) & (strength < ALIKE)
+    fits = (radius < ONE_SIZE) & (strength < NEAR)
+    sure = (wanted.clear > CLEAR) & (strength < ONE_SIZE)
     chosen = (wanted.clear > RING_CONTRAST) & ((support >= LEAST_SUPPORT) | sure)
     left = np.flatnonzero(fits & ~chosen)
     chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > LIKENESS

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
 from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.markers.spots import ONE_SIZE
 
 Bytes = NDArray[np.uint8]
 Levels = NDArray[np.int16]
@@ -36,9 +37,6 @@ PATCH_MARGIN: Final = 1.2
 RIDGE: Final = 1e-6
 """Ridge of the normal equations, relative to their trace: keeps marks without contrast solvable. Such marks
 are never trusted. Chosen by hand."""
-
-ONE_TEMPLATE: Final = 1.5
-"""Ratio of radii of marks whose templates have one size, at most. Chosen by hand."""
 
 TINY: Final = np.finfo(np.float32).tiny
 """Keeps quotients finite."""
@@ -128,7 +126,7 @@ class MarkerTemplates:
 
     def add(self, reference: Floats32, origin: Floats, radii: Floats) -> None:
         """Append marks (n, 2), px, with radii (n,), px, as they look in another frame."""
-        step = np.floor(np.log(radii / radii.min()) / np.log(ONE_TEMPLATE) + 1e-6)
+        step = np.floor(np.log(radii / radii.min()) / np.log(ONE_SIZE) + 1e-6)
         sizes, size_of = np.unique(step, return_inverse=True)
         place = np.empty(len(radii), np.int64)
         known = len(self._models)
