@@ -47,16 +47,6 @@ CROWDED: Final = 0.32
 LONE_PITCH: Final = 8.0
 """Pitch of a single mark, in radii. Chosen by hand."""
 
-CENTROID_WINDOW: Final = 1.6
-"""Radius of the window of a centroid, in radii of the mark. Chosen by hand: it holds the mark's border."""
-
-SURROUNDINGS: Final = (1.4, 1.9)
-"""Inner and outer radius of the ring that gives the level around a mark, in radii of the mark; the outer one
-is 1.5 px wider. Chosen by hand."""
-
-CENTROID_ROUNDS: Final = 4
-"""Steps of a centroid's window: each is a fraction of the one before."""
-
 _NO_MARKERS: Final = (
     "0 markers found: is the sensor marker-less? then use the pipeline markerless, or one that is made for "
     "your sensor without dots (tactflow pipelines)"
@@ -264,16 +254,14 @@ def _candidate(found: Group) -> Candidate:
 
 
 def _detection(gray: NDArray[np.float32], best: Group, marks: Spots, others: list[Group]) -> Detection:
-    """The marks with exact centres, in reading order, and what else they might be."""
-    dark = gray if best.polarity == "dark" else 255 - gray
+    """The marks in reading order, and what else they might be."""
     radius = best.sigma * RADIUS_PER_SIGMA
     ratio = np.maximum(marks.radius / radius, radius / marks.radius)
     radii = np.where(ratio < ONE_SIZE, radius, marks.radius)
     if len(radii) > 1:
         radii = np.minimum(radii, CROWDED * nearest(marks.points, 1)[0][:, 0])
-    centers = refine_centers(dark, marks.points, radii)
-    order = _reading_order(centers, radius)
-    centers, radii, marks = centers[order], radii[order], marks.at(order)
+    order = _reading_order(marks.points, radius)
+    centers, radii, marks = marks.points[order], radii[order], marks.at(order)
     pitch = pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
     edges = neighbour_graph(centers, LONGEST_LINK * pitch)
     rival = next((_candidate(other) for other in others if not _same(other, centers, radii)), None)
@@ -300,60 +288,6 @@ def _require_options(
         raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
     if valid is not None and (valid.shape != shape or valid.dtype != np.uint8):
         raise ValueError(f"required valid to be {shape} uint8, got shape {valid.shape}, dtype {valid.dtype}")
-
-
-def refine_centers(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Floats:
-    """Centroid of what is darker than its surroundings, in a window that follows it.
-
-    The surroundings are a plane fitted to a ring around the mark, so a slope of the light does not pull.
-
-    Parameters
-    ----------
-    gray : (H, W) float32, grey levels; marks are dark.
-    centers : (N, 2) float64, starting points, px, right to about a radius.
-    radii : (N,) float64, of the marks, px.
-
-    Returns
-    -------
-    centers : (N, 2) float64, px; where there is nothing dark, the starting point. Whole grey levels are
-        exact in float32, and everything after is float64.
-
-    Examples
-    --------
-    >>> gray = np.full((30, 30), 200, np.float32)
-    >>> gray[12:17, 10:15] = 50
-    >>> refine_centers(gray, np.array([[11.0, 15.0]]), np.array([2.5])).round(3)
-    array([[12., 14.]])
-    """
-    radius = radii[:, None]
-    inner, outer = SURROUNDINGS[0] * radius, SURROUNDINGS[1] * radius + 1.5
-    reach = int(np.ceil(outer.max(initial=0)))
-    axis = np.arange(-reach, reach + 1)
-    grid_x, grid_y = (part.ravel() for part in np.meshgrid(axis, axis))
-    padded = cv2.copyMakeBorder(gray, reach, reach, reach, reach, cv2.BORDER_REPLICATE).astype(np.float64)
-    height, width = gray.shape
-    result = np.array(centers, np.float64)
-    limits = np.array([width - 1, height - 1])
-    for _ in range(CENTROID_ROUNDS):
-        corner = np.clip(np.rint(result).astype(np.int64), 0, limits)
-        patches = padded[corner[:, 1:] + grid_y + reach, corner[:, :1] + grid_x + reach]
-        x = grid_x + corner[:, :1] - result[:, :1]
-        y = grid_y + corner[:, 1:] - result[:, 1:]
-        distance = np.hypot(x, y)
-        ring = np.clip(distance - inner, 0, 1) * np.clip(outer - distance, 0, 1)
-        basis = np.stack([np.ones_like(x), x, y], axis=1)
-        weighted = basis * ring[:, None]
-        normal = weighted @ basis.transpose(0, 2, 1)
-        plane = np.linalg.solve(normal, weighted @ patches[:, :, None])
-        darkness = np.maximum((basis.transpose(0, 2, 1) @ plane)[:, :, 0] - patches, 0)
-        darkness *= np.clip(CENTROID_WINDOW * radius + 0.5 - distance, 0, 1)
-        total = darkness.sum(axis=1)
-        good = total > 1e-3
-        move = np.zeros_like(result)
-        move[good, 0] = (darkness * x).sum(axis=1)[good] / total[good]
-        move[good, 1] = (darkness * y).sum(axis=1)[good] / total[good]
-        result += np.clip(move, -radius, radius)
-    return result
 
 
 def _reading_order(centers: Floats, radius: float) -> NDArray[np.int64]:

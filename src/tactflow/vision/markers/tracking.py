@@ -15,7 +15,6 @@ from tactflow.vision.markers.detection import (
     Detection,
     NoMarkersError,
     detect_markers,
-    refine_centers,
     require_image,
     to_gray,
 )
@@ -68,8 +67,7 @@ class MarkerTracker:
     ----------
     reference : (H, W, 3) uint8 BGR or (H, W) uint8, the untouched gel; or several such frames of one size,
         whose mean has less noise.
-    detection : the marks of the reference; with several frames, their centres are taken again from the mean.
-        None: those that `detect_markers` finds in the first frame.
+    detection : the marks of the reference. None: those that `detect_markers` finds in the first frame.
     max_displacement : farthest a mark may go between two frames, or from where its neighbours suggest, px.
         Larger values cost time in the search and admit more confusion. None: 1.3 times the pitch.
     valid : (H, W) uint8, not 0 where there is gel, for marks that join. None: everywhere.
@@ -120,10 +118,8 @@ class MarkerTracker:
         across = float(np.hypot(*self._shape))
         self._farthest = min(max_displacement or MAX_DISPLACEMENT * self._pitch, across)
         self._polarity = detection.polarity
-        dark = detection.polarity == "dark"
         self._origin = np.array(detection.centers, np.float64)
-        if len(grays) > 1:
-            self._origin = refine_centers(mean if dark else 255 - mean, self._origin, _radii(detection))
+        dark = detection.polarity == "dark"
         self._templates = MarkerTemplates(mean, self._origin, _radii(detection), dark)
         self._sigma = max(self._radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
         peaks, strength = find_peaks(mean, self._sigma, self._polarity, 0.0)
