@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.drawing.lettering import Lettering
 from tactflow.drawing.results import DARK, GRAY, GREEN, MAGENTA, WHITE, YELLOW, Colour
-from tactflow.vision.markers.detection import Candidate, Detection
+from tactflow.vision.markers import Candidate, Detection
 
 SHORTEST_SIDE: Final = 480
 """Shorter side of the drawn frame, px, at least: smaller frames are enlarged. Chosen by hand."""

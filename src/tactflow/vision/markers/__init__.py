@@ -10,10 +10,11 @@ the spots of the frame, and places the marks that are not seen. `motion` tells w
 `mask` tells where markers cover the gel, and `inpaint` fills these places.
 """
 
-from tactflow.vision.markers.detection import Candidate, Detection, NoMarkersError, detect_markers
+from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.markers.lattice import neighbour_graph
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
+from tactflow.vision.markers.selection import Candidate
 from tactflow.vision.markers.tracking import MarkerTracker
 
 __all__ = [

@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.lattice import LONGEST_LINK, corners, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.selection import Group, Sign, evidence, groups, links, marks_of, probability
-from tactflow.vision.markers.spots import ONE_SIZE, RADIUS_PER_SIGMA, Spots, find_spots, sigmas
+from tactflow.vision.markers.selection import (
+    Candidate,
+    Sign,
+    candidates,
+    evidence,
+    links,
+    marks_of,
+    probability,
+)
+from tactflow.vision.markers.spots import ONE_SIZE, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
 
 LEAST_SCORE: Final = 2.5
-"""Score of the weakest group of spots that is believed to be marks (see `selection.groups`). Real gels with
+"""Score of the weakest candidate that is believed to be marks (see `selection.candidates`). Real gels with
 marks score 4 and more; dust, reflections and noise on gels without at most 0.4, what compression leaves along
 edges up to 3, in 36 of 38 such pictures of wedge_grasp up to 2.4 (measured). Marks 3.5 px apart need as
 little."""
@@ -36,13 +45,16 @@ texture looks the same when dark and bright are swapped, marks and the gel betwe
 sensors have at most 0.67, dashes that touch 0.78, three of twelve simulated cloths that are refused for
 nothing else 0.86 and more (measured). So have marks that cover 0.4 of the gel."""
 
-SAME_MARKS: Final = 0.5
-"""Share of the spots of another group that lie on the marks, from which on it is no rival but they again, at
-another scale or their highlights. Chosen by hand."""
-
 CROWDED: Final = 0.32
 """Radius of a mark over the distance of the nearest other, at most: so its surroundings hold no other. With
 0.37, 0.2 % of the marks of seven recordings are lost (measured)."""
+
+CENTROID_WINDOW: Final = 1.6
+"""Radius of the window of a centroid, in radii of the mark. Chosen by hand: it holds the mark's border."""
+
+SURROUNDINGS: Final = (1.4, 1.9)
+"""Inner and outer radius of the ring that gives the level around a mark, in radii of the mark; the outer one
+is 1.5 px wider. Chosen by hand."""
 
 LONE_PITCH: Final = 8.0
 """Pitch of a single mark, in radii. Chosen by hand."""
@@ -52,23 +64,6 @@ _NO_MARKERS: Final = (
     "your sensor without dots (tactflow pipelines)"
 )
 _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels)"
-
-
-class Candidate(NamedTuple):
-    """Spots that may be marks: what was chosen, or could have been.
-
-    centers : (N, 2) float64, px. radius : px. score : how much they look like marks, comparable within one
-    picture. lattice : share of parallelograms of neighbours that close, 0 to 1.
-    """
-
-    centers: Floats
-    radius: float
-    polarity: Literal["dark", "bright"]
-    score: float
-    lattice: float
-
-    def __str__(self) -> str:
-        return f"{len(self.centers)} {self.polarity} ones of radius {self.radius:.1f} px"
 
 
 class NoMarkersError(ValueError):
@@ -184,7 +179,7 @@ def detect_markers(
     scales = {
         sign: {s: find_spots(gray, s, sign, valid) for s in sigmas(dot_radius, shortest)} for sign in signs
     }
-    found = groups(scales) if shortest >= 8 else []
+    found = candidates(scales) if shortest >= 8 else []
     if not found:
         raise NoMarkersError(_NO_MARKERS)
     best = found[0]
@@ -197,14 +192,14 @@ def detect_markers(
     # One alone has no probability.
     marks = marks.at(~(probability(evidence(gray, marks)) < least_probability))
     if not len(marks.points):
-        raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, _candidate(best))
+        raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, best)
     detection = _detection(gray, best, marks, found[1:])
     rival = detection.rival
     if rival is not None and rival.polarity != best.polarity and rival.score > CLOSE * best.score:
         raise NoMarkersError(
-            f"{_NO_MARKERS} ({_candidate(best)} are as regular as {rival}, as in a texture; if either are "
+            f"{_NO_MARKERS} ({best} are as regular as {rival}, as in a texture; if either are "
             "marks, give their polarity)",
-            _candidate(best),
+            best,
         )
     return detection
 
@@ -214,23 +209,23 @@ def _levels(gray: NDArray[np.float32], points: Floats) -> NDArray[np.float32]:
     return np.asarray(map_coordinates(gray, points.T[::-1], order=1, mode="nearest"), np.float32)
 
 
-def _require_lattice(found: list[Group]) -> None:
+def _require_lattice(found: list[Candidate]) -> None:
     """Raises NoMarkersError for spots, best first, that are too few, too faint, or in no lattice."""
     if found[0].score >= LEAST_SCORE:
         return
     best = max(found, key=lambda other: float(other.spots.strength.sum()))
     raise NoMarkersError(
         f"{_NO_MARKERS} ({len(best.spots.points)} {best.polarity} spots of radius "
-        f"{best.sigma * RADIUS_PER_SIGMA:.1f} px form no lattice: {100 * best.share:.0f} % of their "
+        f"{best.radius:.1f} px form no lattice: {100 * best.lattice:.0f} % of their "
         "parallelograms close, of a grid's 80 %; if they are marks, and no dust or random texture, give "
         "their radius in pixels)",
-        _candidate(best),
+        best,
     )
 
 
-def _require_gel_between(gray: NDArray[np.float32], best: Group, spots: Spots) -> None:
+def _require_gel_between(gray: NDArray[np.float32], best: Candidate, spots: Spots) -> None:
     """Raises NoMarkersError for marks between which there is no even gel, as in a weave."""
-    points, radius = spots.points, best.sigma * RADIUS_PER_SIGMA
+    points, radius = spots.points, best.radius
     around = corners(points, links(points))
     if not len(around.points):
         return
@@ -244,37 +239,87 @@ def _require_gel_between(gray: NDArray[np.float32], best: Group, spots: Spots) -
         raise NoMarkersError(
             f"{_NO_MARKERS} ({len(points)} {best.polarity} spots of radius {radius:.1f} px run into each "
             "other, like the threads of a cloth; if they are marks, give their radius in pixels)",
-            _candidate(best),
+            best,
         )
 
 
-def _candidate(found: Group) -> Candidate:
-    radius = found.sigma * RADIUS_PER_SIGMA
-    return Candidate(found.spots.points, radius, found.polarity, found.score, found.share)
-
-
-def _detection(gray: NDArray[np.float32], best: Group, marks: Spots, others: list[Group]) -> Detection:
+def _detection(
+    gray: NDArray[np.float32], best: Candidate, marks: Spots, others: list[Candidate]
+) -> Detection:
     """The marks in reading order, and what else they might be."""
-    radius = best.sigma * RADIUS_PER_SIGMA
+    radius = best.radius
     ratio = np.maximum(marks.radius / radius, radius / marks.radius)
     radii = np.where(ratio < ONE_SIZE, radius, marks.radius)
     if len(radii) > 1:
         radii = np.minimum(radii, CROWDED * nearest(marks.points, 1)[0][:, 0])
-    order = _reading_order(marks.points, radius)
-    centers, radii, marks = marks.points[order], radii[order], marks.at(order)
+    centers = _centroids(gray if best.polarity == "dark" else 255 - gray, marks.points, radii)
+    order = _reading_order(centers, radius)
+    centers, radii, marks = centers[order], radii[order], marks.at(order)
     pitch = pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
     edges = neighbour_graph(centers, LONGEST_LINK * pitch)
-    rival = next((_candidate(other) for other in others if not _same(other, centers, radii)), None)
+    rival = next((other for other in others if not _same(other, centers, radii)), None)
     sizes = radii if (radii != radius).any() else None
-    return Detection(
-        centers, radius, best.polarity, pitch, edges, sizes, _candidate(best), rival, evidence(gray, marks)
-    )
+    return Detection(centers, radius, best.polarity, pitch, edges, sizes, best, rival, evidence(gray, marks))
 
 
-def _same(other: Group, centers: Floats, radii: Floats) -> bool:
-    """Whether another group lies where the marks are."""
-    away = np.hypot(*(other.spots.points[:, None] - centers).transpose(2, 0, 1))
-    return bool((away < radii).any(axis=1).mean() > SAME_MARKS)
+def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Floats:
+    """Centroid of what is darker than its surroundings, in a window that follows it.
+
+    The surroundings are a plane fitted to a ring around the mark, so a slope of the light does not pull.
+
+    Parameters
+    ----------
+    gray : (H, W) float32, grey levels; marks are dark.
+    centers : (N, 2) float64, starting points, px, right to about a radius.
+    radii : (N,) float64, of the marks, px.
+
+    Returns
+    -------
+    centers : (N, 2) float64, px; where there is nothing dark, the starting point. Whole grey levels are
+        exact in float32, and everything after is float64.
+
+    Examples
+    --------
+    >>> gray = np.full((30, 30), 200, np.float32)
+    >>> gray[12:17, 10:15] = 50
+    >>> _centroids(gray, np.array([[11.0, 15.0]]), np.array([2.5])).round(3)
+    array([[12., 14.]])
+    """
+    radius = radii[:, None]
+    inner, outer = SURROUNDINGS[0] * radius, SURROUNDINGS[1] * radius + 1.5
+    reach = int(np.ceil(outer.max(initial=0)))
+    axis = np.arange(-reach, reach + 1)
+    grid_x, grid_y = (part.ravel() for part in np.meshgrid(axis, axis))
+    padded = cv2.copyMakeBorder(gray, reach, reach, reach, reach, cv2.BORDER_REPLICATE).astype(np.float64)
+    height, width = gray.shape
+    result = np.array(centers, np.float64)
+    limits = np.array([width - 1, height - 1])
+    # Each step is a fraction of the one before.
+    for _ in range(4):
+        corner = np.clip(np.rint(result).astype(np.int64), 0, limits)
+        patches = padded[corner[:, 1:] + grid_y + reach, corner[:, :1] + grid_x + reach]
+        x = grid_x + corner[:, :1] - result[:, :1]
+        y = grid_y + corner[:, 1:] - result[:, 1:]
+        distance = np.hypot(x, y)
+        ring = np.clip(distance - inner, 0, 1) * np.clip(outer - distance, 0, 1)
+        basis = np.stack([np.ones_like(x), x, y], axis=1)
+        weighted = basis * ring[:, None]
+        normal = weighted @ basis.transpose(0, 2, 1)
+        plane = np.linalg.solve(normal, weighted @ patches[:, :, None])
+        darkness = np.maximum((basis.transpose(0, 2, 1) @ plane)[:, :, 0] - patches, 0)
+        darkness *= np.clip(CENTROID_WINDOW * radius + 0.5 - distance, 0, 1)
+        total = darkness.sum(axis=1)
+        good = total > 1e-3
+        move = np.zeros_like(result)
+        move[good, 0] = (darkness * x).sum(axis=1)[good] / total[good]
+        move[good, 1] = (darkness * y).sum(axis=1)[good] / total[good]
+        result += np.clip(move, -radius, radius)
+    return result
+
+
+def _same(other: Candidate, centers: Floats, radii: Floats) -> bool:
+    """Whether most of another candidate are the marks again, at another scale, or their highlights."""
+    return bool(np.any(cdist(other.centers, centers) < radii, axis=1).mean() > 0.5)
 
 
 def _require_options(

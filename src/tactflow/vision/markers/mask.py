@@ -100,9 +100,10 @@ def _other_sizes(found: Detection) -> tuple[float, ...]:
     """Radii, px, of marks that a circle around one of the usual size would cut or lead past."""
     if found.radii is None:
         return ()
-    step = np.rint(np.log(found.radii / found.dot_radius) / np.log(ONE_SIZE))
+    # One circle serves for marks that are smaller or larger by that ratio.
+    step = np.rint(np.log(found.radii / found.dot_radius) / np.log(ONE_SIZE**2))
     sizes, counts = np.unique(step, return_counts=True)
-    return tuple(found.dot_radius * ONE_SIZE ** float(s) for s in sizes[(counts > 1) & (sizes != 0)])
+    return tuple(float(np.median(found.radii[step == s])) for s in sizes[(counts > 1) & (sizes != 0)])
 
 
 def marker_mask(image: Bytes, dot: Dot) -> Bytes:

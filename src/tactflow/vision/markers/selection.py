@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import lattice
 from tactflow.vision.markers.lattice import BESIDE, LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.spots import ONE_SIZE, RADIUS_PER_SIGMA, Spots, joined
+from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, Spots, joined
 
 Sign = Literal["dark", "bright"]
 
@@ -40,13 +40,18 @@ else. Chosen on tactip_video, whose pins have a bright rim around them."""
 APART: Final = 0.9
 """Distance of two marks, sums of their radii, at least: with 1, marks that crowd are lost (sts_torque160)."""
 
-CLEAR: Final = 0.55
-"""Clearance of a spot that is a mark where a single corner or line of the lattice wants one. Chosen on
-sts_640."""
+CLEAR: Final = 0.65
+"""Clearance of a spot that is a mark without the others' agreement: on its own, or where a single corner or
+line of the lattice wants one. Dots on even ground have 0.8 to 1, pieces of edges and lines 0.3 to 0.7
+(tactip_video, sts_640)."""
 
 NEAR: Final = 3.2
 """Ratio of the responses of a spot and of the marks around, either way, at most, where the lattice
 wants a mark: light and dirt weaken marks."""
+
+ALIKE: Final = 1.5
+"""Ratio of the radii of a spot and of the marks around, either way, at most; and of their responses, where
+only a clear ring or even ground says that it is a mark."""
 
 LEAST_BEND: Final = 0.15
 """Bend of a mark over that of most marks, at least: a piece of an edge or a line has 0. Of the dots marked on
@@ -80,21 +85,31 @@ WINDOW: Final = 2.6
 Chosen on sts_640 and sts_torque160, where glare correlates less with marks than with 1.9 radii."""
 
 
-class Group(NamedTuple):
-    """Spots of one scale and polarity that look like the marks of one gel.
+class Candidate(NamedTuple):
+    """Spots of one scale and polarity that may be the marks of a gel.
 
-    score : how much so. share : of parallelograms of neighbours that close. sigma : scale, px.
+    spots : about as strong, and apart from each other. radius : of a disc that answers like them, px.
+    score : how much they look like marks, comparable within one picture. lattice : share of parallelograms
+    of neighbours that close, 0 to 1.
     """
 
-    score: float
-    share: float
-    sigma: float
-    polarity: Sign
     spots: Spots
+    radius: float
+    polarity: Sign
+    score: float
+    lattice: float
+
+    @property
+    def centers(self) -> Floats:
+        """(N, 2) float64, px."""
+        return self.spots.points
+
+    def __str__(self) -> str:
+        return f"{len(self.centers)} {self.polarity} ones of radius {self.radius:.1f} px"
 
 
-def groups(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Group]:
-    """The group of each polarity and scale that has one, the best first.
+def candidates(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Candidate]:
+    """The candidate of each polarity and scale that has one, the best first.
 
     scales : for each polarity and scale, px, its spots.
     """
@@ -107,20 +122,20 @@ def groups(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Group]:
                 # More contrast is evidence, but six lamps are no better than a hundred faint dots.
                 total = float(np.median(members.strength)) * len(members.points)
                 score = max(share - RANDOM_SHARE, 0.0) * total**0.5
-                found.append(Group(score, share, sigma, polarity, members))
-    return sorted(found, key=lambda group: (group.score, float(group.spots.strength.sum())), reverse=True)
+                found.append(Candidate(members, sigma * RADIUS_PER_SIGMA, polarity, score, share))
+    return sorted(found, key=lambda one: (one.score, float(one.spots.strength.sum())), reverse=True)
 
 
-def marks_of(gray: NDArray[np.float32], group: Group, by_scale: Mapping[float, Spots]) -> Spots:
-    """The marks of a group in all their sizes, without spots that only look like them.
+def marks_of(gray: NDArray[np.float32], chosen: Candidate, by_scale: Mapping[float, Spots]) -> Spots:
+    """The marks of a candidate in all their sizes, without spots that only look like them.
 
-    gray : (H, W) float32, grey levels. by_scale : the spots of the group's polarity.
+    gray : (H, W) float32, grey levels. by_scale : the spots of its polarity.
     """
-    least = 1 / NEAR * float(np.percentile(group.spots.strength, 10))
+    least = 1 / NEAR * float(np.percentile(chosen.spots.strength, 10))
     spots = joined(*(spots.at(spots.strength > least) for spots in by_scale.values()))
-    larger = spots.at((spots.radius > 1.01 * group.sigma * RADIUS_PER_SIGMA) & (spots.clear > RING_CONTRAST))
-    covers = np.any(cdist(larger.points, group.spots.points) < larger.radius[:, None], axis=1)
-    either = joined(group.spots, larger.at(covers))
+    larger = spots.at((spots.radius > 1.01 * chosen.radius) & (spots.clear > RING_CONTRAST))
+    covers = np.any(cdist(larger.points, chosen.spots.points) < larger.radius[:, None], axis=1)
+    either = joined(chosen.spots, larger.at(covers))
     marks = _grown(gray, _in_lattice(_apart(either, either.strength)), spots)
     return marks.at(marks.bend > LEAST_BEND * np.median(marks.bend)) if len(marks.points) else marks
 
@@ -193,11 +208,13 @@ def _alike(spots: Spots) -> Spots:
 
 
 def _in_lattice(marks: Spots) -> Spots:
-    """The marks that are part of a lattice."""
-    if len(marks.points) < LEAST_CLUSTER:
+    """The marks that are part of a lattice, or stand alone on even ground."""
+    if len(marks.points) < BESIDE:
         return marks
     share, cluster = lattice.own_shares(marks.points, links(marks.points))
-    return marks.at((cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE))
+    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE)
+    alike = _ratio(marks.strength, np.median(marks.strength)) < ALIKE
+    return marks.at(member | (alike & (marks.clear > CLEAR)))
 
 
 def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
@@ -221,8 +238,8 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     usual = np.median(marks.radius[around], axis=1)
     radius = _ratio(wanted.radius, usual)
     strength = _ratio(wanted.strength, np.median(marks.strength[around], axis=1))
-    fits = (radius < ONE_SIZE) & (strength < NEAR)
-    sure = (wanted.clear > CLEAR) & (strength < ONE_SIZE)
+    fits = (radius < ALIKE) & (strength < NEAR)
+    sure = (wanted.clear > CLEAR) & (strength < ALIKE)
     chosen = (wanted.clear > RING_CONTRAST) & ((support >= LEAST_SUPPORT) | sure)
     left = np.flatnonzero(fits & ~chosen)
     chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > LIKENESS
