@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -182,15 +183,25 @@ def detect_markers(
     found = candidates(scales) if shortest >= 8 else []
     if not found:
         raise NoMarkersError(_NO_MARKERS)
-    best = found[0]
     if dot_radius is not None:
-        return _detection(gray, best, best.spots, found[1:])
+        return _detection(gray, found[0], found[0].spots, found[1:])
+    return _in_lattice(gray, found, scales[found[0].polarity], least_probability)
+
+
+def _in_lattice(
+    gray: NDArray[np.float32], found: list[Candidate], by_scale: Mapping[float, Spots], least: float
+) -> Detection:
+    """The marks of the best candidate; raises NoMarkersError if they look like something else.
+
+    by_scale : the spots of its polarity, for each scale, px. least : probability of a mark.
+    """
+    best = found[0]
     _require_lattice(found)
     _require_gel_between(gray, best, best.spots)
-    marks = marks_of(gray, best, scales[best.polarity])
+    marks = marks_of(gray, best, by_scale)
     _require_gel_between(gray, best, marks)
     # One alone has no probability.
-    marks = marks.at(~(probability(evidence(gray, marks)) < least_probability))
+    marks = marks.at(~(probability(evidence(gray, marks)) < least))
     if not len(marks.points):
         raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, best)
     detection = _detection(gray, best, marks, found[1:])
