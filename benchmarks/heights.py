@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 import tactflow
 from benchmarks.depth import SETS, radii_of, read, scale_of
+from benchmarks.peers.common import one_thread
 from benchmarks.peers.depth import CHOICES, PixelNetwork
 from tactflow.calibration import KINDS
 from tactflow.calibration.file import Calibration
@@ -115,6 +116,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--out", type=Path, default=Path("docs/accuracy/heights.jpg"))
     args = parser.parse_args()
+    one_thread()
     columns = list(tiles(args.data))
     half = len(columns) // 2
     picture = np.vstack([np.hstack(columns[:half]), np.hstack(columns[half:])])
