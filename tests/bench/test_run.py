@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.bench.pipelines import Bench
 from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import BenchResult
 from tactflow.bench.run import measure_scene
@@ -52,11 +51,9 @@ def test_every_pipeline_and_every_method_is_timed_and_judged(folder: Path) -> No
 
 
 def test_a_gel_without_markers_is_measured_without_a_tracker(tmp_path: Path) -> None:
-    bench = Bench(BenchResult(quick=True), CopyUnit(), tmp_path)
-    measure_scene(
-        bench, {name: load_pipeline(path) for name, path in packaged_files().items()}, Case("unmarked", 6)
-    )
-    errors = {m.method: m.errors for m in bench.result.measured}
+    result, loaded = BenchResult(quick=True), {name: load_pipeline(p) for name, p in packaged_files().items()}
+    measure_scene(result, CopyUnit(), tmp_path, loaded, Case("unmarked", 6))
+    errors = {m.method: m.errors for m in result.measured}
     assert list(errors) == ["markerless", "classic"]
     assert not any("displacement_rms" in values for values in errors.values())
 

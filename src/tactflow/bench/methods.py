@@ -12,6 +12,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, get_args
 
 import cv2
@@ -19,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.bench import metrics, score
-from tactflow.bench.pipelines import Bench
 from tactflow.bench.quantities import Tally
+from tactflow.bench.results import BenchResult
 from tactflow.bench.scenes import Case, Rendered, rendered
-from tactflow.bench.timing import BLOCK, Times, quiet
+from tactflow.bench.timing import BLOCK, CopyUnit, Times, quiet
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.sim import Truth
@@ -144,28 +145,31 @@ STAGES: Mapping[str, frozenset[str]] = {
 measured only in frames that show one."""
 
 
-def measure_methods(bench: Bench, pipelines: Mapping[str, Pipeline], case: Case) -> None:
+def measure_methods(
+    result: BenchResult, unit: CopyUnit, scratch: Path, pipelines: Mapping[str, Pipeline], case: Case
+) -> None:
     """Measure every method of every stage on one scene.
 
+    result : rows are added to it. unit : measured along the way. scratch : folder for temporary files.
     pipelines : name -> pipeline; the first is the default one and provides the inputs.
     """
-    with rendered(case, bench.scratch) as scene:
+    with rendered(case, scratch) as scene:
         frames = list(_run_chain(next(iter(pipelines.values())), scene))
     for stage, ports in STAGES.items():
         ways = alternatives(pipelines, stage)
         shown = [item for item in frames if item.truth.touching or "contact_mask" not in ports]
         if len(ways) > 1:
-            _measure_stage(bench, stage, ways, shown, case.label)
+            unit.take()
+            _measure_stage(result, stage, ways, shown, case.label)
 
 
 def _measure_stage(
-    bench: Bench, stage: str, ways: Mapping[str, Node], frames: Sequence[_Inputs], scene: str
+    result: BenchResult, stage: str, ways: Mapping[str, Node], frames: Sequence[_Inputs], scene: str
 ) -> None:
     judges = {name: _Judge() for name in ways}
     times: dict[str, Times] = {name: defaultdict(list) for name in ways}
     calls = {name: _call(node, STAGES[stage]) for name, node in ways.items()}
     failures: dict[str, str] = {}
-    bench.unit.take()
     with quiet():
         for first in range(0, len(frames), BLOCK):
             turn = frames[first : first + BLOCK]
@@ -182,10 +186,10 @@ def _measure_stage(
                     getattr(judges[name], stage)(item, None if isinstance(found, Absent) else found)
     for name in ways:
         if name in failures:
-            bench.result.failures[f"{stage}/{name}/{scene}"] = failures[name]
+            result.failures[f"{stage}/{name}/{scene}"] = failures[name]
         else:
             errors = judges[name].tally.errors()
-            bench.result.add(stage, name, scene, errors, times=times[name], frames=len(frames))
+            result.add(stage, name, scene, errors, times=times[name], frames=len(frames))
 
 
 def _call(node: Node, ports: frozenset[str]) -> Callable[[_Inputs], Any]:

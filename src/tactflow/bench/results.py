@@ -14,6 +14,10 @@ from tactflow.engine.errors import ConfigError
 
 SCHEMA = "tactflow.bench/3"
 
+PIPELINE = "pipeline"
+"""Group of the rows about whole pipelines."""
+CLASSIC = "classic"
+"""Name of the pipeline that is the yardstick: the original script."""
 TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
 """Kind of frame -> quantity that is its median CPU time, ms."""
 

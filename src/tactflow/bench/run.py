@@ -15,10 +15,12 @@ from pathlib import Path
 
 import cv2
 
+from tactflow.bench.lockstep import on_recording, take_turns
 from tactflow.bench.methods import measure_methods
-from tactflow.bench.pipelines import CLASSIC, Bench
-from tactflow.bench.results import BenchResult
+from tactflow.bench.quantities import Tally
+from tactflow.bench.results import CLASSIC, PIPELINE, BenchResult
 from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, rendered
+from tactflow.bench.score import PipelineScore
 from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
@@ -63,14 +65,14 @@ def run_bench(
     loaded = {name: load_pipeline(path) for name, path in files.items()}
     result, unit = BenchResult(quick=quick, machine=machine()), CopyUnit()
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
-        bench = Bench(result, unit, Path(folder))
+        shared = (result, unit, Path(folder))
         steps = [
-            (f"pipelines on {case.label}", partial(measure_scene, bench, loaded, case))
+            (f"pipelines on {case.label}", partial(measure_scene, *shared, loaded, case))
             for case in whole
             if case.label in scenes
         ]
         steps += [
-            (f"methods on {case.label}", partial(measure_methods, bench, _marked(loaded), case))
+            (f"methods on {case.label}", partial(measure_methods, *shared, _marked(loaded), case))
             for case in alone
             if case.label in scenes
         ]
@@ -82,14 +84,25 @@ def run_bench(
     return result
 
 
-def measure_scene(bench: Bench, loaded: Pipelines, case: Case) -> None:
-    """Measure whole pipelines on a simulated scene."""
-    with rendered(case, bench.scratch) as scene:
+def measure_scene(result: BenchResult, unit: CopyUnit, scratch: Path, loaded: Pipelines, case: Case) -> None:
+    """Measure whole pipelines, in turns of a few frames, on a simulated scene.
+
+    result : rows are added to it. unit : measured along the way. scratch : folder for temporary files.
+    """
+    with rendered(case, scratch) as scene:
         suited = _marked(loaded) if len(scene.scene.layout.rest) else _bare(loaded)
         if case in TROUBLES:
             # The script takes half of a run's time and was not made for any of this.
             suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
-        bench.measure(suited, scene)
+        scores = {name: PipelineScore(scene, Tally()) for name in suited}
+        ready = {name: on_recording(pipeline, scene.path) for name, pipeline in suited.items()}
+        times, failures = take_turns(ready, lambda name, found: scores[name].add(found), unit=unit)
+    for name, score in scores.items():
+        if name in failures:
+            result.failures[f"{PIPELINE}/{name}/{case.label}"] = failures[name]
+        else:
+            errors, frames = score.tally.errors(), sum(map(len, times[name].values()))
+            result.add(PIPELINE, name, case.label, errors, times=times[name], frames=frames)
 
 
 def _marked(loaded: Pipelines) -> dict[str, Pipeline]:

@@ -7,9 +7,8 @@ from statistics import median
 
 import numpy as np
 
-from tactflow.bench.pipelines import CLASSIC, PIPELINE
 from tactflow.bench.quantities import QUANTITIES
-from tactflow.bench.results import TIMES, BenchResult, Measurement
+from tactflow.bench.results import CLASSIC, PIPELINE, TIMES, BenchResult, Measurement
 from tactflow.system.terminal import markdown
 
 TITLES = {

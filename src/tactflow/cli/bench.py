@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tactflow.bench.pipelines import CLASSIC
-from tactflow.bench.results import load_errors, regressions
+from tactflow.bench.results import CLASSIC, load_errors, regressions
 from tactflow.bench.run import DEFAULT, MARKERLESS, run_bench
 from tactflow.bench.tables import lines
 from tactflow.cli.options import refuse_output, writing
