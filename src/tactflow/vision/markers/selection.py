@@ -72,9 +72,6 @@ LEAST_CLUSTER: Final = 6
 """Marks of a lattice beside a larger one, at least: four or five spots form a parallelogram by chance
 (sts_torque160)."""
 
-MEMBER_SHARE: Final = 0.3
-"""Share of closed parallelograms of a mark, at least. Chosen on sts_640."""
-
 PROBABILITY: Final = (-0.37, -4.72, 5.65, 2.42)
 """Log odds of a mark: constant, and weights of its `evidence`. Fitted to 18 sensors by `python -m
 tactflow.bench.judge_dots --fit`, which also tells how often marks of a probability are marks on a sensor that
@@ -212,7 +209,7 @@ def _in_lattice(marks: Spots) -> Spots:
     if len(marks.points) < BESIDE:
         return marks
     share, cluster = lattice.own_shares(marks.points, links(marks.points))
-    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= MEMBER_SHARE)
+    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= RANDOM_SHARE)
     alike = _ratio(marks.strength, np.median(marks.strength)) < ALIKE
     return marks.at(member | (alike & (marks.clear > CLEAR)))
 
