@@ -274,27 +274,12 @@ def _detection(
 
 
 def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Floats:
-    """Centroid of what is darker than its surroundings, in a window that follows it.
+    """Centroids (N, 2) of what is darker than its surroundings, in windows that follow them, px.
 
     The surroundings are a plane fitted to a ring around the mark, so a slope of the light does not pull.
 
-    Parameters
-    ----------
-    gray : (H, W) float32, grey levels; marks are dark.
-    centers : (N, 2) float64, starting points, px, right to about a radius.
-    radii : (N,) float64, of the marks, px.
-
-    Returns
-    -------
-    centers : (N, 2) float64, px; where there is nothing dark, the starting point. Whole grey levels are
-        exact in float32, and everything after is float64.
-
-    Examples
-    --------
-    >>> gray = np.full((30, 30), 200, np.float32)
-    >>> gray[12:17, 10:15] = 50
-    >>> _centroids(gray, np.array([[11.0, 15.0]]), np.array([2.5])).round(3)
-    array([[12., 14.]])
+    gray : (H, W) float32, grey levels; marks are dark. centers : (N, 2) float64, starting points, px, right
+    to about a radius; they stay where there is nothing dark. radii : (N,) float64, of the marks, px.
     """
     radius = radii[:, None]
     inner, outer = SURROUNDINGS[0] * radius, SURROUNDINGS[1] * radius + 1.5
