@@ -6,8 +6,8 @@ Grasps of a Wedge without dots, in two sessions on different days with different
 judged by a calibration (as `tactflow calibrate force` makes it) from the grasps of the other objects, and by
 one from the other day, whose objects are others, too. Columns: RMS error, N; R2; share of errors within one
 and within two stated standard errors, %; the same for a ridge regression on the same features; frames. Frames
-count in which a contact is found; how many of those with 0.75 N or more have none is said beside. Worst
-object first.
+count in which a contact is found; how many of those with 0.75 N or more have none is said beside, and how
+often contact and force agree on each day. Worst object first.
 """
 
 from __future__ import annotations
@@ -168,6 +168,12 @@ def r2(force: Floats, said: Floats) -> float:
     return 1 - float(np.mean((said - force) ** 2) / np.var(force))
 
 
+def agreeing(grasps: Sequence[Grasp], day: str) -> float:
+    """Share of a day's frames in which a contact is found just where the force is `TOUCHING` or more, %."""
+    agrees = [(one.force() >= TOUCHING) == one.watched.touched for one in grasps if one.day == day]
+    return 100 * float(np.concatenate(agrees).mean())
+
+
 def row(name: str, values: Floats) -> list[str]:
     """The columns of an object. values : (4, n), see `judge`."""
     force, said, stated, by_ridge = values
@@ -205,6 +211,10 @@ def main() -> None:
             "",
             f"no contact found in {sum(map(len, missed.values()))} of {pressed} frames with {TOUCHING} N or "
             f"more, up to {missed[worst.name].max(initial=0):.1f} N ({worst.name})",
+            *(
+                f"{day}: contact agrees with {TOUCHING} N in {agreeing(grasps, day):.0f} %"
+                for day in SESSIONS
+            ),
         ]
     )
 

@@ -28,7 +28,9 @@ class Force(Stage):
         """Prepare. calibration : the file."""
         super().__init__(params)
         known = None if calibration is None else Calibration.load(calibration).force
-        if known is not None and not known.press.stiffness.keys() <= {*BY_DEPTH, *BY_CHANGE}:
+        if known is not None and not any(
+            known.press.stiffness.keys() <= {*features} for features in (BY_DEPTH, BY_CHANGE)
+        ):
             logger.warning(
                 "force: %s has a force that an earlier version fitted; run `tactflow calibrate force` again",
                 calibration,
