@@ -60,7 +60,7 @@ ACROSS: Final = 5
 """Frames of a picture of the worst ones, and its columns."""
 TILE: Final = 240
 """Side of each of them, px."""
-GREEN, RED, WHITE = (0, 255, 0), (0, 0, 255), (255, 255, 255)
+GREEN, RED, WHITE, GRAY = (0, 255, 0), (0, 0, 255), (255, 255, 255), 64
 WITHIN: Final = 0.2
 """Part of a region that an outline covers, from which on the region is of that contact. Chosen by hand."""
 LARGE: Final = 500
@@ -178,9 +178,12 @@ def labelled(
             yield label, None
 
 
-def draw_worst(pipeline: str, labels: Sequence[FrameLabel], data: Path, path: Path) -> None:
+def draw_worst(
+    pipeline: str, labels: Sequence[FrameLabel], data: Path, path: Path, blank: bool = False
+) -> None:
     """Write a picture of the frames whose hulls overlap least with the outlines: these green, hulls red.
 
+    blank : leave the frames themselves out.
     Raises ConfigError if there are no outlined frames, or the file cannot be written.
     """
     worst: list[tuple[float, int, NDArray[np.uint8]]] = []
@@ -188,7 +191,7 @@ def draw_worst(pipeline: str, labels: Sequence[FrameLabel], data: Path, path: Pa
     for number, (label, result) in enumerate(labelled(pipeline, outlined, data, images=True)):
         if result is not None and result.image is not None:
             overlap = compare(label, result).hull
-            worst.append((overlap, number, _tile(label, result, f"{label.lab} {overlap:.2f}")))
+            worst.append((overlap, number, _tile(label, result, f"{label.lab} {overlap:.2f}", blank)))
             worst = sorted(worst, key=lambda one: one[:2])[:WORST]
     if not worst:
         raise ConfigError(f"--picture: {data} has no recording with an outlined frame")
@@ -203,10 +206,11 @@ def draw_worst(pipeline: str, labels: Sequence[FrameLabel], data: Path, path: Pa
         raise ConfigError(f"--picture {path}: cannot be written; required a .png or .jpg in a folder")
 
 
-def _tile(label: FrameLabel, result: Result, text: str) -> NDArray[np.uint8]:
-    """(TILE, TILE, 3) uint8: a frame with its outlines and its hull."""
+def _tile(label: FrameLabel, result: Result, text: str, blank: bool) -> NDArray[np.uint8]:
+    """(TILE, TILE, 3) uint8: a frame, or gray instead, with its outlines and its hull."""
     image, mapping = result.image, result["mapping"]
     assert image is not None
+    image = np.full_like(image, GRAY) if blank else image
     factor = TILE / max(image.shape[:2])
     small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     found = [] if result.contact is None else [result.contact.hull]
@@ -423,6 +427,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--picture", type=Path, metavar="FILE", help=f"draw the {WORST} worst frames of the first pipeline"
     )
+    parser.add_argument(
+        "--blank", action="store_true", help="leave the frames out of --picture, as their licence may ask for"
+    )
     parser.add_argument("--recording", metavar="START", default="", help="only those whose name starts so")
     options = parser.parse_args(arguments)
     try:
@@ -434,7 +441,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(*fit(options.pipelines[0], first, options.data), sep="\n")
             return 0
         if options.picture is not None:
-            draw_worst(options.pipelines[0], first, options.data, options.picture)
+            draw_worst(options.pipelines[0], first, options.data, options.picture, options.blank)
             return 0
         results = {name: list(judge(name, first, options.data)) for name in options.pipelines}
         if not any(results.values()):
