@@ -395,7 +395,7 @@ def _fine_noise(planes: Floats32) -> Floats32:
 
     Two pixels of a cell along one diagonal minus those along the other: noise differs between them, while
     shading, and grain and blotches wider than a cell, hardly do. To tell whether anything touches the gel,
-    that is too little (docs/accuracy.md, `speckle`).
+    that is too little.
     """
     above, below = planes[:, ::2], planes[:, 1::2]
     diagonal = np.abs(above[:, :, ::2] - above[:, :, 1::2] - below[:, :, ::2] + below[:, :, 1::2])
