@@ -18,8 +18,9 @@ there. Measured with reference and contact exchanged, on 166 outlined contacts o
 noticed; not exchanged, one is mistaken."""
 ROUGHER: Final = 1.25
 """The same, from which the reference counts as untouched from then on."""
-ENOUGH: Final = 30
-"""Frames with a contact that is not smoother, after which it does, too: a second of them."""
+ENOUGH: Final = 10
+"""Frames with a contact that is not smoother, after which it does, too: what a reference shows touched is
+released before another contact begins."""
 
 
 class ReferenceCheck:
