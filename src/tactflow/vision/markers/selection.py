@@ -33,9 +33,9 @@ RANDOM_SHARE: Final = 0.3
 """Share of parallelograms that close among spots in no lattice: 0.1 to 0.25 on rendered textures, 0.31 where
 spots keep nearly the distance of a lattice from each other (measured)."""
 
-LONG_LINK: Final = 1.8
-"""Length of a link of the lattice, over the median one at either end, at most: longer ones lead to something
-else. Chosen on tactip_video, whose pins have a bright rim around them."""
+LONG_LINK: Final = 2.0
+"""Length of a link of the lattice, over the median one at either end, at most: across one missing mark.
+Without such a bound, the bright rims of a TacTip's pins are taken for marks."""
 
 APART: Final = 0.9
 """Distance of two marks, sums of their radii, at least: with 1, marks that crowd are lost (sts_torque160)."""
