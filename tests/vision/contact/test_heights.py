@@ -41,7 +41,7 @@ def regions(heights: Heights, changed: NDArray[np.bool_] | None = None) -> list[
 
 
 def plain_lines(heights: Float, levels: Float, least: int) -> list[tuple[float, ...]]:
-    """Of each line: level, sides along it, and the sum of its slopes."""
+    """Of each line: level, cells inside, sides along it and along the border, and the sum of its slopes."""
     lines = []
     for index, level in enumerate(levels):
         holes = np.ones((3, 3), np.bool_)
@@ -51,14 +51,15 @@ def plain_lines(heights: Float, levels: Float, least: int) -> list[tuple[float, 
             inside = np.pad(labels == label, 1)
             if inside.sum() < least:
                 continue
-            sides, drop = 0, 0.0
+            sides, border, drop = 0, 0, 0.0
             z = np.pad(heights, 1, constant_values=np.nan)
             for shift in ((0, 1), (0, -1), (1, 0), (-1, 0)):
                 outside, beside = np.roll(inside, shift, (0, 1)), np.roll(z, shift, (0, 1))
                 fall = (z - beside)[inside & ~outside]
                 sides += np.isfinite(fall).sum()
+                border += np.isnan(fall).sum()
                 drop += float(np.nansum(fall))
-            lines.append((index, sides, round(drop, 2)))
+            lines.append((index, inside.sum(), sides, border, round(drop, 2)))
     return sorted(lines)
 
 
@@ -75,14 +76,14 @@ def test_each_level_line_is_measured(seed: int, high: int, wide: int) -> None:
     heights = np.asarray(cv2.blur(noise, (3, 3)), np.float32)
     levels = np.linspace(heights.min() - 1, heights.max(), 6, dtype=np.float32)[1:-1]
     above, drops = np.empty((high, wide), np.int32), np.empty(high * wide * 4, np.float32)
-    marked, lines = (heights > 1).astype(np.uint8), np.empty((len(drops), 5), np.int32)
+    marked, lines = (heights > 1).astype(np.uint8), np.empty((len(drops), 7), np.int32)
     count = grow_level_lines(heights, marked, levels, 2, above, drops, lines)
-    level, _, _, sides, _ = lines[:count].T
-    found = zip(level, sides, drops[:count].astype(float), strict=True)
+    level, _, cells, _, sides, border, _ = lines[:count].T
+    found = zip(level, cells, sides, border, drops[:count].astype(float), strict=True)
     expected = plain_lines(heights, levels, 2)
     for one, other in zip(sorted(found), expected, strict=True):
-        assert one[:2] == other[:2]
-        assert abs(one[2] - other[2]) < 0.05
+        assert one[:4] == other[:4]
+        assert abs(one[4] - other[4]) < 0.05
 
 
 @settings(max_examples=40, deadline=None)

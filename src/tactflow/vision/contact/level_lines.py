@@ -29,6 +29,10 @@ BESIDE: Final = 3
 the surface has waves of four. From 2 to 6 outlines overlap as well with real ones within 0.01."""
 SMALLEST: Final = 9
 """Cells inside the smallest line: three by three."""
+WIDEST: Final = 0.6
+"""Part of the picture that a contact covers at most: something else has to be at rest."""
+OPEN: Final = 0.5
+"""Part of a line that may run along the border of the picture."""
 DECIDED: Final = 5.0
 """How many times the slope of a frame's contact decides for good between a bump and a dent. The wrong one is
 flatter by a tenth at least in all outlined frames, by three quarters in the median."""
@@ -43,8 +47,9 @@ class LevelLines(NamedTuple):
     above : (h, w) int32, how many levels each cell is above; what a line encloses is as high as the line.
 
     Of each line, (n,): level : index of its level. inside : a cell inside, as y w + x. encloses : whether
-    cells that have changed are inside. slope : mean slope of the surface along it, per cell. salience : how
-    much it stands out. outer : index of the line around it, or -1.
+    cells that have changed are inside. slope : mean slope of the surface along it, per cell; 0 where it is
+    too wide or too open for a contact. salience : how much it stands out. outer : index of the line around
+    it, or -1.
     """
 
     above: NDArray[np.int32]
@@ -67,16 +72,17 @@ def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
     marked = np.ascontiguousarray(changed[window]).view(np.uint8)
     above = np.zeros((high, wide), np.int32)
     over = np.empty(surface.shape, np.int32)
-    lines = np.empty((LEVELS * surface.size // SMALLEST, 5), np.int32)
+    lines = np.empty((LEVELS * surface.size // SMALLEST, 7), np.int32)
     drops = np.empty(len(lines), np.float32)
     count = grow_level_lines(surface, marked, levels, SMALLEST, over, drops, lines)
     above[window] = over
-    level, inside, enclosed, sides, outer = lines[:count].T
+    level, inside, cells, enclosed, sides, border, outer = lines[:count].T
     y, x = np.divmod(inside, surface.shape[1])
     inside = (y + window[0].start) * wide + x + window[1].start
     # A line in any direction is pi / 4 as long as the sides of cells along it.
     length = np.float32(math.pi / 4) * sides
-    slope = np.asarray(drops[:count] / np.maximum(length, np.float32(1)), np.float32)
+    possible = (sides >= (1 - OPEN) * (sides + border)) & (cells <= WIDEST * heights.size)
+    slope = np.asarray(drops[:count] * possible / np.maximum(length, np.float32(1)), np.float32)
     salience = slope * np.sqrt(length)
     return LevelLines(above, level, inside, enclosed > 0, slope, np.asarray(salience, np.float32), outer)
 

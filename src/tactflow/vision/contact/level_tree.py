@@ -34,15 +34,16 @@ def grow_level_lines(
     least : cells inside of a line that counts.
     above : (h, w), filled with how many levels each cell is above, or the lines that it is enclosed by.
     drops : (n,), filled with the sum of the surface's slope along each line, per cell.
-    lines : (n, 5), filled with each line's level, as an index; one of the cells inside, as y w + x; how many
-    of the cells inside are marked; sides of cells along the line; and the line around it, or -1.
+    lines : (n, 7), filled with each line's level, as an index; one of the cells inside, as y w + x; how many
+    cells are inside; how many of these are marked; sides of cells along the line, and along the border of the
+    picture; and the line around it, or -1.
     """
     high, wide = heights.shape
     z, marks = heights.ravel(), marked.ravel()
     order, ends = _by_level(heights, levels, above.ravel())
     root = np.full(z.size, -1, np.int32)
-    # Of the set that a cell is the root of: cells, marked ones, sides along the line.
-    sizes, drop = np.zeros((z.size, 3), np.int32), np.zeros(z.size, np.float32)
+    # Of the set that a cell is the root of: cells, marked ones, sides along the line and along the border.
+    sizes, drop = np.zeros((z.size, 4), np.int32), np.zeros(z.size, np.float32)
     line_of = np.full(z.size, -1, np.int32)
     count, inner = 0, 0
     for level in range(levels.size - 1, -1, -1):
@@ -55,12 +56,12 @@ def grow_level_lines(
             cell = order[i]
             if root[cell] == cell and sizes[cell, 0] >= least:
                 drops[count] = drop[cell]
-                lines[count, 0], lines[count, 1], lines[count, 4] = level, cell, -1
-                lines[count, 2:4] = sizes[cell, 1:]
+                lines[count, 0], lines[count, 1], lines[count, 6] = level, cell, -1
+                lines[count, 2:6] = sizes[cell]
                 line_of[cell] = count
                 count += 1
         for line in range(inner, outer):
-            lines[line, 4] = line_of[_root_of(root, lines[line, 1])]
+            lines[line, 6] = line_of[_root_of(root, lines[line, 1])]
         inner = outer
     return count
 
@@ -73,9 +74,10 @@ def _join(
     root[cell] = cell
     y, x = cell // wide, cell % wide
     for dy, dx in ((-1, 0), (0, -1), (0, 1), (1, 0)):
-        if not (0 <= y + dy < high and 0 <= x + dx < wide):
-            continue
         here = _root_of(root, cell)
+        if not (0 <= y + dy < high and 0 <= x + dx < wide):
+            sizes[here, 3] += 1
+            continue
         beside = cell + dy * wide + dx
         fall = z[cell] - z[beside]
         if root[beside] < 0:
@@ -88,7 +90,7 @@ def _join(
         if there != here:
             root[here] = there
             drop[there] += drop[here]
-            for j in range(3):
+            for j in range(4):
                 sizes[there, j] += sizes[here, j]
 
 
