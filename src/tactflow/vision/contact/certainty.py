@@ -1,8 +1,7 @@
 """How probable it is that a region that has changed is a contact.
 
-Three things tell: an object that presses changes the slopes of the gel, and with it the colour of its light,
-while shadows and lamps change its brightness; what is small beside another change is more often a reflection
-or a wrinkle; and around a contact the markers move.
+Two things tell: an object that presses changes the slopes of the gel, and with it the colour of its light,
+while shadows and lamps change its brightness; and around a contact the markers move.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from tactflow.vision.arrays import Floats, Floats32, Mask
 from tactflow.vision.contact.background import CELL
 from tactflow.vision.types import Contact
 
-WEIGHTS: Final = (0.13, 2.53, 0.95, 1.64)
+WEIGHTS: Final = (0.37, 1.59, 1.67)
 """Constant and weights of `contact_evidence` in the log odds: `python -m tactflow.bench.judge --fit`."""
 DOUBTFUL: Final = 0.25
 """Probability below which a region beside another does not count: three to one against it."""
@@ -37,21 +36,17 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
 
     Returns
     -------
-    (n, 3) : logarithm of the part that colour has in its largest change; logarithm of its pixels over those
-    of the largest region; 1 where markers moved as well, else 0.
+    (n, 2) : logarithm of the part that colour has in its largest change; 1 where markers moved as well, else
+    0.
     """
-    (high, wide), largest = deviations.shape[1:], max(part.region_area for part in parts)
+    high, wide = deviations.shape[1:]
     inside = np.asarray(cv2.resize(mask, (wide, high), interpolation=cv2.INTER_NEAREST), np.uint8)
-    evidence = np.empty((len(parts), 3))
+    evidence = np.empty((len(parts), 2))
     for row, part in zip(evidence, parts, strict=True):
         cells = np.zeros((high, wide), np.uint8)
         cv2.fillConvexPoly(cells, (part.hull / CELL).astype(np.int32), (1.0,))
         light, colour = (cv2.minMaxLoc(values, cells & inside)[1] for values in deviations)
-        row[:] = (
-            math.log(max(colour / max(light, 1e-9), LEAST_SHARE)),
-            math.log(part.region_area / largest),
-            part.evidence == "both",
-        )
+        row[:] = math.log(max(colour / max(light, 1e-9), LEAST_SHARE)), part.evidence == "both"
     return evidence
 
 
