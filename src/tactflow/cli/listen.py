@@ -74,7 +74,7 @@ def _print_lines(subscriber: Subscriber, count: float) -> None:
     while subscriber.received < count:
         line = describe(subscriber.receive())
         if subscriber.lost > lost:
-            line += f"  ({subscriber.lost - lost} lost)"
+            line += f"  ({subscriber.lost - lost} messages lost)"
             lost = subscriber.lost
         print(line, flush=True)
 

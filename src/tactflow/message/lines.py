@@ -16,7 +16,7 @@ from typing import BinaryIO
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.outputs import cannot_write, refuse_interference
-from tactflow.system.files import discard_output, expanded, make_folder
+from tactflow.system.files import claim_path, discard_output, expanded, make_folder
 
 log = logging.getLogger("tactflow")
 
@@ -149,7 +149,8 @@ class LineFile:
     Raises
     ------
     StageError : from every method, if it cannot be written (it then ends with the last complete line), if
-        another program has removed or replaced it, or if it does not end with a result message.
+        another program has removed or replaced it, another run is writing to it, or if it does not end with
+        a result message.
     """
 
     ended = False
@@ -166,12 +167,19 @@ class LineFile:
             self._file = path.open("ab+", buffering=0)
         except OSError as error:
             raise cannot_write(path, error) from error
+        self._claim: int | None = None
         try:
+            self._claim = claim_path(path)
             if replaces:
                 self._file.truncate(0)
             self._size = _complete_last_line(self._file, path)
+        except BlockingIOError as error:
+            self._release()
+            raise cannot_write(
+                path, error, "give another path (--set sinks.jsonl.path=other.jsonl)"
+            ) from error
         except BaseException:
-            self._file.close()
+            self._release()
             raise
 
     def send(self, line: bytes) -> None:
@@ -187,8 +195,15 @@ class LineFile:
         try:
             self._write()
         finally:
-            with suppress(OSError):
-                self._file.close()
+            self._release()
+
+    def _release(self) -> None:
+        """Close the file, and let other runs have it."""
+        with suppress(OSError):
+            self._file.close()
+        if self._claim is not None:
+            os.close(self._claim)
+            self._claim = None
 
     def _write(self) -> None:
         data, self._waiting = b"".join(self._waiting), []
