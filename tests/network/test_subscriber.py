@@ -223,7 +223,7 @@ def test_listen_prints_one_readable_line_a_message(
     assert out.splitlines() == [
         "main 0  t 0.000 s  no contact  dots 2/3",
         f"main 1  t 0.100 s  {contact}",
-        f"main 4  t 0.400 s  {contact}  (2 lost)",
+        f"main 4  t 0.400 s  {contact}  (2 messages lost)",
         f"main 5  t 0.500 s  {contact.replace('angle -12.3 deg', 'no direction')}",
     ]
     assert err == ""
