@@ -311,7 +311,7 @@ class Calibration(_Entry):
     def _misfit_of_kind(self, mapping: PixelMapping) -> str | None:
         wide, expected = mapping.size[0] / mapping.size[1], self.size[0] / self.size[1]
         if abs(wide / expected - 1) > ASPECT:
-            return f"frames of {_by(mapping.size)} px have another shape than its {_by(self.size)} px"
+            return f"frames of {_by(mapping.size)} have another shape than its {_by(self.size)}"
         here, there = (_axes(corners) for corners in (raw_corners(mapping), self.corners))
         if (np.sum(here * there, axis=1) < ALIGNED).any():
             return "the frames are turned or mirrored otherwise; it is for frames as the sensor gives them"

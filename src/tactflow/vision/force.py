@@ -29,6 +29,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import check_color_image
 from tactflow.vision.contact.cells import HALF, to_cells, to_planes
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tactflow.vision.geometry.valid_area import valid_area
@@ -78,6 +79,7 @@ class LightChange:
     """
 
     def __init__(self, untouched: NDArray[np.uint8]) -> None:
+        check_color_image(untouched)
         self.untouched = untouched
         height, width = untouched.shape[:2]
         side = max(1, round(max(height, width) / CELLS))
@@ -93,6 +95,7 @@ class LightChange:
         tilt lights up would outweigh all others. It is a mean, since where the gel ends in the dark differs
         from one reference to the next.
         """
+        check_color_image(image)
         light = to_planes(image, self._size)
         lit = under_illumination(self._light, self._illumination.fit(light))[:, self._gel]
         brightness = max(float(lit.mean()), 1.0)

@@ -16,6 +16,8 @@ from tactflow.vision.contact.level_tree import grow_level_lines
 
 Float = NDArray[np.float32]
 SHAPE = 60, 80
+UNKNOWN = np.eye(3, dtype=np.float32)
+"""Mixtures of which nobody knows what they show."""
 
 
 def bump(x: float, y: float, radius: float, high: float = 1.0, shape: tuple[int, int] = SHAPE) -> Float:
@@ -107,7 +109,7 @@ def test_lines_lie_within_one_another_and_count_the_marked_cells(seed: int) -> N
 def test_contacts_have_no_cell_in_common(seed: int) -> None:
     draw = np.random.default_rng(seed)
     bumps = [bump(*draw.uniform(5, 55, 2), draw.uniform(3, 15), draw.uniform(0.5, 1)) for _ in range(4)]
-    found = [core(region) for region in regions(Heights(np.asarray(sum(bumps), np.float32), None))]
+    found = [core(region) for region in regions(Heights(np.asarray(sum(bumps), np.float32), UNKNOWN))]
     assert np.sum(found, axis=0).max() == 1
 
 
@@ -121,7 +123,7 @@ def test_whatever_colours_answer_to_slopes_the_surface_is_found_up_to_a_factor(s
     assume(np.linalg.cond(lamps) < 1 / 0.15)
     surface = bump(*draw.uniform(25, 35, 2), draw.uniform(6, 12)) + bump(55, 35, 5, 0.4)
     heights = HeightModel()(seen(surface, lamps))
-    assert heights.slopes is not None
+    assert heights.sloping
     # Measured: 0.9994 at least.
     assert abs(np.corrcoef(heights.values.ravel(), surface.ravel())[0, 1]) > 0.99
 
@@ -139,8 +141,20 @@ def test_a_cylinder_shows_one_slope_and_is_found_after_a_ball() -> None:
 def test_what_brightens_or_darkens_as_a_whole_is_depth(sign: int) -> None:
     surface = bump(40, 30, 10, 20)
     heights = HeightModel()(np.stack([sign * surface] * 3))
-    assert heights.slopes is None
+    assert len(heights.mixtures) == 1
     assert np.corrcoef(heights.values.ravel(), surface.ravel())[0, 1] > 0.99
+
+
+def test_what_changes_its_hue_as_a_whole_is_depth() -> None:
+    surface = bump(40, 30, 10, 20)
+    heights = HeightModel()(np.stack([surface, 0 * surface, -surface]))
+    assert abs(heights.mixtures @ [1, 0, -1]) == pytest.approx(np.sqrt(2))
+
+
+def test_coloured_changes_that_are_no_slopes_are_of_unknown_kind() -> None:
+    noise = np.random.default_rng(0).normal(0, 20, (3, 15, 20)).astype(np.float32)
+    change = np.stack([cv2.resize(plane, SHAPE[::-1]) for plane in noise])
+    assert HeightModel()(change).mixtures.shape == (3, 3)
 
 
 @pytest.mark.parametrize("lamp", [(1, 0), (0, -1), (0.6, 0.8)])
@@ -148,7 +162,7 @@ def test_a_gray_camera_shows_one_slope_from_which_the_shape_is_found(lamp: tuple
     surface = bump(40, 30, 10)
     model = HeightModel()
     heights = model(20 * seen(surface, np.array([lamp] * 3)))
-    assert heights.slopes is not None
+    assert heights.sloping
     assert model.alike
     # Measured: 0.82, as it is blurred along the direction in which no slope shows.
     assert abs(np.corrcoef(heights.values.ravel(), surface.ravel())[0, 1]) > 0.8
@@ -172,14 +186,14 @@ def test_an_object_in_a_moat_is_the_contact_whichever_way_it_points() -> None:
 
 def test_two_objects_are_two_contacts_and_a_faint_wrinkle_is_none() -> None:
     surface = bump(20, 30, 8) + bump(55, 30, 8, 0.8) + bump(40, 50, 5, 0.05)
-    found = regions(Heights(surface, None))
+    found = regions(Heights(surface, UNKNOWN))
     assert [bool(core(region)[30, x]) for region, x in zip(found, (20, 55), strict=True)] == [True, True]
 
 
 def test_a_contact_encloses_cells_that_have_changed() -> None:
     surface, changed = bump(20, 30, 8) + bump(55, 30, 8, 0.8), np.zeros(SHAPE, np.bool_)
     changed[28:32, 53:57] = True
-    (region,) = regions(Heights(surface, None), changed)
+    (region,) = regions(Heights(surface, UNKNOWN), changed)
     assert core(region)[30, 55]
 
 
@@ -192,5 +206,5 @@ def test_a_ring_is_outlined_around_and_not_within() -> None:
 
 
 def test_a_contact_that_the_border_cuts_off_is_found() -> None:
-    (region,) = regions(Heights(bump(40, 0, 12), None))
+    (region,) = regions(Heights(bump(40, 0, 12), UNKNOWN))
     assert core(region)[0, 40]

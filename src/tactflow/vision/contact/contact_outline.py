@@ -32,15 +32,14 @@ FAINT: Final = 0.3
 Chosen by hand."""
 
 
-def contact_level(change: Floats32, core: Mask, slopes: Floats32 | None) -> Floats32:
+def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
     """Level set of one contact's outline.
 
     Parameters
     ----------
     change : (h, w, 3) float32, of the contact's window, in standard deviations; 0 where nothing belongs to
-        the contact. core : (h, w) uint8, 1 where the contact surely is, else 0. slopes :
-        (2, 3) float32, mixtures of the channels that are slopes along x and y; None where the light answers
-        with depth.
+        the contact. core : (h, w) uint8, 1 where the contact surely is, else 0. mixtures :
+        (k, 3) float32, of the channels: one shows depth, several show slope.
 
     Returns
     -------
@@ -53,11 +52,11 @@ def contact_level(change: Floats32, core: Mask, slopes: Floats32 | None) -> Floa
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> disc = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
     >>> core = (disc == 1).astype(np.uint8)
-    >>> level = contact_level(np.stack([disc] * 3, axis=2), core, slopes=None)
+    >>> level = contact_level(np.stack([disc] * 3, axis=2), core, np.ones((1, 3), np.float32))
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
-    shows, border = _what_shows(change, slopes)
+    shows, border = _what_shows(change, mixtures)
     level = np.asarray(shows / largest_nearby(shows) - np.float32(border), np.float32)
     inside = _around(np.asarray((level > 0) | (core > 0)), core)
     # What is filled in is as deep inside as what has changed most, what is left out as far outside.
@@ -65,16 +64,13 @@ def contact_level(change: Floats32, core: Mask, slopes: Floats32 | None) -> Floa
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
-def _what_shows(change: Floats32, slopes: Floats32 | None) -> tuple[Floats32, float]:
+def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
     """What tells of the contact, (h, w), and the part of its largest value at which the contact ends."""
-    if slopes is not None:
-        along_x, along_y = cv2.split(cv2.transform(change, slopes))
-        return np.asarray(cv2.magnitude(along_x, along_y), np.float32), OUTER
-    brightness = np.asarray(cv2.transform(change, np.ones((1, 3), np.float32)), np.float32)
-    brighter, darker = np.maximum(brightness, np.float32(0)), np.maximum(-brightness, np.float32(0))
-    if cv2.norm(darker, cv2.NORM_L2SQR) > cv2.norm(brighter, cv2.NORM_L2SQR):
-        return darker, SHALLOW
-    return brighter, SHALLOW
+    shown = np.asarray(cv2.transform(change, mixtures), np.float32)
+    if len(mixtures) > 1:
+        return np.linalg.norm(shown, axis=2), OUTER
+    more, less = np.maximum(shown, np.float32(0)), np.maximum(-shown, np.float32(0))
+    return (less if cv2.norm(less, cv2.NORM_L2SQR) > cv2.norm(more, cv2.NORM_L2SQR) else more), SHALLOW
 
 
 def largest_nearby(values: Floats32) -> Floats32:

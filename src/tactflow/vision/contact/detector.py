@@ -176,6 +176,7 @@ class ContactDetector:
         """Forget the reference."""
         self._last: NDArray[np.uint8] | None = None
         self._background: BackgroundModel | None = None
+        self._gel: NDArray[np.uint8] | None = None
         self._before: Flags | None = None
         self._strongest = self._strongest_wide = 0.0
         self._evidence: Floats32 | None = None
@@ -203,6 +204,8 @@ class ContactDetector:
             return
         if self._background is None:
             self._background = BackgroundModel(image, self._repeatability, self._tint, self._shift, valid)
+            if valid is not None and not valid.all():
+                self._gel = np.asarray((valid > 0) * np.uint8(255))
         else:
             self._background.add(image)
         self._last = image
@@ -264,11 +267,12 @@ class ContactDetector:
         for rows, columns, inside, core in regions:
             window = self._background.window_change(change, rows, columns, inside)
             surely = core.repeat(2, axis=0).repeat(2, axis=1)
-            level = contact_level(window, surely, heights.slopes)
+            level = contact_level(window, surely, heights.mixtures)
             draw_level(level, CELL * rows.start, CELL * columns.start, mask)
         if not regions:
             draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL)
-        return mask
+        # Cells reach beyond the gel.
+        return mask if self._gel is None else mask & self._gel
 
     def _clear(self, change: Change, before: Flags | None) -> Flags | None:
         """Contact by the size of the change, so that its outline can be seen.

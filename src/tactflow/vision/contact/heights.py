@@ -9,8 +9,8 @@ enforcing integrability in shape from shading algorithms", PAMI 10, 1988).
 
 Where all channels change alike, as those of a gray camera do, there is one mixture, and it is the slope along
 the direction in which it differs least from that of a surface; or it answers with depth, which brightens or
-darkens the contact as a whole. Where it does, or no mixtures are nearly integrable, the size of the change
-stands for the shape.
+darkens the contact as a whole. Where it does, or no mixtures are nearly integrable so far, the size of the
+change stands for the shape.
 """
 
 from __future__ import annotations
@@ -52,12 +52,17 @@ class Heights(NamedTuple):
     """The shape of a gel.
 
     values : (h, w) float32, height of each cell above the gel at rest, in some unit, or how much it has
-    changed. slopes : (2, 3) float32, mixtures of the channels that are slopes along x and y; None where no
-    mixtures are.
+    changed. mixtures : (k, 3) float32, of the channels, that show the shape: two, which are the slopes along
+    x and y; one, which is the depth; or all three channels, where nobody knows.
     """
 
     values: Floats32
-    slopes: Floats32 | None
+    mixtures: Floats32
+
+    @property
+    def sloping(self) -> bool:
+        """Whether slopes are known, and the values are heights."""
+        return len(self.mixtures) == 2
 
 
 class HeightModel:
@@ -81,20 +86,21 @@ class HeightModel:
         self._missing, self._power = np.zeros((6, 6)), np.zeros((3, 3))
         self._one_way = self._size = 0.0
         self.alike = False
-        self._slopes: Floats32 | None = None
+        self._mixtures = np.eye(3, dtype=np.float32)
         self._before = np.zeros((2, 3), np.float32)
 
     def __call__(self, change: Floats32) -> Heights:
         """Shape of the gel, (h, w); change : (3, h, w) float32, in standard deviations, 0 where no gel is."""
         self._learn(change)
-        if self._slopes is None:
-            return Heights(cv2.magnitude(cv2.magnitude(change[0], change[1]), change[2]), None)
+        if len(self._mixtures) != 2:
+            size = cv2.magnitude(cv2.magnitude(change[0], change[1]), change[2])
+            return Heights(np.asarray(size, np.float32), self._mixtures)
         high, wide = change.shape[1:]
-        slopes = (self._slopes @ change.reshape(3, -1)).reshape(2, high, wide)
+        slopes = (self._mixtures @ change.reshape(3, -1)).reshape(2, high, wide)
         down, across = _waves(high), _waves(wide)
         climbs = down.values @ slopes[0] @ across.slopes.T + down.slopes @ slopes[1] @ across.values.T
         climbs /= _squares(high, wide)
-        return Heights(np.asarray(down.values.T @ climbs @ across.values, np.float32), self._slopes)
+        return Heights(np.asarray(down.values.T @ climbs @ across.values, np.float32), self._mixtures)
 
     def _learn(self, change: Floats32) -> None:
         """Add the power of a change, and what of it would be missing in a surface, if that tells more."""
@@ -114,24 +120,24 @@ class HeightModel:
         clear = sizes > CLEAR
         self._one_way += float(np.linalg.norm(flat[:, clear].sum(axis=1)))
         self._size += float(sizes[clear].sum())
-        self._slopes = self._integrable()
-        if self._slopes is not None:
+        self._mixtures = self._showing()
+        if len(self._mixtures) == 2:
             # Up to the sign, which stays as it was.
-            self._slopes *= np.float32(1 if (self._slopes * self._before).sum() >= 0 else -1)
-            self._before = self._slopes
+            self._mixtures *= np.float32(1 if (self._mixtures * self._before).sum() >= 0 else -1)
+            self._before = self._mixtures
 
-    def _integrable(self) -> Floats32 | None:
-        """Mixtures (2, 3) of the channels that are slopes along x and y; None where none are of a surface."""
+    def _showing(self) -> Floats32:
+        """Mixtures (k, 3) of the channels that show the shape, as in `Heights`."""
         powers, directions = np.linalg.eigh(self._power)
         basis = np.kron(np.eye(2), directions[:, powers >= WEAKEST * powers[-1]])
         self.alike = basis.shape[1] == 2
-        if self.alike and self._one_way >= ONE_WAY * self._size:
-            return None
         power = basis.T @ np.kron(np.eye(2), self._power) @ basis
         missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
-        mixtures = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
-        integrable = missing[0] <= (ONE_SLOPE if self.alike else INTEGRABLE)
-        return mixtures / np.linalg.norm(mixtures) if integrable else None
+        one_way = self.alike and self._one_way >= ONE_WAY * self._size
+        if missing[0] <= (ONE_SLOPE if self.alike else INTEGRABLE) and not one_way:
+            slopes = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
+            return slopes / np.linalg.norm(slopes)
+        return np.asarray(directions[:, -1:].T if self.alike else np.eye(3), np.float32)
 
 
 class _Waves(NamedTuple):

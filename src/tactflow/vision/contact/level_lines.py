@@ -115,9 +115,9 @@ class ContactFinder:
 
         heights : of the gel's cells. changed : (h, w) bool, cells of which each contact encloses some.
         """
-        values = heights.values if self._bumps >= 0 or heights.slopes is None else -heights.values
+        values = heights.values if self._bumps >= 0 or not heights.sloping else -heights.values
         found = _contacts(values, changed)
-        if heights.slopes is not None and abs(self._bumps) <= DECIDED * found.slope:
+        if heights.sloping and abs(self._bumps) <= DECIDED * found.slope:
             others = _contacts(-values, changed)
             more = found.slope - others.slope
             if abs(self._bumps) + more < 0:

@@ -20,7 +20,7 @@ ROUGHER: Final = 1.25
 """The same, from which the reference counts as untouched from then on."""
 ENOUGH: Final = 10
 """Frames with a contact that is not smoother, after which it does, too: what a reference shows touched is
-released before another contact begins."""
+released before another contact begins. Chosen by hand."""
 
 
 class ReferenceCheck:

@@ -55,12 +55,13 @@ def cell_means(picture: NDArray[Any], side: int) -> NDArray[Any]:
     """Means over square cells; means of whole numbers are rounded.
 
     picture : (H, W) or (H, W, channels), uint8 or float32. side : of a cell, px, a power of two. Returns
-    (H // side, W // side, ...) of the picture's dtype; what fills no cell at the right and below is left out.
+    (H // side, W // side, ...) of the picture's dtype; what fills no cell at the right and below is left out,
+    unless there is no whole one: then the one is of what there is.
 
     >>> cell_means(np.arange(10, dtype=np.float32).reshape(2, 5), 2)
     array([[3., 5.]], dtype=float32)
     """
-    height, width = (extent // side for extent in picture.shape[:2])
+    height, width = (max(extent // side, 1) for extent in picture.shape[:2])
     cells: Any = picture[: height * side, : width * side]
     # OpenCV has a loop of its own for halves: two take a third of the time of one step.
     while side > 1:

@@ -16,8 +16,7 @@ REST: Final = 0.1
 
 BEST_AGREEMENT: Final = 0.25
 """Difference of a mark's displacement from the mean of those around it, over this mean, that is always
-expected. In seven recordings and eight scenes the evidence against a true mark is then 4.1 at most, 3 in all
-but one of them (measured)."""
+expected. Chosen by hand."""
 
 LEAVING_EVIDENCE: Final = 5.0
 """Evidence that a mark stays while those around it move, from which on it leaves: very strong (Kass and
@@ -58,7 +57,7 @@ class MotionEvidence:
 
     def __init__(self, origin: Floats, pitch: float, prior: Floats, against: Floats) -> None:
         self._around, weight = surroundings(origin, pitch)
-        self._share = weight / weight.sum(axis=1, keepdims=True)
+        self._share = weight / np.maximum(weight.sum(axis=1, keepdims=True), np.finfo(float).tiny)
         self._rest = REST * pitch
         self._log_odds = np.log(prior / (1 - prior))
         self.against = against

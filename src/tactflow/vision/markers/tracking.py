@@ -108,6 +108,8 @@ class MarkerTracker:
         if max_displacement is not None and not 0 < max_displacement < np.inf:
             raise ValueError(f"required max_displacement > 0 px, got {max_displacement:g}")
         detection = detection or detect_markers(frames[0], valid=valid)
+        if not len(detection.centers):
+            raise ValueError("required a detection of at least one mark, got none")
         mean = np.asarray(np.mean(np.stack(grays), axis=0, dtype=np.float32))
         self._shape = grays[0].shape
         self._shapes = (self._shape, (*self._shape, 3))
