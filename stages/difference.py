@@ -1,8 +1,8 @@
-"""Stage `difference`: where something touches the gel, against the reference."""
+"""Stage `difference`: detect contact by comparison with the reference."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,8 +15,8 @@ from tactflow.vision.contact.reference import ReferenceCheck
 
 
 class ContactPorts(NamedTuple):
-    """contact_mask : 255 in contact. touching : whether anything is. deviations : what the mask comes from;
-    None where nothing touches, and for `colour`."""
+    """contact_mask : 255 in contact. touching : whether anything is. deviations : the changes behind the
+    mask; None without contact."""
 
     contact_mask: ContactMask
     touching: Touching
@@ -26,69 +26,52 @@ class ContactPorts(NamedTuple):
 class Difference(Stage):
     """Compare the unmarked frame with the untouched gel.
 
-    It learns from all frames marked as reference (`colour`: from the last one), or else from the first frame.
-    Where the gel is smoother than in the reference, it was the reference that was touched: that is no
-    contact, and while it lasts, a new reference is asked for.
+    It learns from all frames marked as reference, or else from the first frame. If the gel is smoother than
+    in the reference, the reference was touched: nothing is reported as contact, and after `patience` frames
+    the stage requests a new reference.
     """
 
     memory = "stateful"
 
     class Params(StageParams):
-        """How contact is detected; the description of a parameter names the methods that use it."""
+        """Sensitivity of the test against the sensor's own noise."""
 
-        method: Literal["noise", "colour"] = Field(
-            "noise",
-            description="noise tests against the sensor's own noise, for gels that answer with brightness or "
-            "colour; colour is a plain distance of colours",
-        )
         false_alarms: float = Field(
-            1e-6, gt=0, lt=1, description="noise: false contacts of the untouched gel, per frame"
+            1e-6, gt=0, lt=1, description="false contacts on the untouched gel, per frame"
         )
         repeatability: float = Field(
-            0.025, ge=0, le=1, description="noise: how far the light of the gel itself varies, relative"
+            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative"
         )
         tint: float = Field(
-            0.01,
-            ge=0,
-            le=1,
-            description="noise: how far the colour of that light varies, relative to its brightness",
+            0.01, ge=0, le=1, description="variation of the colour of that light, relative to its brightness"
         )
         shift: float = Field(
-            1.0, ge=0, le=100, description="noise: how far the untouched gel moves against the camera, px"
+            1.0, ge=0, le=100, description="movement of the untouched gel against the camera, px"
         )
         relaxation: float = Field(
-            0.2,
-            ge=0,
-            lt=1,
-            description="noise: what a released gel still shows, relative to the strongest change",
+            0.2, ge=0, lt=1, description="change that a released gel still shows, relative to the strongest"
         )
         creep: float = Field(
-            0.1,
-            ge=0,
-            le=1,
-            description="noise: how much of its change a released gel loses from frame to frame at most",
+            0.1, ge=0, le=1, description="largest fraction of its change that a released gel loses per frame"
         )
         patience: int = Field(
             30,
             ge=0,
-            description="frames in a row in which the reference turns out to have been touched, after which "
-            "a new one is taken; 0: none",
+            description="consecutive frames that show the reference to have been touched, after which a new "
+            "one is taken; 0: never",
         )
-        distance: float = Field(24.0, gt=0, le=441, description="colour: change that is contact, grey levels")
 
     def __init__(self, params: Params) -> None:
         super().__init__(params)
         self._check: ReferenceCheck | None = None
         self._doubted = 0
         self._detector = ContactDetector(
-            params.method,
             false_alarms=params.false_alarms,
             repeatability=params.repeatability,
             tint=params.tint,
             shift=params.shift,
             relaxation=params.relaxation,
             creep=params.creep,
-            distance=params.distance,
         )
 
     def reset(self) -> None:

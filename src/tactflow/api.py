@@ -237,7 +237,7 @@ def stage(use: str | type[Stage], /, **params: Any) -> Any:
     --------
     >>> import tactflow
     >>> scene = tactflow.open_scene("press")
-    >>> difference = tactflow.stage("difference", method="colour")
+    >>> difference = tactflow.stage("difference")
     >>> difference.process(scene.frame(0)).touching, difference.process(scene.frame(60)).touching
     (False, True)
     """

@@ -15,7 +15,7 @@ PIPELINE = """
 stages:
   capture: {source: "sim:idle", settle: 0}
   preprocess: {rotate: 0, downsample: 1}
-  difference: {in: {unmarked: preprocess.image}, method: colour}
+  difference: {in: {unmarked: preprocess.image}, use: "tactflow.classic.stages:Difference"}
   hull: {when: touching}
 sinks: {}
 """

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 import tactflow
@@ -29,10 +28,9 @@ def _touched() -> tuple[Image, Image]:
     return scene.frame(0), scene.frame(25)
 
 
-@pytest.mark.parametrize("method", ["noise", "colour"])
-def test_a_touched_gel_is_told_from_the_reference(method: str) -> None:
+def test_a_touched_gel_is_told_from_the_reference() -> None:
     untouched, touched = _touched()
-    stage = _stage(method=method)
+    stage = _stage()
     mask, touching, _ = stage.process(untouched, _frame(untouched, 0, reference=True))
     assert not touching
     assert not mask.any()

@@ -111,16 +111,16 @@ def dog_mask(reference: Image, image: Image) -> Image:
     return np.zeros(image.shape[:2], np.uint8) if dot is None else marker_mask(image, dot)
 
 
-def detector(method: str, reference: Image) -> ContactDetector:
+def detector(reference: Image) -> ContactDetector:
     """A detector with one reference."""
-    made = ContactDetector(method)  # type: ignore[arg-type]
-    made.add_reference(reference)
-    return made
+    contact = ContactDetector()
+    contact.add_reference(reference)
+    return contact
 
 
-def contact_mask(method: str, reference: Image, image: Image) -> Image:
+def contact_mask(reference: Image, image: Image) -> Image:
     """The contact mask of one image against one reference."""
-    return detector(method, reference).detect(image).mask
+    return detector(reference).detect(image).mask
 
 
 def tracked(reference: Image, image: Image) -> Markers:
@@ -133,12 +133,11 @@ def filled(method: Any, _reference: Image, image: Image) -> Image:
     return remove_markers(image, marker_mask(image, Dot(3.0)), method=method)
 
 
-DIFFERENCES = ("noise", "colour")
 INPAINTING = ("normalized", "telea", "ns", "none")
 PICTURE_METHODS: Mapping[str, Callable[[Image, Image], Any]] = {
     "marker_mask": dog_mask,
     **{f"inpaint-{name}": partial(filled, name) for name in INPAINTING},
-    **{f"difference-{name}": partial(contact_mask, name) for name in DIFFERENCES},
+    "difference": contact_mask,
     "tracker": tracked,
 }
 """Name -> callable of (reference, image)."""

@@ -22,7 +22,6 @@ MIN_PITCH: Final = 6.0
 DOWNSAMPLE: Final = "stages.preprocess.downsample"
 AXES: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {
     "preprocess": {f"downsample {k}": {DOWNSAMPLE: k} for k in (1, 2, 4)},
-    "difference": {m: {"stages.difference.method": m} for m in ("noise", "colour")},
     "fusion": {"fusion": {}, "no fusion": {"stages.fusion": None}},
     "field": {"field": {}, "mean": {"stages.field": None, "stages.flow_in_mask.method": "mean"}},
 }
@@ -49,7 +48,7 @@ def candidates(
 
     >>> from tactflow.config.shipped import find_pipeline
     >>> [c.name for c in candidates(find_pipeline("markerless"), (400, 300), None)][:3]
-    ['downsample 1, noise', 'downsample 1, colour', 'as given']
+    ['downsample 1', 'as given']
     """
     original = load_pipeline(file, sensor=sensor)
     # Only stages with the built-in implementation.
