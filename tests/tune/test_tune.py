@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import replace
@@ -17,7 +16,7 @@ import tactflow
 from tactflow.bench.scenes import Case
 from tactflow.config.shipped import find_pipeline
 from tactflow.tune import report, search, space
-from tactflow.tune.measure import Interval, Trial, judge, mark_unsound
+from tactflow.tune.measure import Trial, judge, mark_unsound
 from tactflow.tune.recording import Recording, take
 from tactflow.tune.search import Goal, Tuned
 from tactflow.tune.sensor import Fitted, Look, fit
@@ -29,8 +28,7 @@ FIELD = {"field": {"field": {}, "mean": {"stages.field": None, "stages.flow_in_m
 
 
 def make_trial(name: str, ms: float, error: float, **more: object) -> Trial:
-    errors = {"center": Interval(error, 0.9 * error, 1.1 * error)}
-    trial = Trial(name, {}, tactflow.load("default"), errors, ms=Interval(ms, ms, ms))
+    trial = Trial(name, {}, tactflow.load("default"), {"center": error}, ms=ms)
     for key, value in more.items():
         setattr(trial, key, value)
     return trial
@@ -52,8 +50,6 @@ def test_the_simulated_sensor_looks_like_the_recorded_one(recorded: Recording) -
     settings = dict(part.split("=") for part in look.query.split("&"))
     assert float(settings["pitch"]) == pytest.approx(69.0, rel=0.03)
     assert settings["polarity"] == "dark"
-    assert settings["light"] == "photometric"
-    assert look.contrast == pytest.approx(1.0, abs=0.1)
     assert look.levels == pytest.approx((1.0, 1.0, 1.0), abs=0.05)
 
 
@@ -64,21 +60,16 @@ def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     monkeypatch.setattr(search, "SIMULATED", (Case("press", 24),))
     path = Fitted(SMALL, Case("press", 30), tmp_path, 3).path
     budget = 1.5
-    words = ["tune", "default", "--source", str(path), "--json"]
-    assert terminal(*words, "--max-error", str(budget)) == 0
-    output = json.loads(terminal.out)
+    assert terminal("tune", "default", "--source", str(path), "--max-error", str(budget)) == 0
     trials = candidates(find_pipeline("default"), (320, 240), None)
     judge(trials, [Fitted(SMALL, Case("press", 24), tmp_path, 50)])
-    truth = {trial.name: trial.error.value for trial in trials}
+    truth = {trial.name: trial.error for trial in trials}
     # The mean over the dots is cheaper than the field, and far off: the budget forbids it.
-    assert output["chosen"] == ORIGINAL
+    assert f"| CHOSEN | {ORIGINAL} " in terminal.out
     assert truth[ORIGINAL] <= budget < truth["mean"]
-    (chosen,) = [trial for trial in output["candidates"] if trial["name"] == output["chosen"]]
-    assert chosen["checks"]["agreement"] == pytest.approx(100.0, abs=10.0)
     assert "field" in tactflow.load("tuned.yaml").nodes
     text = Path("tuned.yaml").read_text()
-    assert f"{chosen['ms']['value']:.2f}" in text
-    assert "time: CPU of a frame with contact, on the recording" in text
+    assert all(f"# {line}".rstrip() in text for line in terminal.out.splitlines())
 
 
 def test_the_order_follows_the_goal() -> None:
@@ -86,8 +77,8 @@ def test_the_order_follows_the_goal() -> None:
         make_trial("slow", 9, 0.1),
         make_trial("fast", 1, 2.0),
         make_trial("middle", 3, 0.5),
-        make_trial("wrong", 0.5, 0.1, unsound="% of dots lost: 50 (best 0)"),
-        make_trial("fails", 0.1, 0.1, failure="tracker failed"),
+        make_trial("wrong", 0.5, 0.1, fault="% of dots lost: 50 (best 0)"),
+        make_trial("fails", 0.1, 0.1, fault="tracker failed"),
     ]
     assert [trial.name for trial in Goal(max_error=1.0).order(trials)][:3] == ["middle", "slow", "fast"]
     assert [trial.name for trial in Goal(max_ms=4.0).order(trials)][:3] == ["middle", "fast", "slow"]
@@ -97,7 +88,7 @@ def test_the_order_follows_the_goal() -> None:
 
 def test_an_impossible_budget_tells_what_is_possible(recorded: Recording) -> None:
     trials = [make_trial("exact", 9, 0.1), make_trial("fast", 1, 2.0)]
-    possible = "Possible: 0.105 px in 9 ms (exact), or 2.1 px in 1 ms (fast)"
+    possible = "Possible: 0.1 px in 9 ms (exact), or 2 px in 1 ms (fast)"
     assert Tuned(recorded, SMALL, trials).impossible().endswith(possible)
 
 
@@ -107,7 +98,7 @@ def test_a_pipeline_that_misses_contacts_is_not_sound() -> None:
     trials[1].quantities = {"missed_half_depth": 40.0}
     mark_unsound(trials)
     assert [trial.usable for trial in trials] == [True, False, False]
-    assert "40 (best 0)" in trials[1].unsound
+    assert "40 (best 0)" in trials[1].fault
 
 
 def test_what_is_changed_stands_in_the_file_and_removed_stages_are_gone(

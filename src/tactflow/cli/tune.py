@@ -7,13 +7,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tactflow.cli.options import add_json, add_overwrite, add_sensor, refuse_output, writing
+from tactflow.cli.options import add_overwrite, add_sensor, refuse_output, writing
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import StageError
 from tactflow.system.arguments import number
 from tactflow.system.files import completed
-from tactflow.system.terminal import notes, say, show, show_json, typed
+from tactflow.system.terminal import notes, say, show, typed
 
 _above_0 = number(float, sys.float_info.min, sys.float_info.max, "a number above 0")
 
@@ -46,7 +46,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
     )
     add_overwrite(parser)
-    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -74,10 +73,7 @@ def run(args: argparse.Namespace) -> int:
             say(f"no dots are found: starting from {file.name}")
         trials = candidates(file, recording.size, None if dots is None else dots.pitch, args.sensor)
         tuned = search(trials, recording, folder, Goal(args.max_error, args.max_ms), say)
-    if args.json:
-        show_json(report.as_json(tuned))
-    else:
-        show(report.lines(tuned))
+    show(report.lines(tuned))
     if tuned.chosen is None:
         say(tuned.impossible())
         return StageError.exit_code

@@ -14,9 +14,12 @@ from itertools import takewhile
 from textwrap import shorten
 from typing import Any, Final
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tactflow.calibration.file import UNLIKE_KIND, Calibration
+from tactflow.config.load import load_pipeline
+from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.doctor.checks import STEADY
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
@@ -25,6 +28,7 @@ from tactflow.tune.recording import CHANGE, change_between
 from tactflow.tune.space import DOWNSAMPLE, MIN_PITCH, MIN_SIDE
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.change import Settling
+from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import MarkerStatus
 
 LARGE: Final = 500
@@ -34,9 +38,11 @@ PRESSED: Final = 0.5
 because whether they show a contact is a matter of definition."""
 FEWEST_FOUND: Final = 0.5
 """Share of presses below which a pipeline does not find the contacts of a gel: no better than a coin."""
+NEAR: Final = 0.1
+"""Difference of two scores up to which they count as equal: the standard error of a share of 25 frames."""
 TRIED: Final = ("default", "markerless", "tactip")
-"""Shipped pipelines that are tried for every sensor. The others differ from one of them in geometry alone,
-except for `OF_ONE`."""
+"""Shipped pipelines that are tried for every sensor. The others differ from one of them in geometry and
+calibration alone, except for `OF_ONE`."""
 OF_ONE: Final = frozenset({"classic", "wedge"})
 """Shipped pipelines for no kind of sensor: the original script, and one that rectifies the picture of one
 camera."""
@@ -67,16 +73,15 @@ class Attempt:
     """What a pipeline reports on the frames.
 
     pipeline : its name. settings : values that differ from its file. found : share of pressed frames with a
-    contact. false : share of frames at rest with a contact. deviation : standard error of their difference.
-    dots : median number of dots at rest. steady : 95th percentile of their displacement at rest, px.
-    picture : result of the strongest press, with its image. failure : error message if it does not run.
+    contact. false : share of frames at rest with a contact. dots : median number of dots at rest.
+    steady : 95th percentile of their displacement at rest, px. picture : result of the strongest press, with
+    its image. failure : error message if it does not run.
     """
 
     pipeline: str
     settings: dict[str, Any]
     found: float = math.nan
     false: float = math.nan
-    deviation: float = math.nan
     dots: int = 0
     steady: float = math.inf
     picture: Result | None = field(default=None, repr=False)
@@ -145,28 +150,47 @@ def propose(
     kind: str | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[Attempt]:
-    """Try the shipped pipelines of `TRIED` and that of the sensor's kind, best first.
+    """Try the shipped pipelines of `TRIED` and those that fit the sensor, best first.
 
-    Of pipelines whose scores are within a standard error of the best, one that also tracks steady dots is
-    preferred, then the one for the sensor that the user named, then the first.
+    Of pipelines whose scores are near the best, one that also tracks steady dots is preferred, then one for
+    this kind of sensor, then the first.
 
     pitch : of the dots, px, None without dots. rotate : degrees clockwise. kind : shipped pipeline for the
-    sensor as named by the user, None if unknown. report : called with the result of each.
+    sensor as named by the user, None to recognise it. report : called with the result of each.
     """
-    height, width = sample.frames[0].shape[:2]
+    untouched = sample.frames[sample.reference]
+    height, width = untouched.shape[:2]
     settings = {"stages.preprocess.rotate": rotate, DOWNSAMPLE: shrinking((width, height), pitch)}
+    fitting = [kind] if kind is not None else _recognised(untouched) if rotate == 0 else []
     attempts = []
-    for name in dict.fromkeys([*TRIED, kind or TRIED[0]]):
+    for name in dict.fromkeys([*TRIED, *fitting]):
         attempts.append(_attempt(name, settings, sample))
         report(str(attempts[-1]))
-    best = max(attempts, key=lambda attempt: attempt.score)
+    best = max(attempt.score for attempt in attempts)
 
-    def rank(attempt: Attempt) -> tuple[bool, float, bool, bool]:
-        near = attempt.score >= best.score - best.deviation
+    def rank(attempt: Attempt) -> tuple[float, bool, bool]:
         with_dots = pitch is not None and attempt.has_dots
-        return not near, 0.0 if near else -attempt.score, not with_dots, attempt.pipeline != kind
+        worse = 0.0 if attempt.score >= best - NEAR else 1.0 - attempt.score
+        return worse, not with_dots, attempt.pipeline not in fitting
 
     return sorted(attempts, key=rank)
+
+
+def _recognised(untouched: ColorImage) -> list[str]:
+    """Shipped pipelines with the calibration of a kind of sensor that looks like this one at rest."""
+    # The median removes the dots.
+    factor = 240 / min(untouched.shape[:2])
+    small = cv2.resize(untouched, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    plain = np.asarray(cv2.medianBlur(small, 25), np.uint8)
+    mapping = PixelMapping.identity((plain.shape[1], plain.shape[0]))
+    names = []
+    for name in packaged_pipelines():
+        path = load_pipeline(find_pipeline(name)).calibration
+        if path is not None:
+            calibration = Calibration.load(path)
+            if calibration.misfit(mapping) is None and calibration.unlikeness(plain) <= UNLIKE_KIND:
+                names.append(name)
+    return names
 
 
 def _attempt(name: str, settings: dict[str, Any], sample: Sample) -> Attempt:
@@ -194,23 +218,9 @@ def _attempt(name: str, settings: dict[str, Any], sample: Sample) -> Attempt:
         return attempt
     contact = np.array(touching)
     attempt.false = float(contact[sample.rest].mean())
-    variance = _variance(contact[sample.rest])
     if sample.pressed:
         attempt.found = float(contact[sample.pressed].mean())
-        variance += _variance(contact[sample.pressed])
-    attempt.deviation = math.sqrt(variance)
     if dots and any(map(len, moved)):
         attempt.dots = int(np.median(dots))
         attempt.steady = float(np.percentile(np.concatenate(moved), 95))
     return attempt
-
-
-def _variance(outcomes: NDArray[np.bool_]) -> float:
-    """Variance of a share of outcomes (N,), also of 0 and 1.
-
-    A. Agresti and B. A. Coull, "Approximate is better than exact for interval estimation of binomial
-    proportions", The American Statistician 52, 1998.
-    """
-    count = len(outcomes) + 4
-    share = (int(outcomes.sum()) + 2) / count
-    return share * (1 - share) / count

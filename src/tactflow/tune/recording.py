@@ -78,9 +78,7 @@ class Recording:
     """The extracted part of a recording.
 
     source : as given by the user. path : `.npy` file of the frames. frames : number of frames. size : (width,
-    height), px, before downsampling. observation : some of the frames, for the doctor's measures. pressed :
-    (H, W, 3), the frame that differs most from the first, after the pipeline's geometry. change : its maximum
-    relative change of light.
+    height), px, before downsampling. observation : some of the frames, for the doctor's measures.
     """
 
     source: str
@@ -88,8 +86,6 @@ class Recording:
     frames: int
     size: tuple[int, int]
     observation: Observation
-    pressed: ColorImage
-    change: float
 
 
 def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
@@ -120,12 +116,11 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
             f"{source}: {observation.frames} frames are too few to tune on; required {MIN_FRAMES} or more"
         )
     frames = kept.frames
-    changes = [change_between(frames[0], image) for image in frames]
-    strongest = int(np.argmax(changes))
-    if changes[strongest] < CHANGE:
+    change = max(change_between(frames[0], image) for image in frames)
+    if change < CHANGE:
         raise SourceError(
             f"{source}: no contact in the first {observation.frames} frames (the light changes by at most "
-            f"{100 * changes[strongest]:.1f} %); record some presses, with the gel untouched at first"
+            f"{100 * change:.1f} %); record some presses, with the gel untouched at first"
         )
     path, transform = folder / "recording.npy", _geometry(pipeline)
     np.save(path, frames)
@@ -133,9 +128,8 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
         Pair(number, transform(image), None if after is None else transform(after))
         for number, image, after in observation.pairs
     ]
-    pressed = transform(frames[strongest])
-    height, width = pressed.shape[:2]
-    return Recording(source, path, len(frames), (width, height), observation, pressed, changes[strongest])
+    height, width = observation.pairs[0].image.shape[:2]
+    return Recording(source, path, len(frames), (width, height), observation)
 
 
 def change_between(first: ColorImage, now: ColorImage) -> float:

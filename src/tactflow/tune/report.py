@@ -1,57 +1,36 @@
-"""Report the result of a search: as text, JSON, and pipeline file with comments."""
+"""Report the result of a search: a table, and a pipeline file with comments."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.system.terminal import markdown, printable
-from tactflow.tune.measure import CHECKS, ERRORS, Interval
+from tactflow.tune.measure import ERRORS
 from tactflow.tune.search import Tuned
 
 
 def lines(tuned: Tuned) -> Iterator[str]:
-    """How the pipelines were measured, a table of them, and the chosen one on the recording, as Markdown."""
+    """How the pipelines were measured, and a table of them, as Markdown."""
+    kinds = [kind for kind in ERRORS if any(kind in trial.errors for trial in tuned.trials)]
     facts = [
         f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}",
         "errors: px of the camera image, simulated; time: CPU of a frame with contact, on the recording",
+        "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds),
     ]
-    kinds = [kind for kind in ERRORS if any(kind in trial.errors for trial in tuned.trials)]
     rows = []
     for trial in tuned.trials:
-        cells = [_cell(trial.ms, 2), *(_cell(trial.errors.get(kind), 3) for kind in kinds)]
-        remark = (trial.failure or trial.unsound).partition("\n")[0]
-        rows.append(["CHOSEN" if trial is tuned.chosen else "", trial.name, *cells, remark])
+        errors = (f"{trial.errors[kind]:.3f}" if kind in trial.errors else "-" for kind in kinds)
+        ms = f"{trial.ms:.2f}" if math.isfinite(trial.ms) else "-"
+        mark, remark = "CHOSEN" if trial is tuned.chosen else "", trial.fault.partition("\n")[0]
+        rows.append([mark, trial.name, ms, *errors, remark])
     columns = ["", "pipeline", "time, ms", *(f"{kind}, px" for kind in kinds), "remarks"]
-    legend = "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds)
-    legend = f"In brackets: 90 % intervals. {legend}"
-    yield from markdown("How", "\n\n".join(facts))
-    yield from markdown("Time and error", legend, columns, rows)
-    if tuned.chosen is not None:
-        checks = [[CHECKS[name], f"{value:.3g}"] for name, value in tuned.chosen.checks.items()]
-        yield from markdown("The chosen pipeline on the recording", "", ["check", "value"], checks)
-
-
-def _cell(interval: Interval | None, digits: int) -> str:
-    if interval is None:
-        return "-"
-    return f"{interval.value:.{digits}f} ({interval.low:.{digits}f}-{interval.high:.{digits}f})"
-
-
-def as_json(tuned: Tuned) -> dict[str, Any]:
-    """The report as values for JSON."""
-    keys = ("name", "settings", "errors", "quantities", "ms", "failure", "unsound", "checks")
-    return {
-        "source": tuned.recording.source,
-        "sensor": tuned.look,
-        "chosen": None if tuned.chosen is None else tuned.chosen.name,
-        "candidates": [{key: getattr(trial, key) for key in keys} for trial in tuned.trials],
-    }
+    yield from markdown("Time and error", "\n\n".join(facts), columns, rows)
 
 
 def pipeline_text(tuned: Tuned, out: Path) -> str:

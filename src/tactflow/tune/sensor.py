@@ -1,4 +1,4 @@
-"""Fit the simulated sensor to a recording."""
+"""Fit the simulated sensor to a recording: size, dots, brightness, blur and noise."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from tactflow.doctor import measures
 from tactflow.doctor.observation import Observation
 from tactflow.sim import Truth, open_scene
 from tactflow.sim.camera import SIZE
-from tactflow.tune.recording import Recording, change_between
+from tactflow.tune.recording import Recording
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.geometry import PixelMapping
-from tactflow.vision.markers import NoMarkersError, detect_markers
 
 OWN_BLUR: Final = 0.9
 """Intrinsic blur of the simulator's dots as the doctor measures it, px of its frame."""
@@ -27,12 +26,6 @@ DOT_LIMITS: Final = (1.5, 60.0)
 """Range of dot radii passed to the simulator, px of its frame. Chosen by hand."""
 MAX_COLUMNS: Final = 60
 """Maximum number of columns and rows of dots in the simulator."""
-LIGHTS: Final = {"photometric": 0.0, "mixed": 0.5, "bright": 1.0}
-"""Light of the simulator -> share of the change at a contact common to all channels, 0 to 1."""
-DEPTHS: Final = (0.3, 0.5, 0.75, 1.0)
-"""Relative depths of the simulated press among which the best match is selected."""
-FAINT: Final = 0.06
-"""Minimum relative change of light at pixels that decide the type of light. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +34,7 @@ class Look:
 
     size : (width, height) of the frames, px. query : scene settings, as for `open_scene`. noise : grey
     levels. blur : px, in addition to the simulator's own. levels : (3,) factors on the simulator's light,
-    BGR. contrast : of the dots, relative to the simulator's.
+    BGR.
     """
 
     size: tuple[int, int]
@@ -49,15 +42,11 @@ class Look:
     noise: float = 0.0
     blur: float = 0.0
     levels: tuple[float, ...] = (1.0, 1.0, 1.0)
-    contrast: float = 1.0
 
     def __str__(self) -> str:
-        parts = [f"{self.size[0]} x {self.size[1]} px", f"noise {self.noise:.1f} grey levels", self.query]
-        if self.contrast != 1.0:
-            parts.append(f"dots of {100 * self.contrast:.0f} % contrast")
-        if self.blur:
-            parts.append(f"blur {self.blur:.1f} px")
-        return ", ".join(parts)
+        width, height = self.size
+        noise, blur = f"noise {self.noise:.1f} grey levels", f"blur {self.blur:.1f} px"
+        return f"{width} x {height} px, {noise}, {blur}, {self.query}"
 
 
 def fit(recording: Recording) -> Look:
@@ -68,21 +57,16 @@ def fit(recording: Recording) -> Look:
     """
     observation = recording.observation
     scale = math.sqrt(recording.size[0] * recording.size[1] / (SIZE[0] * SIZE[1]))
-    size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
-    plain = Look(size, f"{_dots(observation, scale)}&light={_light_of(recording)}")
-    simulated = rounded(light(plain, open_scene(f"press?{plain.query}&frames=60&noise=0"), 0))
-    levels = tuple(
-        float(v) for v in _levels(observation.pairs[0].image) / np.maximum(_levels(simulated), 1.0)
-    )
-    noise = measures.noise_of(observation.pairs)
+    query = _dots(observation, scale)
+    simulated = open_scene(f"press?{query}&frames=60&noise=0").frame(0)
+    levels = _levels(observation.pairs[0].image) / np.maximum(_levels(simulated), 1.0)
     blur = measures.blur(observation.typical) or 0.0
     return Look(
-        size,
-        f"{plain.query}&depth={_depth(recording, plain, simulated)}",
-        round(noise, 2),
+        (round(SIZE[0] * scale), round(SIZE[1] * scale)),
+        query,
+        round(measures.noise_of(observation.pairs), 2),
         round(math.sqrt(max(blur**2 - (OWN_BLUR * scale) ** 2, 0.0)), 2),
-        levels,
-        round(_contrast_ratio(observation, simulated, levels), 2),
+        tuple(map(float, levels)),
     )
 
 
@@ -99,75 +83,10 @@ def _dots(observation: Observation, scale: float) -> str:
     return f"{grid}&missing={min(missing, 0.5):.3f}"
 
 
-def rounded(light: NDArray[Any]) -> ColorImage:
-    """(H, W, 3) uint8 from grey levels."""
-    return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
-
-
 def _levels(image: ColorImage) -> NDArray[np.float64]:
     """Median grey levels (3,) of the gel, BGR."""
     gel = image[image.max(axis=2) > measures.BLACK]
     return np.asarray(np.median(gel, axis=0) if len(gel) else np.ones(3), np.float64)
-
-
-def _contrast_ratio(observation: Observation, simulated: ColorImage, levels: tuple[float, ...]) -> float:
-    """Contrast of the dots, relative to the dots of the simulated frame at the same light levels."""
-    if observation.dots is None:
-        return 1.0
-    simulated = np.clip(simulated * np.array(levels), 0, 255).astype(np.uint8)
-    try:
-        dots = detect_markers(simulated)
-    except NoMarkersError:
-        return 1.0
-    contrast = measures.lattice(dots, measures.grey(simulated)).contrast
-    target = measures.lattice(observation.dots, observation.grays[0]).contrast
-    return float(np.clip(target / max(contrast, 1.0), 0.1, 1.1))
-
-
-def _light_of(recording: Recording) -> str:
-    """The simulator's light that responds to contacts like the recording."""
-    pictures = recording.observation.pairs[0].image, recording.pressed
-    side = max(8, min(pictures[0].shape[:2]) // 60)
-    untouched, touched = (cv2.blur(picture, (side, side))[::4, ::4].astype(float) for picture in pictures)
-    ratio = (touched / np.maximum(untouched, 25.0)).reshape(-1, 3)
-    ratio = ratio / np.maximum(np.median(ratio, axis=0), 0.1) - 1.0
-    strong = ratio[np.abs(ratio).max(axis=1) > FAINT]
-    if not len(strong):
-        return "photometric"
-    mean = strong.mean(axis=1)
-    common = float(np.mean(mean) / max(float(np.mean(np.abs(strong))), 1e-6))
-    if common < -0.6:
-        return "darkening"
-    return min(LIGHTS, key=lambda name: abs(LIGHTS[name] - max(common, 0.0)))
-
-
-def _depth(recording: Recording, plain: Look, untouched: ColorImage) -> float:
-    """Depth of the simulated press that changes the light as much as the recording.
-
-    untouched : simulated frame of the untouched gel.
-    """
-    target = recording.change
-    changes = {}
-    for depth in DEPTHS:
-        scene = open_scene(f"press?{plain.query}&frames=60&noise=0&depth={depth}")
-        deepest = max(range(60), key=lambda index: max((p.depth for p in scene.presses(index)), default=0.0))
-        changes[depth] = change_between(untouched, rounded(light(plain, scene, deepest)))
-    return min(changes, key=lambda depth: abs(math.log(max(changes[depth], 1e-3) / target)))
-
-
-def light(look: Look, scene: Any, index: int) -> NDArray[np.float32]:
-    """A frame with the sensor's size, light levels and dot contrast, (H, W, 3) grey levels.
-
-    Not rounded: quantisation before adding noise increases the error of the contact's centre by half.
-    """
-    image = scene.frame(index).astype(np.float32)
-    if look.contrast != 1.0:
-        clean = scene.clean(index).astype(np.float32)
-        image = cv2.addWeighted(image, look.contrast, clean, 1.0 - look.contrast, 0.0)
-    if look.size != SIZE:
-        shrinks = look.size[0] < SIZE[0]
-        image = cv2.resize(image, look.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-    return np.asarray(image * np.array(look.levels, np.float32), np.float32)
 
 
 class Fitted(Rendered):
@@ -183,12 +102,18 @@ class Fitted(Rendered):
         super().__init__(replace(case, query=query), folder, look.size)
 
     def render(self, index: int) -> ColorImage:
-        """The frame, with blur and noise."""
-        frame = light(self._look, self.scene, index)
-        if self._look.blur:
-            frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), self._look.blur), np.float32)
-        frame += np.float32(self._look.noise) * self._rng.standard_normal(frame.shape, dtype=np.float32)
-        return rounded(frame)
+        """The frame, with the sensor's size, light, blur and noise."""
+        look = self._look
+        image: NDArray[Any] = self.scene.frame(index).astype(np.float32)
+        if look.size != SIZE:
+            shrinks = look.size[0] < SIZE[0]
+            image = cv2.resize(image, look.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+        # Not rounded: quantisation before adding noise increases the error of the contact's centre by half.
+        frame = np.asarray(image * np.array(look.levels, np.float32), np.float32)
+        if look.blur:
+            frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), look.blur), np.float32)
+        frame += np.float32(look.noise) * self._rng.standard_normal(frame.shape, dtype=np.float32)
+        return np.asarray(np.clip(np.rint(frame), 0, 255), np.uint8)
 
     def truths(self, mapping: PixelMapping) -> list[Truth]:
         """Like `Rendered.truths`, for a mapping from frames of the sensor's size."""
