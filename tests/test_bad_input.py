@@ -14,7 +14,7 @@ pytest.importorskip("rosbags", reason="the extra bags is not installed")
 pytest.importorskip("h5py", reason="the extra hdf5 is not installed")
 pytest.importorskip("zarr", reason="the extra zarr is not installed")
 pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
-pytest.importorskip("av", reason="the extra av is not installed")
+pytest.importorskip("av", reason="the extra lerobot is not installed")
 
 from tactflow.cli.main import main
 from tests.adapters.bags import TOPIC, write_bag
@@ -70,7 +70,7 @@ def damaged_zarr(folder: Path) -> Path:
 
 
 def lerobot(folder: Path, dtype: str = "image") -> Path:
-    return write_lerobot(folder / "press", np.zeros((5, 48, 64, 3), np.uint8), "v3.0", dtype)
+    return write_lerobot(folder / "press", np.zeros((5, 48, 64, 3), np.uint8), dtype)
 
 
 def episode(root: Path) -> str:

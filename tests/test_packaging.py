@@ -31,12 +31,11 @@ def test_links_of_the_readme_work_on_a_package_index() -> None:
 
 
 @pytest.mark.parametrize("sensor", ["left", "right"])
-def test_the_runs_of_the_containers_are_valid(sensor: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_runs_of_the_containers_are_valid(sensor: str) -> None:
     run, _, source, *settings = SERVICES[sensor]["command"]
     page = ["--set=sinks.view={host: 0.0.0.0, token: simulated-sensors}"]
     assert run == "run"
     assert main(["check", f"--set=stages.capture.source={source.partition('=')[2]}", *settings, *page]) == 0
-    assert "foxglove" in " ".join(settings), capsys.readouterr().err
 
 
 def test_the_image_is_built_from_every_file_that_the_wheel_needs() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.engine.errors import SourceError
 from tactflow.sources import open_source
 
 pytest.importorskip("rosbags", reason="the extra bags is not installed")
@@ -103,27 +102,3 @@ def test_pictures_of_foxglove_are_read(tmp_path: Path) -> None:
     found = played(str(write_foxglove(tmp_path / "press.mcap", messages)))
     assert [t for _, t in found] == [0.0, 0.04, 0.08]
     assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
-
-
-def test_a_video_in_messages_is_decoded(tmp_path: Path) -> None:
-    schemas = pytest.importorskip("foxglove_schemas_protobuf.CompressedVideo_pb2")
-    av = pytest.importorskip("av")
-    messages = []
-    encoder = av.CodecContext.create("libx264", "w")
-    encoder.width, encoder.height, encoder.pix_fmt, encoder.framerate = 64, 48, "yuv420p", 25
-    encoder.options = {"tune": "zerolatency"}
-    encoder.gop_size = 3
-    for index in range(5):
-        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 40 * index, np.uint8), format="bgr24")
-        for packet in encoder.encode(frame):
-            one = schemas.CompressedVideo(format="h264", data=bytes(packet))
-            one.timestamp.FromNanoseconds(BEGIN + index * PERIOD)
-            messages.append(one)
-    found = played(f"{write_foxglove(tmp_path / 'press.mcap', messages)}?topic={TOPIC}")
-    assert [round(float(image.mean()) / 40) for image, _ in found] == [0, 1, 2, 3, 4]
-    assert [t for _, t in found] == [0.0, 0.04, 0.08, 0.12, 0.16]
-    # Begun in the middle, it is shown from the next picture on that stands alone.
-    found = played(f"{write_foxglove(tmp_path / 'late.mcap', messages[1:])}?topic={TOPIC}")
-    assert [round(float(image.mean()) / 40) for image, _ in found] == [3, 4]
-    with pytest.raises(SourceError, match="there is no picture in it"):
-        open_source(f"{write_foxglove(tmp_path / 'none.mcap', messages[1:3])}?topic={TOPIC}")

@@ -90,33 +90,6 @@ def test_what_is_no_frames_is_refused(query: str, tmp_path: Path) -> None:
         open_source(f"{path}{query}")
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_an_array_ends_where_nothing_more_is_stored(
-    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = KINDS[name](tmp_path / name, frames=IMAGES)
-    options = {"shape": (10**12, 12, 16, 3), "chunks": (2, 12, 16, 3), "dtype": "u1"}
-    is_zarr = name.endswith(".zarr")
-    if is_zarr:
-        file = pytest.importorskip("zarr").open_group(path)
-    else:
-        file = pytest.importorskip("h5py").File(path, "a")
-        file.create_dataset("whole", IMAGES.shape, "u1")
-    create = file.create_array if is_zarr else file.create_dataset
-    long, late, _ = (create(key, **options) for key in ("long", "late", "never"))
-    # Zarr does not store the chunk of two black pictures.
-    long[:5] = np.concatenate([IMAGES[:2], 0 * IMAGES[:2], IMAGES[4:]])
-    late[10**6] = IMAGES[0]
-    if not is_zarr:
-        file.close()
-    found = played(f"{path}?dataset=long")
-    assert [int(image.max()) > 0 for image, _ in found] == [True, True, False, False, True, False]
-    assert "ended after 6 of 1000000000000 frames, the others were never written" in caplog.text
-    for array in ("late", "never", *([] if is_zarr else ["whole"])):
-        with pytest.raises(SourceError, match=f"{array}: only [01] of its chunks are stored; was it written"):
-            open_source(f"{path}?dataset={array}")
-
-
 def test_times_that_are_damaged_are_an_error_of_the_source(tmp_path: Path) -> None:
     path = write_zarr(tmp_path / "press.zarr", frames=IMAGES, t=np.arange(5.0))
     (path / "gel/t/c/0").write_bytes(b"damaged")
@@ -180,13 +153,13 @@ def write_film(path: Path, images: NDArray[np.uint8]) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def write_lerobot(root: Path, images: NDArray[np.uint8], version: str, dtype: str) -> Path:
-    """Two episodes of two and three frames at 25 Hz, by the documents of the layouts."""
+def write_lerobot(root: Path, images: NDArray[np.uint8], dtype: str) -> Path:
+    """Two episodes of two and three frames at 25 Hz, by the documents of the layout."""
     pa = pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
     import pyarrow.parquet as pq
 
     features = {KEY: {"dtype": dtype, "shape": [48, 64, 3]}, "action": {"dtype": "float32", "shape": [1]}}
-    info = {"codebase_version": version, "fps": 25, "total_episodes": 2, "features": features}
+    info = {"codebase_version": "v3.0", "fps": 25, "total_episodes": 2, "features": features}
     rows: list[dict[str, Any]] = [{"episode_index": int(index >= 2)} for index in range(5)]
     episodes = [{"episode_index": 0, "length": 2}, {"episode_index": 1, "length": 3}]
     if dtype == "image":
@@ -195,30 +168,23 @@ def write_lerobot(root: Path, images: NDArray[np.uint8], version: str, dtype: st
     for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
         (root / folder).mkdir(parents=True)
     (root / "meta" / "info.json").write_text(json.dumps(info))
-    if version.startswith("v3"):
-        pq.write_table(pa.Table.from_pylist(rows), root / "data/chunk-000/file-000.parquet")
-        for index, episode in enumerate(episodes):
-            episode |= {"data/chunk_index": 0, "data/file_index": 0}
-            if dtype == "video":
-                place = {"chunk_index": 0, "file_index": 0, "from_timestamp": 0.08 * index}
-                episode |= {f"videos/{KEY}/{key}": value for key, value in place.items()}
+    pq.write_table(pa.Table.from_pylist(rows), root / "data/chunk-000/file-000.parquet")
+    for index, episode in enumerate(episodes):
+        episode |= {"data/chunk_index": 0, "data/file_index": 0}
         if dtype == "video":
-            write_film(root / "videos" / KEY / "chunk-000/file-000.mp4", images)
-        pq.write_table(pa.Table.from_pylist(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
-        return root
-    for index, part in enumerate((slice(2), slice(2, 5))):
-        name = f"episode_00000{index}"
-        pq.write_table(pa.Table.from_pylist(rows[part]), root / f"data/chunk-000/{name}.parquet")
-        write_film(root / "videos/chunk-000" / KEY / f"{name}.mp4", images[part])
-    (root / "meta" / "episodes.jsonl").write_text("\n".join(map(json.dumps, episodes)))
+            place = {"chunk_index": 0, "file_index": 0, "from_timestamp": 0.08 * index}
+            episode |= {f"videos/{KEY}/{key}": value for key, value in place.items()}
+    if dtype == "video":
+        write_film(root / "videos" / KEY / "chunk-000/file-000.mp4", images)
+    pq.write_table(pa.Table.from_pylist(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
     return root
 
 
-@pytest.mark.parametrize(("version", "dtype"), [("v3.0", "video"), ("v3.0", "image"), ("v2.1", "video")])
-def test_an_episode_of_a_lerobot_dataset_is_played(version: str, dtype: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("dtype", ["video", "image"])
+def test_an_episode_of_a_lerobot_dataset_is_played(dtype: str, tmp_path: Path) -> None:
     levels = np.array([20, 60, 100, 140, 180], np.uint8)
     images = np.broadcast_to(levels[:, None, None, None], (5, 48, 64, 3)).copy()
-    root = write_lerobot(tmp_path / "press", images, version, dtype)
+    root = write_lerobot(tmp_path / "press", images, dtype)
     for episode, expected in ((0, [20, 60]), (1, [100, 140, 180])):
         found = played(f"lerobot:{root}?camera={KEY}&episode={episode}")
         # A video comes near the grey levels, which are 40 apart.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from contextlib import redirect_stderr
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.message.episodes import MarkerOrder
 from tactflow.message.result import Result
-from tactflow.vision.types import Depth, Markers, Scale
+from tactflow.vision.types import Markers
 from tests.adapters.lerobot_env import needs_datasets, run_with_lerobot
 from tests.messages import Results, result_of
 
@@ -53,16 +52,13 @@ def test_a_dataset_holds_what_was_found(exported: tuple[Path, list[Result]]) -> 
     assert np.array_equal(table[f"{MAIN}.marker_status"], status)
 
 
-def frames_of(
-    *markers: Markers | None, scale: Scale | None = None, depth: Depth | None = None
-) -> list[Result]:
+def frames_of(*markers: Markers | None) -> list[Result]:
     """A result for each, ten a second, of 64 x 48 pixels."""
     image = np.zeros((48, 64, 3), np.uint8)
-    results = [
-        result_of(Tick(Frame("main", 0, 0.0, image)), Results(image, markers=found, scale=scale, depth=depth))
-        for found in markers
+    return [
+        result_of(Tick(Frame("main", index, index / 10, image)), Results(image, markers=found))
+        for index, found in enumerate(markers)
     ]
-    return [Result(replace(r.frame, seq=index, t=index / 10), dict(r)) for index, r in enumerate(results)]
 
 
 def moved(offset: tuple[float, float], origin: np.ndarray = ORIGIN, status: int = 0) -> Markers:
@@ -98,43 +94,21 @@ def test_a_recording_with_markers_after_one_without_is_refused(tmp_path: Path) -
         writer.add(frames_of(moved((0.0, 0.0))))
 
 
-def test_points_are_in_millimetres_and_what_is_unknown_is_masked(tmp_path: Path) -> None:
-    heights = np.zeros((48, 64), np.float32)
-    heights[:, :20] = 0.5
-    scale = Scale(0.1, 0.2, (0.001, 0.001), (31.5, 23.5))
-    writer = DatasetWriter(tmp_path, 10, "press")
-    writer.add(frames_of(moved((2.0, -1.0)), scale=scale, depth=Depth(heights, 0.5, None, 1.0, None)))
-    writer.add(frames_of(moved((2.0, -1.0)), scale=scale))
-    writer.finish()
-    table = pq.read_table(tmp_path / "data").to_pydict()
-    with_depth, without = np.array(table[f"{MAIN}.points"])
-    assert np.allclose(with_depth[:, :3], [[0.2, -0.2, -0.5 * (x < 20)] for x, _ in ORIGIN])
-    assert np.array_equal(np.isfinite([with_depth, without]), table[f"{MAIN}.points_mask"])
-    assert np.isnan(with_depth[:, 3:]).all()
-    assert np.isnan(without[:, 2:]).all()
-    info = json.loads((tmp_path / "meta" / "info.json").read_text())["features"][f"{MAIN}.points"]
-    assert (info["shape"], info["dtype"]) == ([6, 6], "float32")
-    assert info["names"]["components"] == ["dx_mm", "dy_mm", "dz_mm", "Fx_N", "Fy_N", "Fz_N"]
-    stats = json.loads((tmp_path / "meta" / "stats.json").read_text())[f"{MAIN}.points"]
-    assert np.allclose(np.array(stats["mean"])[0], [0.2, -0.2, -0.5, 0, 0, 0])
-
-
 OPENED = """
 import json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 dataset = LeRobotDataset("tactflow/press", root=sys.argv[1])
 items = [dataset[index] for index in range(len(dataset))]
 print(json.dumps([[item[f"observation.tactile.main.{name}"].tolist() for item in items]
-    for name in ("marker_offset", "marker_status", "points_mask")]))
+    for name in ("marker_offset", "marker_status")]))
 """
 
 
 @needs_datasets
 def test_lerobot_loads_the_markers(exported: tuple[Path, list[Result]]) -> None:
     out, results = exported
-    offsets, status, mask = json.loads(run_with_lerobot(OPENED, str(out)))
+    offsets, status = json.loads(run_with_lerobot(OPENED, str(out)))
     for index, result in enumerate(results):
         assert result.markers is not None
         assert np.array_equal(np.float32(offsets[index]), np.float32(result.markers.displacement))
         assert np.array_equal(status[index], result.markers.status)
-    assert np.array_equal(mask, np.tile([True, True, False, False, False, False], (100, 80, 1)))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_array, damaged, log, require
+from tactflow.sources.base import FrameReader, check_array, damaged, require
 from tactflow.sources.files import DEFAULT_FPS, decode_image
 from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
@@ -25,11 +24,6 @@ EXPORTED = {"dataset": "/frames", "times": "/t"}
 """Written by `tactflow export`, and read by default from a file that has both."""
 BLOCK = 64 << 20
 """Maximum number of bytes read at a time. Chosen by hand."""
-LARGEST_CHUNK = 1 << 30
-"""Maximum size of an uncompressed chunk, bytes, so that a damaged file does not take all memory. Chosen by
-hand."""
-ZARR_CHUNK = re.compile(r"(?:c[./])?(\d+)(?:[./]\d+)*")
-"""Path of a chunk or shard in the folder of a Zarr array: its index along each axis."""
 
 
 class ArrayDataset(FrameReader):
@@ -57,7 +51,7 @@ class ArrayDataset(FrameReader):
         try:
             self._array = _choose(spec, settings.get("dataset"), arrays, "dataset")
             _check(self._array, self.name)
-            self.total = self._count_stored(*_stored_chunks(self._array))
+            self.total = int(self._array.shape[0])
             if "times" in settings:
                 self._times = self._seconds(_choose(spec, settings["times"], arrays, "times"))
             else:
@@ -84,22 +78,6 @@ class ArrayDataset(FrameReader):
                 frame = frame[..., [2, 1, 0, 3][: frame.shape[2]]] if frame.shape[2] > 1 else frame
             yield frame, float(t)
 
-    def _count_stored(self, stored: Collection[int], length: int) -> int:
-        """Number of frames up to the last stored chunk; later ones would read as the fill value.
-
-        stored : indices of chunks along the first axis. length : frames in each.
-        """
-        chunks, claimed = max(stored, default=-1) + 1, int(self._array.shape[0])
-        # Zarr omits chunks of black pictures. If most are missing, it was not written completely.
-        if 2 * len(stored) < max(chunks, 1):
-            raise SourceError(f"{self.name}: only {len(stored)} of its chunks are stored; was it written?")
-        if chunks * length < claimed:
-            log.warning(
-                "%s: ended after %d of %d frames, the others were never written",
-                *(self.name, chunks * length, claimed),
-            )
-        return min(chunks * length, claimed)
-
     def _seconds(self, array: Any) -> NDArray[np.float64]:
         """Times from 0 at the first frame, s."""
         length = self._array.shape[0]
@@ -107,7 +85,7 @@ class ArrayDataset(FrameReader):
             raise SourceError(
                 f"{self.name}: times are {array.dtype} of shape {array.shape}; required {length} numbers"
             )
-        times = np.asarray(array[: self.total])
+        times = np.asarray(array[:])
         # Whole numbers are subtracted before they are rounded: Unix time in ns has 19 digits.
         seconds: NDArray[np.float64] = (times - times[:1]) / (1e9 if array.dtype.kind in "iu" else 1.0)
         if not np.isfinite(seconds).all():
@@ -160,21 +138,6 @@ def _open(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
         raise damaged(str(path), error) from error
 
 
-def _stored_chunks(array: Any) -> tuple[Collection[int], int]:
-    """Indices of the stored chunks along the first axis, and the frames in each."""
-    if hasattr(array, "store"):
-        # The zarr package would look for every possible chunk.
-        folder = Path(array.store.root, array.path)
-        paths = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-        found = {int(match[1]) for path in paths if (match := ZARR_CHUNK.fullmatch(path))}
-        return found, (array.shards or array.chunks)[0]
-    if array.chunks is None:
-        return range(array.id.get_storage_size() > 0), array.shape[0]
-    found = set()
-    array.id.chunk_iter(lambda chunk: found.add(chunk.chunk_offset[0] // array.chunks[0]))
-    return found, array.chunks[0]
-
-
 def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str) -> Any:
     array = None if name is None else arrays.get(f"/{name.strip('/')}")
     if array is not None:
@@ -187,14 +150,11 @@ def _choose(spec: str, name: str | None, arrays: Mapping[str, Any], setting: str
 
 
 def _check(array: Any, name: str) -> None:
-    """Raise SourceError if an array holds no frames, or too large ones."""
+    """Raise SourceError if an array holds no frames."""
     shape, dtype = array.shape, array.dtype
     are_files = (array.ndim == 1 and dtype.kind == "O") or (array.ndim == 2 and dtype == np.uint8)
     if 0 in shape or not are_files:
         check_array(array, name)
-    chunk = math.prod(array.chunks or (1,)) * dtype.itemsize
-    if chunk > LARGEST_CHUNK:
-        raise SourceError(f"{name}: has chunks of {chunk} bytes; required at most {LARGEST_CHUNK}")
 
 
 def _read_chunks(array: Any, length: int) -> Iterator[NDArray[Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,7 +16,6 @@ from tactflow.sources.files import decode_image
 from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
 
 if TYPE_CHECKING:
-    import av
     from mcap.records import Channel, Schema
 
 SETTINGS = {"topic": "name of a topic with pictures"}
@@ -24,8 +23,6 @@ DECODERS = {"cdr": "rosbags", "ros1": "rosbags", "protobuf": "mcap_protobuf"}
 """Encoding of the messages in an MCAP file -> package that decodes them."""
 PACKAGES = ("sensor_msgs/msg", "sensor_msgs", "foxglove", "foxglove_msgs/msg", "foxglove_msgs")
 """Where the types of messages with pictures are defined."""
-CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
-"""Format of a `CompressedVideo` -> FFmpeg's decoder."""
 ENCODINGS: dict[str, tuple[int, int | None]] = {
     **dict.fromkeys(("bgr8", "8UC3", "bgr16", "16UC3"), (3, None)),
     **dict.fromkeys(("rgb8", "rgb16"), (3, cv2.COLOR_RGB2BGR)),
@@ -83,8 +80,6 @@ class Bag(FrameReader):
         first: int | None = None
         for written, message in self._store.messages(self._topic):
             image = to_image(message, self.name)
-            if image is None:
-                continue
             taken = _stamp(message) or written
             first = taken if first is None else first
             yield image, (taken - first) / 1e9
@@ -242,13 +237,11 @@ def _stamp(message: Any) -> int:
     return int(getattr(time, seconds)) * 1_000_000_000 + int(getattr(time, rest))
 
 
-def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any] | None] | None:
+def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any]] | None:
     """The function that extracts the picture from a message of this type; None for other types."""
     package, _, name = kind.replace(".", "/").rpartition("/")
     if package not in PACKAGES:
         return None
-    if name == "CompressedVideo":
-        return VideoDecoder()
     return {"Image": raw_image, "RawImage": raw_image, "CompressedImage": compressed_image}.get(name)
 
 
@@ -285,39 +278,3 @@ def compressed_image(message: Any, name: str) -> NDArray[Any]:
     if "compressedDepth" in getattr(message, "format", ""):
         raise SourceError(f"{name}: compressed depth, not a picture")
     return decode_image(bytes(message.data), name)
-
-
-class VideoDecoder:
-    """Decodes a video from messages with one picture each."""
-
-    def __init__(self) -> None:
-        self._codec: av.VideoCodecContext | None = None
-        self._begun = False
-
-    def __call__(self, message: Any, name: str) -> NDArray[np.uint8] | None:
-        """The picture of one message, (H, W, 3) uint8 BGR; None before the first key frame.
-
-        Raises SourceError if PyAV is not installed, or the codec is unknown.
-        """
-        require(name, "videos in messages", "av", "av")
-        import av
-
-        if self._codec is None:
-            if message.format not in CODECS:
-                known = ", ".join(CODECS)
-                raise SourceError(f"{name}: a video as {message.format!r}; required one of: {known}")
-            self._codec = cast("av.VideoCodecContext", av.CodecContext.create(CODECS[message.format], "r"))
-            # With threads of its own, FFmpeg returns a picture only several pictures later.
-            self._codec.thread_type = "NONE"
-        try:
-            frames = self._codec.decode(av.Packet(bytes(message.data)))
-        except av.error.InvalidDataError:
-            # A recording may begin between two key frames.
-            if self._begun:
-                raise
-            return None
-        for frame in frames:
-            self._begun = True
-            check_pixel_count(name, frame.width, frame.height)
-            return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
-        return None

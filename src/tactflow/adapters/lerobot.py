@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError
@@ -48,8 +47,6 @@ NAMES = {
 }
 """Feature -> names of its numbers. The first two are in px; the others exist with any calibration. All
 numbers are 0 where the first is 0."""
-FORCES = ("Fx_N", "Fy_N", "Fz_N")
-"""Force on a marker: always unknown, because tactflow measures only that on the whole gel."""
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
 """Integer columns that every dataset has, besides `timestamp`."""
 CHUNK = 1000
@@ -191,13 +188,8 @@ class DatasetWriter:
     def _marker_rows(self, result: Result) -> dict[str, NDArray[Any]]:
         """The features of the markers; empty before the first frame with markers."""
         if result.markers is not None:
-            markers = self._order.align(result.markers)
-            return _marker_features(result.sensor, markers, _points(markers, result))
-        return {} if self._order.origin is None else self._lost_markers(result.sensor)
-
-    def _lost_markers(self, sensor: str) -> dict[str, NDArray[Any]]:
-        lost = self._order.lost()
-        return _marker_features(sensor, lost, np.full((len(lost.offset), 6), np.nan))
+            return _marker_features(result.sensor, self._order.align(result.markers))
+        return {} if self._order.origin is None else _marker_features(result.sensor, self._order.lost())
 
     def _complete(self, rows: list[dict[str, Any]]) -> None:
         """Complete the features of every row of an episode, and add their values to the statistics.
@@ -208,14 +200,13 @@ class DatasetWriter:
         """
         sensor = self._camera.removeprefix(PICTURES)
         if self._order.origin is not None:
-            lost = self._lost_markers(sensor)
+            lost = _marker_features(sensor, self._order.lost())
             rows[:] = [lost | row for row in rows]
         values = [
             {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE)} for row in rows
         ]
         if not self._features:
-            calibrated = f"{TACTILE}.contact_mm" in values[0]
-            self._features = {name: _feature(name, value, calibrated) for name, value in values[0].items()}
+            self._features = {name: _feature(name, value) for name, value in values[0].items()}
         if values[0].keys() != self._features.keys():
             raise StageError("it has markers, and the recordings before have none: make two datasets")
         for name in self._features:
@@ -226,7 +217,7 @@ class DatasetWriter:
 
         types: dict[str, Any] = {}
         for name, feature in self._features.items():
-            value = pa.bool_() if feature["dtype"] == "bool" else getattr(pa, feature["dtype"])()
+            value = getattr(pa, feature["dtype"])()
             length, *columns = feature["shape"]
             types[name] = pa.list_(pa.list_(value)) if columns else pa.list_(value, length)
         if not self._is_video:
@@ -313,47 +304,20 @@ def _values(result: Result) -> dict[str, list[float]]:
     }
 
 
-def _marker_features(
-    sensor: str, markers: AlignedMarkers, points: NDArray[np.float64]
-) -> dict[str, NDArray[Any]]:
-    """The features of N markers. points : (N, 6), NaN where unknown."""
+def _marker_features(sensor: str, markers: AlignedMarkers) -> dict[str, NDArray[Any]]:
+    """The features of N markers."""
     prefix = f"{TACTILE}.{sensor}"
-    return {
-        f"{prefix}.marker_offset": markers.offset,
-        f"{prefix}.marker_status": markers.status,
-        f"{prefix}.points": points,
-        f"{prefix}.points_mask": np.isfinite(points),
-    }
+    return {f"{prefix}.marker_offset": markers.offset, f"{prefix}.marker_status": markers.status}
 
 
-def _points(markers: AlignedMarkers, result: Result) -> NDArray[np.float64]:
-    """(N, 6) float64: dx, dy, dz, Fx, Fy, Fz of each marker; NaN where unknown.
-
-    In mm and N, right, down and out of the gel, so that dz is negative where the gel is pushed in; without a
-    calibration dx and dy are in px, and the others unknown. dz is that of the gel under the marker.
-    """
-    points = np.full((len(markers.offset), 6), np.nan)
-    scale = result.scale
-    points[:, :2] = markers.offset * ((1.0, 1.0) if scale is None else (scale.x, scale.y))
-    if result.depth is not None:
-        places = (markers.origin + markers.offset)[:, ::-1].T
-        heights = result.depth.heights.astype(np.float64)
-        points[:, 2] = -map_coordinates(heights, places, order=1, mode="constant", cval=np.nan)
-    return points
-
-
-def _feature(name: str, value: NDArray[Any], calibrated: bool) -> dict[str, Any]:
+def _feature(name: str, value: NDArray[Any]) -> dict[str, Any]:
     """The description of a feature, from its values in a frame."""
     dtype = "float32" if value.dtype.kind == "f" else value.dtype.name
     ending = name.removeprefix(f"{TACTILE}.")
     if ending in NAMES:
         return {"dtype": dtype, "shape": [len(value)], "names": NAMES[ending]}
-    components = {
-        "marker_offset": ["dx_px", "dy_px"],
-        "marker_status": ["0 tracked, 1 inferred, 2 lost"],
-        "points": [*(["dx_mm", "dy_mm"] if calibrated else ["dx_px", "dy_px"]), "dz_mm", *FORCES],
-        "points_mask": ["known"],
-    }[ending.rpartition(".")[2]]
+    is_offset = ending.endswith(".marker_offset")
+    components = ["dx_px", "dy_px"] if is_offset else ["0 tracked, 1 inferred, 2 lost"]
     return {"dtype": dtype, "shape": list(value.shape), "names": {"components": components}}
 
 

@@ -1,4 +1,4 @@
-"""One camera of one episode of a LeRobot dataset (layouts v2 and v3), as a source."""
+"""One camera of one episode of a LeRobot dataset (layout v3), as a source."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from tactflow.sources.paths import find_path, refuse_devices, split_query
 
 SCHEME = "lerobot:"
 SETTINGS = {"camera": "key of a camera", "episode": "number of an episode"}
-CHUNK = 1000
-"""Episodes in one folder of layout v2, if the dataset does not say."""
 
 
 class LeRobotEpisode(FrameReader):
@@ -108,12 +106,7 @@ def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int, b
 def _find(root: Path, info: Any, camera: str, episode: int) -> tuple[Path, Path, float, int]:
     """The table and the video of an episode, its start in the video, s, and its number of frames."""
     if str(info["codebase_version"]).startswith("v2"):
-        chunk = f"chunk-{episode // int(info.get('chunks_size', CHUNK)):03d}"
-        data = root / "data" / chunk / f"episode_{episode:06d}.parquet"
-        video = root / "videos" / chunk / camera / f"episode_{episode:06d}.mp4"
-        lines = (root / "meta" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
-        lengths = {line["episode_index"]: int(line["length"]) for line in map(json.loads, lines)}
-        return data, video, 0.0, lengths[episode]
+        raise SourceError(f"{root}: has layout v2; LeRobot's convert_dataset_v21_to_v30 makes it layout v3")
     import pyarrow.dataset as ds
 
     table = ds.dataset(root / "meta" / "episodes", format="parquet")

@@ -31,7 +31,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `export`."""
     parser.add_argument(
         "format",
-        help="hdf5 or zarr (all frames and numbers as plain arrays), lerobot (a dataset of layout v3.0), "
+        help="hdf5 (all frames and numbers as plain arrays), lerobot (a dataset of layout v3.0), "
         "or that of a plug-in",
     )
     parser.add_argument(
@@ -51,7 +51,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fps",
         type=_frame_rate,
-        help="frame rate of the dataset (default: that of the first recording; hdf5 and zarr: every frame)",
+        help="frame rate of the dataset (default: that of the first recording; hdf5: every frame)",
     )
     parser.add_argument(
         "--task", default="touch", help="description of the task, stored in the dataset (default: touch)"

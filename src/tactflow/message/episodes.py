@@ -43,11 +43,10 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
 class AlignedMarkers:
     """The N markers of a dataset in one frame.
 
-    origin : (N, 2) float64, positions in the reference frame of this recording, px. offset : (N, 2) float64,
-    displacements since, px. status : (N,) uint8, values of `MarkerStatus`. All are finite.
+    offset : (N, 2) float64, displacements since the reference frame of this recording, px. status : (N,)
+    uint8, values of `MarkerStatus`. All are finite.
     """
 
-    origin: NDArray[np.float64]
     offset: NDArray[np.float64]
     status: NDArray[np.uint8]
 
@@ -89,15 +88,14 @@ class MarkerOrder:
             self.origin = markers.origin
         if self._aligned_origin is None or not np.array_equal(self._aligned_origin, markers.origin):
             self._match(self.origin, markers.origin)
-        origin = np.where(self._is_missing[:, None], self.origin, markers.origin[self._nearest])
         status = np.where(self._is_missing, MarkerStatus.LOST, markers.status[self._nearest])
-        return AlignedMarkers(origin, markers.displacement[self._nearest], status.astype(np.uint8))
+        return AlignedMarkers(markers.displacement[self._nearest], status.astype(np.uint8))
 
     def lost(self) -> AlignedMarkers:
         """All markers, unmoved and lost, for a frame without markers. Only after `align`."""
         assert self.origin is not None
         count = len(self.origin)
-        return AlignedMarkers(self.origin, np.zeros((count, 2)), np.full(count, MarkerStatus.LOST, np.uint8))
+        return AlignedMarkers(np.zeros((count, 2)), np.full(count, MarkerStatus.LOST, np.uint8))
 
     def _match(self, first: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
         distance, nearest = (
