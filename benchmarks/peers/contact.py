@@ -266,8 +266,28 @@ def on_gels(data: Path, peers: Sequence[str]) -> dict[str, Any]:
                 judge.compare(label, _result(name, settings, reference, picture, mapping))
                 for label, reference, picture, mapping in pairs
             ]
-        answers[name] = _summary(judge.chosen_elsewhere(candidates))
+        answers[name] = _summary(_chosen_elsewhere(candidates))
     return answers
+
+
+def _chosen_elsewhere(candidates: Mapping[str, Sequence[judge.Judged]]) -> list[judge.Judged]:
+    """For each lab, the results of the candidate with the highest mean of the other labs' median overlaps."""
+    overlaps: dict[str, dict[str, float]] = {}
+    for name, judged in candidates.items():
+        hulls: dict[str, list[float]] = {}
+        for frame in judged:
+            if not np.isnan(frame.hull):
+                hulls.setdefault(frame.lab, []).append(frame.hull)
+        overlaps[name] = {lab: median(values) for lab, values in hulls.items()}
+    left_out: list[judge.Judged] = []
+    for lab in sorted({frame.lab for judged in candidates.values() for frame in judged}):
+        elsewhere = {
+            name: sum(value for other, value in medians.items() if other != lab)
+            for name, medians in overlaps.items()
+        }
+        best = max(elsewhere, key=lambda name: elsewhere[name])
+        left_out += [frame for frame in candidates[best] if frame.lab == lab]
+    return left_out
 
 
 def _labels(data: Path) -> list[FrameLabel]:

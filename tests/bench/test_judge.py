@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench.judge import OUTLINES, Judged, chosen_elsewhere, interval, judge, main, scatter
+from tactflow.bench.judge import OUTLINES, Judged, interval, judge, main, scatter
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
@@ -92,17 +92,6 @@ def test_labels_of_frames_that_cannot_be_there_are_refused(
         list(judge("default", [labels[0].model_copy(update={"recording": "press.npy"})], tmp_path))
 
 
-def test_a_new_lab_gets_what_is_best_for_the_others() -> None:
-    def at(lab: str, overlap: float) -> Judged:
-        return Judged(lab, lab, touched=True, found=True, hull=overlap)
-
-    first = [at("a", 0.9), at("b", 0.5), at("c", 0.5)]
-    second = [at("a", 0.2), at("b", 0.6), at("c", 0.6)]
-    left_out = chosen_elsewhere({"first": first, "second": second})
-    # Without a, the second is better; without b or c the first.
-    assert [one.hull for one in left_out] == [0.2, 0.5, 0.5]
-
-
 def test_frames_of_one_recording_do_not_make_a_median_surer() -> None:
     generator = np.random.default_rng(1)
     one = Judged("a", "", touched=True, found=True)
@@ -131,7 +120,6 @@ def test_the_command_prints_a_row_for_each_lab(
     assert main(["default", "wedge", "--data", str(data), "--labels", str(tmp_path / "mine.json")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines if line][:4] == ["default", "lab", "simulated", "all"]
-    assert "chosen on the labels of all other labs" in lines
 
 
 def test_a_folder_without_the_recordings_is_refused(

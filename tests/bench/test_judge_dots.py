@@ -6,18 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tactflow.bench.judge_dots import (
-    CHANGES,
-    DOTS,
-    compare,
-    find,
-    judge,
-    main,
-    spread_at_rest,
-    without_dots,
-)
+from tactflow.bench.judge_dots import CHANGES, DOTS, compare, find, judge, main
 from tactflow.bench.label_file import FrameLabel, load_labels, save_labels
-from tactflow.bench.probability import fit_probability
 from tests.vision.dots import grid, render
 
 TRUTH = grid(5, 7, 30.0, corner=(40.0, 35.0))
@@ -70,63 +60,24 @@ def test_a_change_of_the_picture_takes_the_dots_along(change: str) -> None:
 def test_a_dot_of_only_one_round_is_uncertain(data: Path) -> None:
     labels = [label(TRUTH[2:].tolist()), label(TRUTH.tolist(), round_=2), label((), frame=1)]
     judged = list(judge(labels, data))
-    assert [one.kind for one in judged] == [*CHANGES, "real"]
+    assert [one.kind for one in judged] == [*CHANGES, ""]
     assert all((one.dots, one.found, one.false) == (33, 33, 0) for one in judged[:-1])
     assert judged[-1].false == 0
-
-
-def test_every_kind_of_picture_without_dots_is_drawn_alike_each_time() -> None:
-    first, again = list(without_dots()), list(without_dots())
-    kinds = [kind for kind, _ in first]
-    assert {kind: kinds.count(kind) for kind in kinds} == dict.fromkeys(
-        ("noise", "dust", "bubbles", "lamps", "cloth"), 12
-    )
-    for (_, one), (_, other) in zip(first, again, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_dots_at_rest_spread_by_the_noise() -> None:
-    pictures = [render(SIZE, TRUTH, 4.0, noise=2.0, seed=seed) for seed in range(6)]
-    for spread in spread_at_rest(pictures):
-        assert 0.002 < spread < 0.03
-
-
-def test_what_all_dots_do_together_is_no_spread_of_their_own() -> None:
-    pictures = [render(SIZE, TRUTH + 0.2 * step, 4.0, noise=2.0, seed=step) for step in range(6)]
-    spread, own = spread_at_rest(pictures)
-    assert spread > 0.3
-    assert 0.002 < own < 0.03
 
 
 def test_the_labels_of_the_package_name_dots_of_many_labs_and_pictures_without() -> None:
     labels = load_labels(DOTS)
     assert len({one.lab for one in labels if one.dots}) >= 15
-    assert sum(one.dots == () for one in labels) + len(list(without_dots())) >= 100
+    assert sum(one.dots == () for one in labels) >= 50
 
 
-def test_the_command_prints_both_tables(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_a_table(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_labels(data / "labels.json", [label(TRUTH.tolist()), label((), frame=1)])
     assert main(["--data", str(data), "--labels", str(data / "labels.json")]) == 0
     printed = capsys.readouterr().out
     assert "simulated" in printed
     assert "100.0 %" in printed
-    assert "cloth" in printed
-
-
-def test_the_probability_is_fitted_to_what_is_seen() -> None:
-    evidence = np.random.default_rng(0).normal(0, 1, (4000, 3))
-    odds = 1.5 + evidence @ np.array([-2.0, 1.0, 0.5])
-    is_dot = np.random.default_rng(1).random(4000) < 1 / (1 + np.exp(-odds))
-    np.testing.assert_allclose(fit_probability(evidence, is_dot), [1.5, -2.0, 1.0, 0.5], atol=0.2)
-
-
-def test_the_command_fits_the_probability_and_tells_how_true_it_is(
-    data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # Called other than it is: the last dot is none.
-    save_labels(data / "labels.json", [label(TRUTH[:-1].tolist())])
-    assert main(["--data", str(data), "--labels", str(data / "labels.json"), "--fit"]) == 0
-    assert "constant and weights" in capsys.readouterr().out
+    assert "Pictures without dots: 1, with some found: 0" in printed
 
 
 def test_a_folder_without_the_recordings_is_refused(

@@ -5,7 +5,6 @@ from pathlib import Path
 from tactflow.bench.methods import measure_methods
 from tactflow.bench.results import BenchResult
 from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case
-from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.sim import scene_descriptions
@@ -39,7 +38,7 @@ def test_a_tracker_of_ones_own_is_measured_whichever_ports_it_takes_and_a_broken
         use = f"stages.tracker={{use: {tmp_path / 'own.py'}:{name}}}"
         measured[name] = load_pipeline(find_pipeline("default"), overrides=[use])
     result = BenchResult(quick=True)
-    measure_methods(result, CopyUnit(), tmp_path, measured, Case("press", 3))
+    measure_methods(result, tmp_path, measured, Case("press", 3))
     found = {m.method: m.errors for m in result.measurements("tracker")}
     assert found.keys() == {"default", "Own"}
     assert found["Own"]["displacement_rms"] >= 0

@@ -12,7 +12,6 @@ from tactflow.bench.quantities import QUANTITIES
 from tactflow.bench.results import BenchResult
 from tactflow.bench.run import measure_scene
 from tactflow.bench.scenes import Case
-from tactflow.bench.timing import CopyUnit
 from tactflow.cli.bench import packaged_files
 from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
@@ -52,7 +51,7 @@ def test_every_pipeline_and_every_method_is_timed_and_judged(folder: Path) -> No
 
 def test_a_gel_without_markers_is_measured_without_a_tracker(tmp_path: Path) -> None:
     result, loaded = BenchResult(quick=True), {name: load_pipeline(p) for name, p in packaged_files().items()}
-    measure_scene(result, CopyUnit(), tmp_path, loaded, Case("unmarked", 6))
+    measure_scene(result, tmp_path, loaded, Case("unmarked", 6))
     errors = {m.method: m.errors for m in result.measured}
     assert list(errors) == ["markerless", "classic"]
     assert not any("displacement_rms" in values for values in errors.values())
@@ -79,7 +78,7 @@ def test_mistakes_are_refused_before_anything_is_measured(
 
 def measured(scene: str = "press", **errors: float) -> BenchResult:
     """A run that measured these errors of one pipeline."""
-    result = BenchResult(quick=True, copy_ms=0.1)
+    result = BenchResult(quick=True)
     times = {"contact": [0.003, 0.001, 0.002], "idle": [0.0001]}
     result.add("pipeline", "default", scene, errors, times=times, frames=4)
     return result
@@ -130,7 +129,7 @@ def test_every_kind_of_measurement_has_its_row(terminal: Terminal, monkeypatch: 
     assert terminal("bench", "--quick") == 0
     lines = terminal.out.splitlines()
     rows = [" ".join(line.split()) for line in lines if line.startswith("|")]
-    assert "| fast | 0.55 | 5.5 | - | - | 0.2 (0.3) | - | 2 (3) |" in rows
+    assert "| fast | 0.55 | - | 0.2 (0.3) | - | 2 (3) |" in rows
     assert "| press | default | 2 | -, - | 0.01 | -, - | 0, 4, - | 0.97 | - | - | - |" in rows
     assert "| pipeline/classic/press | no markers |" in rows
     for above, below in pairwise(lines):

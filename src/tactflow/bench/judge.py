@@ -6,17 +6,13 @@
 Frames were outlined by a person (`python -m tactflow.bench.label`): `outlines.json` beside this file has
 those of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of separate
 presses run one after the other, behind their reference.
-
-What is chosen with the help of labels cannot be judged on them. With several pipelines the table ends with
-one that is chosen for each lab by the labels of all *other* labs: the result that a new lab can expect of
-such a choice.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -29,7 +25,6 @@ from numpy.typing import NDArray
 
 from tactflow.bench import metrics
 from tactflow.bench.label_file import FrameLabel, load_labels
-from tactflow.bench.probability import fitted
 from tactflow.bench.score import DIRECTED
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.message.result import Result
@@ -37,7 +32,6 @@ from tactflow.sources import open_source
 from tactflow.sources.files import load_image
 from tactflow.streaming import stream
 from tactflow.system.terminal import say, table
-from tactflow.vision.contact.certainty import contact_evidence
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 
@@ -61,8 +55,6 @@ ACROSS: Final = 5
 TILE: Final = 240
 """Side of each of them, px."""
 GREEN, RED, WHITE, GRAY = (0, 255, 0), (0, 0, 255), (255, 255, 255), 64
-WITHIN: Final = 0.2
-"""Part of a region that an outline covers, from which on the region is of that contact. Chosen by hand."""
 LARGE: Final = 500
 """px: pictures with a longer side are halved, as the documentation advises."""
 Pictures = list[NDArray[np.uint8]]
@@ -101,7 +93,7 @@ def compare(label: FrameLabel, result: Result) -> Judged:
     judged = Judged(label.lab, label.recording, bool(label.contact), contact is not None)
     if not label.outlines:
         return judged
-    shape, truth = mapping.size[::-1], _truth(label, mapping)
+    shape, truth = mapping.size[::-1], outlined(label, mapping)
     if contact is None or result.contact_mask is None:
         return replace(judged, hull=0.0, region=0.0)
     drawn = contact_geometry(truth)
@@ -165,7 +157,7 @@ def labelled(
             source = [_picture(path, name) for name in (reference, *(str(label.frame) for label in wanted))]
             missing = dict(enumerate(wanted, 1))
         else:
-            missing = {_index(label): label for label in wanted}
+            missing = {label.index: label for label in wanted}
         try:
             for result in _results(chosen, source, max(missing), images):
                 if result.seq in missing and not result.frame.reference:
@@ -223,33 +215,12 @@ def _tile(label: FrameLabel, result: Result, text: str, blank: bool) -> NDArray[
     return tile
 
 
-def fit(pipeline: str, labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
-    """The weights of a contact's probability, and how true it is."""
-    labs, evidence, is_contact = [], [], []
-    for label, result in labelled(pipeline, labels, data):
-        deviations = None if result is None else result.get("deviations")
-        if result is None or result.contact_mask is None or not isinstance(deviations, np.ndarray):
-            continue
-        if not result.contacts:
-            continue
-        mask, truth = result.contact_mask, _truth(label, result["mapping"])
-        _, regions = cv2.connectedComponents(mask)
-        for part in result.contacts:
-            x, y = part.hull[0].astype(int)
-            labs.append(label.lab)
-            is_contact.append(np.mean(truth[regions == regions[y, x]] > 0) > WITHIN)
-        evidence.append(contact_evidence(result.contacts, mask, deviations))
-    if not evidence:
-        raise ConfigError(f"--data {data}: has none of the labelled recordings")
-    yield from fitted(np.array(labs), np.concatenate(evidence), np.array(is_contact))
-
-
 def _outlines(label: FrameLabel, mapping: PixelMapping) -> list[NDArray[np.float64]]:
     """The outlines of a label, processed px, (n, 2) each."""
     return [mapping.to_processed(outline) for outline in label.outlines or ()]
 
 
-def _truth(label: FrameLabel, mapping: PixelMapping) -> NDArray[np.uint8]:
+def outlined(label: FrameLabel, mapping: PixelMapping) -> NDArray[np.uint8]:
     """(H, W): the outlined region of a processed frame, not 0 inside."""
     return metrics.filled_polygons(_outlines(label, mapping), mapping.size[::-1])
 
@@ -257,14 +228,6 @@ def _truth(label: FrameLabel, mapping: PixelMapping) -> NDArray[np.uint8]:
 def _run(label: FrameLabel) -> tuple[str, str]:
     """What is run at once: a video, or the pictures with the same reference."""
     return label.recording, label.reference if isinstance(label.reference, str) else ""
-
-
-def _index(label: FrameLabel) -> int:
-    if not isinstance(label.frame, int):
-        raise ConfigError(
-            f"{label.recording}: no frame {label.frame!r}; required an index, as it is no folder of pictures"
-        )
-    return label.frame
 
 
 def _picture(folder: Path, name: str) -> NDArray[np.uint8]:
@@ -336,10 +299,6 @@ def _median(values: Sequence[float] | NDArray[np.float64]) -> float:
     return float(np.median(values)) if len(values) else np.nan
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else 0.0
-
-
 def interval(judged: Sequence[Judged], confidence: float = 0.95) -> tuple[float, float]:
     """Bounds of the median overlap of hulls, by resampling whole recordings (bootstrap, Efron 1979).
 
@@ -352,39 +311,10 @@ def interval(judged: Sequence[Judged], confidence: float = 0.95) -> tuple[float,
     if not groups:
         return np.nan, np.nan
     overlaps, generator = list(groups.values()), np.random.default_rng(0)
-    medians = [
-        np.median(
-            np.concatenate(
-                [overlaps[index] for index in generator.integers(len(overlaps), size=len(overlaps))]
-            )
-        )
-        for _ in range(RESAMPLES)
-    ]
+    drawn = generator.integers(len(overlaps), size=(RESAMPLES, len(overlaps)))
+    medians = [np.median(np.concatenate([overlaps[index] for index in chosen])) for chosen in drawn]
     low, high = np.quantile(medians, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
-
-
-def chosen_elsewhere(candidates: Mapping[str, Sequence[Judged]]) -> list[Judged]:
-    """For each lab, the results of that candidate which is best at all other labs: leave one lab out.
-
-    The best has the highest mean of the labs' median overlaps of hulls.
-    """
-    scores = {
-        name: {
-            lab: _median([one.hull for one in group if not np.isnan(one.hull)])
-            for lab, group in _by_lab(judged)
-        }
-        for name, judged in candidates.items()
-    }
-    left_out: list[Judged] = []
-    for lab in sorted({lab for score in scores.values() for lab in score}):
-        others = {
-            name: _mean([value for other, value in score.items() if other != lab and not np.isnan(value)])
-            for name, score in scores.items()
-        }
-        best = max(others, key=lambda name: others[name])
-        left_out += [one for one in candidates[best] if one.lab == lab]
-    return left_out
 
 
 def _by_lab(judged: Sequence[Judged]) -> Iterator[tuple[str, list[Judged]]]:
@@ -422,24 +352,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--labels", type=Path, default=OUTLINES, metavar="FILE", help="default: those of the package"
     )
     parser.add_argument(
-        "--fit", action="store_true", help="fit the probability of a contact, and tell how true it is"
-    )
-    parser.add_argument(
         "--picture", type=Path, metavar="FILE", help=f"draw the {WORST} worst frames of the first pipeline"
     )
     parser.add_argument(
         "--blank", action="store_true", help="leave the frames out of --picture, as their licence may ask for"
     )
-    parser.add_argument("--recording", metavar="START", default="", help="only those whose name starts so")
     options = parser.parse_args(arguments)
     try:
-        labels = [
-            label for label in load_labels(options.labels) if label.recording.startswith(options.recording)
-        ]
+        labels = load_labels(options.labels)
         first = [label for label in labels if label.round == 1]
-        if options.fit:
-            print(*fit(options.pipelines[0], first, options.data), sep="\n")
-            return 0
         if options.picture is not None:
             draw_worst(options.pipelines[0], first, options.data, options.picture, options.blank)
             return 0
@@ -449,8 +370,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except TactflowError as error:
         say(f"tactflow: {error}")
         return error.exit_code
-    if len(results) > 1:
-        results["chosen on the labels of all other labs"] = chosen_elsewhere(results)
     for name, judged in results.items():
         print(name, *summary(judged), sep="\n", end="\n\n")
     if again := scatter(labels):

@@ -1,6 +1,6 @@
 """How well the dots of a gel are found, and where none are.
 
-    python -m tactflow.bench.judge_dots --data RECORDINGS [--fit]
+    python -m tactflow.bench.judge_dots --data RECORDINGS
 
 Dots were marked by eye in frames of recordings of real sensors (as with `python -m tactflow.bench.label
 --dots`); `dots.json` beside this file has them, and frames of gels without dots. A dot that was marked in
@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Final
 
@@ -25,12 +26,12 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from tactflow.bench.label_file import FrameLabel, load_labels
-from tactflow.bench.probability import fitted
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.sources import open_source
+from tactflow.sources.base import to_bgr
 from tactflow.system.terminal import say, table
 from tactflow.vision.arrays import Flags, Floats, Indices
-from tactflow.vision.markers import MarkerTracker, NoMarkersError, detect_markers
+from tactflow.vision.markers import NoMarkersError, detect_markers
 from tactflow.vision.markers.lattice import nearest
 
 DOTS: Final = Path(__file__).with_name("dots.json")
@@ -40,13 +41,6 @@ centroid differ by so much where a glint covers half a dot, and no other dot is 
 BORDER: Final = 0.12
 """Distance from the border of the picture, as a fraction of the distance between neighbours, within which a
 dot is uncertain: most dots have a radius of 0.12 to 0.3 of it, so the border cuts off half of such a dot."""
-REST: Final = {
-    "gels/seu_a/video.mp4": (10, 50),
-    "gels/handmade_dots/video.avi": (0, 14),
-    "gels/tactip_video": (0, 29),
-    "gels/franka_mini/cheese_tube-1-0.avi": (14, 24),
-}
-"""Recording -> its frames (first, end) in which nothing touches the gel and the exposure is steady."""
 Picture = NDArray[np.uint8]
 Finder = Callable[[Picture], Floats]
 """(H, W, 3) BGR -> centres (N, 2), px."""
@@ -56,7 +50,7 @@ Finder = Callable[[Picture], Floats]
 class FoundDots:
     """lab : of the label. dots : that have to be found. found : of these. false : found where there is none.
 
-    kind : empty for the picture as it is; else how it was changed, or what it shows in place of dots.
+    kind : how the picture was changed; empty as it is.
     """
 
     lab: str
@@ -134,7 +128,7 @@ def judge(
         if len(dots):
             yield replace(compare(lab, finder(picture), dots, uncertain, size), kind=kind)
         else:
-            yield FoundDots(lab, 0, 0, len(finder(picture)), "real")
+            yield FoundDots(lab, 0, 0, len(finder(picture)))
 
 
 def labelled(
@@ -153,7 +147,7 @@ def labelled(
         if not (data / label.recording).exists():
             report(f"{label.recording}: not in {data}, left out")
             continue
-        picture = frames(data, label.recording, _index(label), _index(label) + 1)[0]
+        picture = _frame(data, label)
         dots = _points(label.dots)
         again = second.get((label.recording, label.frame))
         sure, uncertain = (dots, dots[:0]) if again is None else _agreed(dots, _points(again))
@@ -161,31 +155,6 @@ def labelled(
             changed, matrix = CHANGES[kind](picture)
             required, possible = (points @ matrix[:, :2].T + matrix[:, 2] for points in (sure, uncertain))
             yield label.lab, kind, changed, required, possible
-
-
-def fit(labels: Sequence[FrameLabel], data: Path) -> Iterator[str]:
-    """The weights of a dot's probability, and how true it is."""
-    labs, evidences, are_dots = [], [], []
-    for name, _, picture, dots, uncertain in labelled(labels, data, kinds=("", "half size", "JPEG 30")):
-        try:
-            found = detect_markers(picture, least_probability=0.0)
-        except NoMarkersError:
-            continue
-        if len(dots) and found.evidence is not None:
-            which, inner = assign(found.centers, dots, uncertain, (picture.shape[1], picture.shape[0]))
-            judged = inner & (which < len(dots))
-            evidences.append(found.evidence[judged])
-            are_dots.append(which[judged] >= 0)
-            labs.append(np.full(judged.sum(), name))
-    if not evidences:
-        raise ConfigError(f"--data {data}: has none of the labelled recordings")
-    yield from fitted(*map(np.concatenate, (labs, evidences, are_dots)))
-
-
-def _index(label: FrameLabel) -> int:
-    if not isinstance(label.frame, int):
-        raise ConfigError(f"{label.recording}: frame {label.frame!r}; required an index")
-    return label.frame
 
 
 def _points(points: Iterable[tuple[float, float]]) -> Floats:
@@ -199,17 +168,13 @@ def _agreed(first: Floats, second: Floats) -> tuple[Floats, Floats]:
     return first[both], np.concatenate([first[~both], second[rest]])
 
 
-def frames(data: Path, recording: str, first: int, end: int) -> list[Picture]:
-    """Frames `first` to `end` - 1 of a recording; raises ConfigError if it is shorter."""
-    with closing(open_source(str(data / recording))) as reader:
-        kept = []
-        for index in range(end):
-            if (read := reader.read()) is None:
-                raise ConfigError(f"{recording}: has no frame {index}")
-            if index >= first:
-                color = read[0] if read[0].ndim == 3 else cv2.cvtColor(read[0], cv2.COLOR_GRAY2BGR)
-                kept.append(np.asarray(color, np.uint8))
-    return kept
+def _frame(data: Path, label: FrameLabel) -> Picture:
+    """A labelled frame; raises ConfigError if the recording is shorter."""
+    with closing(open_source(str(data / label.recording))) as reader:
+        frames = list(islice(iter(reader.read, None), label.index, label.index + 1))
+    if not frames:
+        raise ConfigError(f"{label.recording}: has no frame {label.index}")
+    return to_bgr(frames[0][0], label.recording)
 
 
 def _resized(picture: Picture, scale: float) -> tuple[Picture, Floats]:
@@ -246,109 +211,15 @@ CHANGES: Final[Mapping[str, Callable[[Picture], tuple[Picture, Floats]]]] = {
 points to it."""
 
 
-def without_dots(seed: int = 0) -> Iterator[tuple[str, Picture]]:
-    """Simulated pictures without dots: noise, dust, bubbles, lamps and cloth, twelve of each."""
-    generator = np.random.default_rng(seed)
-    for kind, draw in {
-        "noise": _noise,
-        "dust": _dust,
-        "bubbles": _bubbles,
-        "lamps": _lamps,
-        "cloth": _cloth,
-    }.items():
-        for height, width in ((240, 320), (320, 240)) * 6:
-            y, x = np.mgrid[:height, :width] / max(height, width)
-            slope = generator.uniform(-60, 60, (2, 3))
-            gel = generator.uniform(80, 170, 3) + x[..., None] * slope[0] + y[..., None] * slope[1]
-            drawn = draw(gel, generator) + generator.normal(0, generator.uniform(1, 4), gel.shape)
-            yield kind, np.clip(drawn, 0, 255).astype(np.uint8)
-
-
-def _noise(gel: Floats, generator: np.random.Generator) -> Floats:
-    """Grain of a random size and strength."""
-    grain = cv2.GaussianBlur(generator.normal(0, 1, gel.shape), (0, 0), generator.uniform(0.6, 6))
-    return np.asarray(gel + grain / grain.std() * generator.uniform(3, 20), np.float64)
-
-
-def _discs(gel: Floats, generator: np.random.Generator, count: int, radius: tuple[float, float]) -> Floats:
-    """(H, W, 1) 1 in discs at random places, 0 elsewhere, with soft edges."""
-    height, width = gel.shape[:2]
-    cover = np.zeros((height, width))
-    for x, y, size in generator.uniform((0, 0, radius[0]), (width, height, radius[1]), (count, 3)):
-        shift = 16
-        cv2.circle(cover, (int(x * shift), int(y * shift)), int(size * shift), 1.0, -1, cv2.LINE_8, shift=4)
-    return np.asarray(cv2.GaussianBlur(cover, (0, 0), 0.8)[..., None], np.float64)
-
-
-def _dust(gel: Floats, generator: np.random.Generator) -> Floats:
-    """Dark specks of many sizes anywhere."""
-    specks = _discs(gel, generator, int(generator.integers(5, 150)), (0.5, 5))
-    return gel * (1 - specks * generator.uniform(0.2, 0.8))
-
-
-def _bubbles(gel: Floats, generator: np.random.Generator) -> Floats:
-    """Bright specks with a dark rim."""
-    count, state = int(generator.integers(5, 120)), generator.bit_generator.state
-    rims = _discs(gel, generator, count, (2, 7))
-    generator.bit_generator.state = state
-    cores = _discs(gel, generator, count, (1, 4.5))
-    return gel * (1 - 0.4 * rims) + 80 * cores
-
-
-def _lamps(gel: Floats, generator: np.random.Generator) -> Floats:
-    """A row of saturated lamps along one border, and their glow."""
-    height, width = gel.shape[:2]
-    lamps, count = np.zeros((height, width)), int(generator.integers(3, 9))
-    for x in (np.arange(count) + 0.5) * width / count:
-        cv2.circle(lamps, (int(x), 8), int(generator.integers(4, 8)), 1.0, -1)
-    glow = cv2.GaussianBlur(lamps, (0, 0), 15)
-    return np.asarray(gel + 600 * glow[..., None] + 255 * lamps[..., None], np.float64)
-
-
-def _cloth(gel: Floats, generator: np.random.Generator) -> Floats:
-    """Threads in two directions, each as dark as it likes, that waver."""
-    height, width = gel.shape[:2]
-    y, x = np.mgrid[:height, :width].astype(np.float64)
-    turn, drawn = generator.uniform(0, np.pi), gel
-    for angle in (turn, turn + np.pi / 2 + generator.normal(0, 0.1)):
-        waver = cv2.GaussianBlur(generator.normal(0, 1, (height, width)), (0, 0), 12)
-        along = x * np.cos(angle) + y * np.sin(angle) + waver / waver.std() * generator.uniform(1, 4)
-        wave = np.sin(2 * np.pi * along / generator.uniform(5, 25))
-        drawn = drawn * (1 + generator.uniform(0.05, 0.2) * wave[..., None])
-    return np.asarray(drawn, np.float64)
-
-
-def spread_at_rest(pictures: Sequence[Picture]) -> tuple[float, float]:
-    """Median over the dots of their spread (standard deviation, px) over frames at rest, by coordinate; and
-    the part of it that each dot has on its own: without what a motion of the whole gel, quadratic in the
-    place, explains in each frame.
-
-    Raises NoMarkersError if the first frame has no dots.
-    """
-    tracker = MarkerTracker(pictures[0])
-    tracked = [tracker.track(picture) for picture in pictures]
-    origin = tracked[0].origin
-    moved = np.stack([markers.position[: len(origin)] - origin for markers in tracked])
-    x, y = ((origin - origin.mean(axis=0)) / origin.std(axis=0)).T
-    basis, _ = np.linalg.qr(np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y]))
-    own = moved - basis @ (basis.T @ moved)
-    return float(np.median(moved.std(axis=0))), float(np.median(own.std(axis=0)))
-
-
 def summary(judged: Sequence[FoundDots]) -> Iterator[str]:
-    """Lines of two tables: labelled frames by lab, and pictures without dots by kind."""
-    dotted, plain = [one for one in judged if one.dots], [one for one in judged if not one.dots]
+    """Lines of a table by lab, and how many pictures without dots have some found."""
+    dotted = sorted((one for one in judged if one.dots), key=lambda one: one.lab)
+    plain = [one for one in judged if not one.dots]
     heading = ("lab", "dots", "found", "false", *(kind for kind in CHANGES if kind))
-    labs = {lab: [one for one in dotted if one.lab == lab] for lab in sorted({one.lab for one in dotted})}
-    yield from table(
-        [heading, *(_row(lab or "-", group) for lab, group in labs.items()), _row("all", dotted)]
-    )
-    yield ""
-    rows = [("without dots", "pictures", "with some found")]
-    for kind in [*sorted({one.kind for one in plain}), "all"]:
-        group = [one for one in plain if kind in (one.kind, "all")]
-        rows.append((kind, str(len(group)), str(sum(one.false > 0 for one in group))))
-    yield from table(rows)
+    labs = [_row(lab or "-", list(group)) for lab, group in groupby(dotted, key=lambda one: one.lab)]
+    yield from table([heading, *labs, _row("all", dotted)])
+    yield "Found + false of each change in percent of the dots marked."
+    yield f"Pictures without dots: {len(plain)}, with some found: {sum(one.false > 0 for one in plain)}"
 
 
 def _row(name: str, group: Sequence[FoundDots]) -> tuple[str, ...]:
@@ -369,28 +240,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="recordings that the labels name")
     add("--labels", type=Path, default=DOTS, metavar="FILE", help="default: those of the package")
-    add(
-        "--fit",
-        action="store_true",
-        help="fit the probability of a dot, and tell how true it is",
-    )
     options = parser.parse_args(arguments)
     try:
-        if options.fit:
-            print(*fit(load_labels(options.labels), options.data), sep="\n")
-            return 0
         judged = list(judge(load_labels(options.labels), options.data))
         if not judged:
             raise ConfigError(f"--data {options.data}: has none of the recordings of {options.labels}")
-        judged += [FoundDots("", 0, 0, len(find(picture)), kind) for kind, picture in without_dots()]
         print(*summary(judged), sep="\n")
-        print("\nFound + false of each change in percent of the dots marked.")
-        for recording, (first, end) in REST.items():
-            if (options.data / recording).exists():
-                spread, own = spread_at_rest(frames(options.data, recording, first, end))
-                print(
-                    f"{recording}: dots at rest spread by {spread:.3f} px (median), each alone by {own:.3f}"
-                )
     except TactflowError as error:
         say(f"tactflow: {error}")
         return error.exit_code

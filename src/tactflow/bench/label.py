@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import random
 import sys
 import threading
 from collections.abc import Sequence
@@ -97,11 +96,9 @@ class LabelServer(ThreadingHTTPServer):
     """Serves the page for these items; `serve_forever` runs it, and `address` is where.
 
     path : the file of labels, created if missing. lab, round_ : of the labels; those of other rounds are
-    neither shown nor changed. dots : clicks mark dots instead of outlines. port : 0 for any that is free.
+    neither shown nor changed. dots : clicks mark dots instead of outlines.
 
-    Raises
-    ------
-    ConfigError : the file of labels is broken, or the port is taken.
+    Raises ConfigError if the file of labels is broken.
     """
 
     def __init__(
@@ -111,7 +108,6 @@ class LabelServer(ThreadingHTTPServer):
         lab: str = "",
         round_: int = 1,
         dots: bool = False,
-        port: int = 0,
     ) -> None:
         self.path = path
         frames = [{"recording": i.recording, "frame": i.frame, "reference": i.reference} for i in items]
@@ -127,10 +123,7 @@ class LabelServer(ThreadingHTTPServer):
             self.content[f"/frames/{number}/reference"] = "image/png", item.reference_picture
         self._saving = threading.Lock()
         self.overview()
-        try:
-            super().__init__((HOST, port), _Handler)
-        except (OSError, OverflowError) as error:
-            raise ConfigError(f"--port {port}: {error}") from error
+        super().__init__((HOST, 0), _Handler)
         self.hosts = {f"{name}:{self.server_port}" for name in (HOST, "localhost")}
         self.address = f"http://{HOST}:{self.server_port}/"
 
@@ -215,8 +208,6 @@ def _items(args: argparse.Namespace) -> list[Item]:
         items += read_items(spec, name, args.reference, frames, args.every)
     if not items:
         raise ConfigError("no frame to label; give a smaller --every, or --frames")
-    if args.seed is not None:
-        random.Random(args.seed).shuffle(items)
     return items
 
 
@@ -233,12 +224,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--root", type=Path, metavar="DIR", help="store paths of recordings relative to DIR")
     add("--lab", default="", metavar="NAME", help="stored with each label")
     add("--round", type=positive, default=1, metavar="N", help="2: label again, without a look at 1")
-    add("--seed", type=int, metavar="S", help="show the frames in a random order")
-    add("--port", type=int, default=0, metavar="N", help="0 for any (default)")
     args = parser.parse_args(arguments)
     try:
         items = _items(args)
-        server = LabelServer(items, args.labels, args.lab, args.round, args.dots, args.port)
+        server = LabelServer(items, args.labels, args.lab, args.round, args.dots)
     except TactflowError as error:
         say(f"tactflow: {error}")
         return error.exit_code

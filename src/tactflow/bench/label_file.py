@@ -56,6 +56,13 @@ class FrameLabel(BaseModel):
         """(recording, frame, round): a file has one label of each."""
         return self.recording, self.frame, self.round
 
+    @property
+    def index(self) -> int:
+        """Index of the frame. Raises ConfigError where it is the name of a picture."""
+        if not isinstance(self.frame, int):
+            raise ConfigError(f"{self.recording}: frame {self.frame!r}; required an index from 0")
+        return self.frame
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.outlines and self.contact is not True:

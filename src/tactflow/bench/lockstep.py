@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from tactflow.api import make_runner
-from tactflow.bench.timing import BLOCK, CopyUnit, Times, quiet
+from tactflow.bench.timing import BLOCK, Times, quiet
 from tactflow.engine.collect import with_collector
 from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import TactflowError
@@ -142,8 +142,6 @@ def on_recording(pipeline: Pipeline, path: Path) -> Pipeline:
 def take_turns(
     pipelines: Mapping[str, Pipeline],
     observe: Callable[[str, TimedResult], str],
-    *,
-    unit: CopyUnit | None = None,
     block: int = BLOCK,
 ) -> tuple[dict[str, Times], dict[str, str]]:
     """Run pipelines in turns of a few frames until all recordings are over.
@@ -153,7 +151,7 @@ def take_turns(
     pipelines : name -> pipeline, each with its recording.
     observe : called with (name, result) for each frame, after its turn; returns the kind of frame its time
         belongs to. The time of references is kept apart.
-    unit : measured along the way. block : frames in a turn.
+    block : frames in a turn.
 
     Returns
     -------
@@ -169,8 +167,6 @@ def take_turns(
             except TactflowError as error:
                 failures[name] = str(error)
         while running:
-            if unit is not None:
-                unit.take()
             for name in list(running):
                 try:
                     results = running[name].block(block)

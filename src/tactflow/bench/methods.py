@@ -23,7 +23,7 @@ from tactflow.bench import metrics, score
 from tactflow.bench.quantities import Tally
 from tactflow.bench.results import BenchResult
 from tactflow.bench.scenes import Case, Rendered, rendered
-from tactflow.bench.timing import BLOCK, CopyUnit, Times, quiet
+from tactflow.bench.timing import BLOCK, Times, quiet
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.sim import Truth
@@ -146,11 +146,11 @@ measured only in frames that show one."""
 
 
 def measure_methods(
-    result: BenchResult, unit: CopyUnit, scratch: Path, pipelines: Mapping[str, Pipeline], case: Case
+    result: BenchResult, scratch: Path, pipelines: Mapping[str, Pipeline], case: Case
 ) -> None:
     """Measure every method of every stage on one scene.
 
-    result : rows are added to it. unit : measured along the way. scratch : folder for temporary files.
+    result : rows are added to it. scratch : folder for temporary files.
     pipelines : name -> pipeline; the first is the default one and provides the inputs.
     """
     with rendered(case, scratch) as scene:
@@ -159,7 +159,6 @@ def measure_methods(
         ways = alternatives(pipelines, stage)
         shown = [item for item in frames if item.truth.touching or "contact_mask" not in ports]
         if len(ways) > 1:
-            unit.take()
             _measure_stage(result, stage, ways, shown, case.label)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -56,13 +55,12 @@ class Measurement:
 class BenchResult:
     """A whole run of the bench.
 
-    quick : whether it was the short one. machine : what it ran on. copy_ms : time of one copy of a raw
-    frame, ms. wall_s : how long the run took, s. failures : group/method/scene -> why there are no numbers.
+    quick : whether it was the short one. machine : what it ran on. wall_s : how long the run took, s.
+    failures : group/method/scene -> why there are no numbers.
     """
 
     quick: bool
     machine: dict[str, str] = field(default_factory=dict[str, str])
-    copy_ms: float = math.nan
     wall_s: float = 0.0
     measured: list[Measurement] = field(default_factory=list[Measurement])
     failures: dict[str, str] = field(default_factory=dict[str, str])

@@ -21,7 +21,6 @@ from tactflow.bench.quantities import Tally
 from tactflow.bench.results import CLASSIC, PIPELINE, BenchResult
 from tactflow.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, rendered
 from tactflow.bench.score import PipelineScore
-from tactflow.bench.timing import CopyUnit
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -63,9 +62,9 @@ def run_bench(
         measured = ", ".join(known)
         raise ConfigError(f"--scene {', '.join(unknown)}: not among the scenes measured: {measured}")
     loaded = {name: load_pipeline(path) for name, path in files.items()}
-    result, unit = BenchResult(quick=quick, machine=machine()), CopyUnit()
+    result = BenchResult(quick=quick, machine=machine())
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
-        shared = (result, unit, Path(folder))
+        shared = (result, Path(folder))
         steps = [
             (f"pipelines on {case.label}", partial(measure_scene, *shared, loaded, case))
             for case in whole
@@ -80,14 +79,14 @@ def run_bench(
             progress(what, number, len(steps))
             measure()
     progress("done", len(steps), len(steps))
-    result.copy_ms, result.wall_s = unit.copy_ms, time.perf_counter() - began
+    result.wall_s = time.perf_counter() - began
     return result
 
 
-def measure_scene(result: BenchResult, unit: CopyUnit, scratch: Path, loaded: Pipelines, case: Case) -> None:
+def measure_scene(result: BenchResult, scratch: Path, loaded: Pipelines, case: Case) -> None:
     """Measure whole pipelines, in turns of a few frames, on a simulated scene.
 
-    result : rows are added to it. unit : measured along the way. scratch : folder for temporary files.
+    result : rows are added to it. scratch : folder for temporary files.
     """
     with rendered(case, scratch) as scene:
         suited = _marked(loaded) if len(scene.scene.layout.rest) else _bare(loaded)
@@ -96,7 +95,7 @@ def measure_scene(result: BenchResult, unit: CopyUnit, scratch: Path, loaded: Pi
             suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
         scores = {name: PipelineScore(scene, Tally()) for name in suited}
         ready = {name: on_recording(pipeline, scene.path) for name, pipeline in suited.items()}
-        times, failures = take_turns(ready, lambda name, found: scores[name].add(found), unit=unit)
+        times, failures = take_turns(ready, lambda name, found: scores[name].add(found))
     for name, score in scores.items():
         if name in failures:
             result.failures[f"{PIPELINE}/{name}/{case.label}"] = failures[name]

@@ -48,13 +48,13 @@ FULL = (
     *_cases("press:150 bright:150 mixed:100 cable:280 bright_cable:220 edge:150 box:150"),
     *_cases("ring:80 screw:80 two:80 border:150 slide:140 twist:140 strong_shear:140 jumps:160 worn:150"),
     Case("jumps", 160, "worn=0.05&missing=0.05&vanish=0.05", "_worn"),
-    *_cases("dense:100 sparse:80 bright_dots:80 square_dots:80 doubled_dots:80 irregular:80 tilted:80"),
-    *_cases("glossy:100 noisy:100 drift:150 flicker:150 idle:100 tap:100 unmarked:100"),
+    *_cases("dense:100 bright_dots:80 square_dots:80 doubled_dots:80 irregular:80 tilted:80"),
+    *_cases("noisy:100 drift:150 flicker:150 idle:100 tap:100 unmarked:100"),
 )
 """Every kind of contact, light, marker and camera trouble."""
 
 TROUBLES = (
-    *_cases("lamp:100 round_gel:56 block:56 coin:56 key:56 long_edge:56 finger:56 dark_channel:56"),
+    *_cases("lamp:100 round_gel:56 block:56 coin:56 long_edge:56 finger:56 dark_channel:56"),
     *_cases("halo:56 painted:56 stray:56"),
 )
 """What went wrong on recordings of real gels, one trouble in each scene."""

@@ -56,7 +56,7 @@ def lines(result: BenchResult) -> Iterator[str]:
     kind = "quick" if result.quick else "full"
     summary = (
         f"A {kind} run of {result.wall_s:.0f} s on {machine}. Times are CPU times of a frame in one thread, "
-        f"medians; one copy of a raw frame of 800 x 600 px took {result.copy_ms:.3f} ms."
+        "medians."
     )
     yield from markdown("Machine", summary)
     for group in dict.fromkeys(m.group for m in result.measured):
@@ -71,14 +71,14 @@ def _methods(result: BenchResult, group: str) -> Iterator[str]:
     """One row per method of a group."""
     measured = result.measurements(group)
     quantities = [QUANTITIES[key] for key in PRIMARY.get(group, ())]
-    heads = ["method", "contact, ms", "copies", "idle, ms", "copies", *(q.heading for q in quantities)]
+    heads = ["method", "contact, ms", "idle, ms", *(q.heading for q in quantities)]
     rows = []
     for method in dict.fromkeys(m.method for m in measured):
         own = [m.values for m in measured if m.method == method]
         row = [method]
         for key in TIMES.values():
             times = [values[key] for values in own if key in values]
-            row += [_number(median(times) / unit) if times else "-" for unit in (1.0, result.copy_ms)]
+            row.append(_number(median(times)) if times else "-")
         for quantity in quantities:
             errors = [values[quantity.key] for values in own if quantity.key in values]
             worst = max(errors, key=quantity.distance, default=0.0)

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     failed.
     """
     from tactflow.sim import open_scene
-    from tactflow.sim.export import TRUTH_WRITERS, write_frames, write_truth
+    from tactflow.sim.export import TRUTH_SUFFIXES, write_frames, write_truth
 
     if args.list:
         _list()
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".npy",))
     if args.truth is not None:
-        refuse_output("--truth", args.truth, overwrite=args.overwrite, suffixes=tuple(TRUTH_WRITERS))
+        refuse_output("--truth", args.truth, overwrite=args.overwrite, suffixes=TRUTH_SUFFIXES)
     for option, path, write in (("--out", args.out, write_frames), ("--truth", args.truth, write_truth)):
         if path is None:
             continue

@@ -7,23 +7,22 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from tactflow.sim.scenes import Scene
-from tactflow.sim.truth import Truth
 from tactflow.system.files import completed
 
+TRUTH_SUFFIXES: Final = (".jsonl", ".csv")
 Report = Callable[[int], None]
+"""Called with the number of frames written so far."""
 
 
 def write_frames(scene: Scene, path: Path, report: Report = lambda _done: None) -> None:
-    """Write all frames of a scene.
-
-    path : a `.npy` file (uint8 N x H x W x 3 BGR); overwritten.
-    report : called with the number of frames written so far.
+    """Write all frames of a scene to a `.npy` file (uint8 N x H x W x 3 BGR), which is overwritten.
 
     Raises OSError if the path is not writable.
     """
@@ -43,48 +42,24 @@ def write_truth(scene: Scene, path: Path, report: Report = lambda _done: None) -
     path : `.jsonl` has a JSON object per frame: frame, t (s), touching, center, angle, hull, area, depth,
         origin, position, visible, mean_flow, null if missing. `.csv` is the log of a force gauge: t (s), fx,
         fy, fz (N). Masks are in `open_scene(name).truth(index)`.
-    report : called with the number of frames written so far.
 
-    Raises KeyError for another suffix and OSError if the path is not writable.
+    Raises OSError if the path is not writable.
     """
-    write = TRUTH_WRITERS[path.suffix.lower()]
-    with completed(path) as partial:
-        write(scene, partial, report)
+    with completed(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file) if path.suffix.lower() == ".csv" else None
+        if table is not None:
+            table.writerow(["t", "fx", "fy", "fz"])
+        for index in range(len(scene)):
+            if table is not None:
+                table.writerow([index / scene.fps, *scene.truth(index).force])
+            else:
+                file.write(json.dumps(_line(scene, index), allow_nan=False, separators=(",", ":")) + "\n")
+            report(index + 1)
 
 
-def _truths(scene: Scene, report: Report) -> Iterator[tuple[int, Truth]]:
-    for index in range(len(scene)):
-        yield index, scene.truth(index)
-        report(index + 1)
-
-
-def _write_jsonl(scene: Scene, path: Path, report: Report) -> None:
-    with path.open("w", encoding="utf-8") as file:
-        for index, truth in _truths(scene, report):
-            line = {
-                "frame": index,
-                "t": index / scene.fps,
-                "touching": truth.touching,
-                "center": truth.center,
-                "angle": truth.angle,
-                "hull": truth.hull.tolist(),
-                "area": truth.area,
-                "depth": truth.depth,
-                "origin": truth.origin.tolist(),
-                "position": truth.position.tolist(),
-                "visible": truth.visible.tolist(),
-                "mean_flow": truth.mean_flow,
-            }
-            file.write(json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n")
-
-
-def _write_forces(scene: Scene, path: Path, report: Report) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["t", "fx", "fy", "fz"])
-        for index, truth in _truths(scene, report):
-            table.writerow([index / scene.fps, *truth.force])
-
-
-TRUTH_WRITERS = {".jsonl": _write_jsonl, ".csv": _write_forces}
-"""Suffix of a file -> the function that writes the truth to it."""
+def _line(scene: Scene, index: int) -> dict[str, object]:
+    truth = scene.truth(index)
+    names = ("touching", "center", "angle", "hull", "area", "depth", "origin", "position", "visible")
+    values = {name: getattr(truth, name) for name in names}
+    listed = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
+    return {"frame": index, "t": index / scene.fps, **listed, "mean_flow": truth.contact_flow}

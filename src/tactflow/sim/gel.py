@@ -30,14 +30,12 @@ crease. Chosen by hand."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px. Chosen by hand."""
 _MAX_STICK = 0.999
-"""Maximum relative radius of the stick region: full stick would have infinite traction at the edge."""
+"""Maximum relative radius of the stick region: with full stick, traction at the edge would be infinite."""
 _BISECTIONS = 20
 """Bisection steps for the radius of a contact: to a millionth of an indenter's reach."""
 SHEAR_SPREAD = 110.0
 """Standard deviation of the Gaussian decay of shear and twist around a contact, px. Chosen by hand: four to
 five marker pitches."""
-
-
 MM = 0.025
 """Millimetres per raw pixel of the simulated gel: its balls have a radius of 2.375 mm."""
 _STIFFNESS = 1.0

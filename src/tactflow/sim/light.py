@@ -96,24 +96,18 @@ def _grain(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
     return grain[..., None]
 
 
-def _slopes(depth: Array, step: float) -> tuple[Array, Array]:
-    """Slopes (h, w) of the surface along x and y. depth : (h, w), px, sampled every `step` px."""
-    x, y = (
-        cv2.Sobel(depth, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
-        for dx in (1, 0)
-    )
-    return np.asarray(x, np.float32), np.asarray(y, np.float32)
-
-
 def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
     """(h, w, 3) float32: shading of a deformed surface relative to rest, >= 0.
 
     depth : (h, w) float32, depth of the surface, px, sampled every `step` px.
     """
-    slope_x, slope_y = _slopes(depth, step)
     if light.absorption:
         passing = np.exp(depth * np.float32(-light.absorption))
         return np.asarray(cv2.merge([passing, passing, passing]), dtype=np.float32)
+    slope_x, slope_y = (
+        cv2.Sobel(depth, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5 / step, borderType=cv2.BORDER_REPLICATE)
+        for dx in (1, 0)
+    )
     upright = (1.0 - light.ambient) / np.sqrt(slope_x * slope_x + slope_y * slope_y + np.float32(1.0))
     channels = []
     for gain_x, gain_y in light.tilt():
@@ -157,23 +151,3 @@ def spot(size: tuple[int, int], center: tuple[float, float], spread: tuple[float
         for length, middle, deviation in zip(size, center, spread, strict=True)
     )
     return np.outer(down, across)
-
-
-def add_mirror_spots(image: NDArray[np.float32], x: Array, y: Array, strength: float, seed: int) -> None:
-    """Add specular reflections of lamps to the untouched gel (H, W, 3), grey levels; x, y : (H, W)
-    coordinates."""
-    rng = np.random.default_rng([seed, 0x7370])
-    height, width = x.shape
-    for _ in range(4):
-        center_x, center_y, spread = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(5, 16)
-        spot = np.exp(-((x - center_x) ** 2 + (y - center_y) ** 2) / np.float32(2 * spread**2))
-        image += np.float32(110.0 * strength) * spot[..., None]
-
-
-def highlight(depth: Array, step: float, strength: float) -> Array:
-    """(h, w) float32 grey levels: specular reflection of a lamp on the slope that faces it."""
-    slope_x, slope_y = _slopes(depth, step)
-    off = (slope_x - np.float32(0.13)) ** 2 + (slope_y - np.float32(0.16)) ** 2
-    return np.asarray(
-        np.exp(off * np.float32(-1.0 / (2 * 0.035**2))) * np.float32(150.0 * strength), np.float32
-    )

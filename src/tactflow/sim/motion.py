@@ -16,24 +16,16 @@ from tactflow.sim.gel import Press
 from tactflow.sim.settings import Settings
 from tactflow.sim.shapes import Shape
 
-_REST = 0.1
-"""Initial fraction of a recording without contact; chosen by hand."""
-
-_LONGEST_REST = 120
-"""Its maximum, frames: 2 s at 60 frames/s."""
-
+_REST, _LONGEST_REST = 0.1, 120
+"""Initial part of a recording without contact: its fraction, and its maximum, frames (2 s)."""
 _LAST_REST = 30
-"""Length of a recording per untouched frame at its end; chosen by hand."""
-
+"""Length of a recording per untouched frame at its end."""
 _FULL_LOAD = 0.75
-"""Fraction of a hold after which partial slip becomes full slip. Chosen by hand."""
-
+"""Fraction of a hold after which partial slip becomes full slip."""
 _LARGEST_CREEP = 60.0
-"""Amplitude of creep before it reverses, px; chosen by hand."""
-
+"""Amplitude of creep before it reverses, px."""
 _LARGEST_STROKE = 110.0
-"""Maximum marker pitch, px, to which displacements of the gel are proportional. Chosen by hand."""
-
+"""Maximum marker pitch, px, to which displacements of the gel are proportional."""
 _LARGEST_JUMP = 0.45
 """Maximum displacement of a jumping gel from its rest position, pitches: jumps of up to 0.9 pitches."""
 
@@ -42,18 +34,17 @@ _LARGEST_JUMP = 0.45
 class Programme:
     """A series of contacts; lengths of time are in frames.
 
-    indenters : functions that make them. offsets : their positions, px. period : time
-    between contacts. rise : time from touch to full depth, and back. hold : time at full depth. depths :
-    relative depths of successive contacts. place : mean position as a fraction of the frame; wander : maximum
-    deviation from it, px.
-    angles : range of the indenter's angle, degrees. travel : distance the indenter slides during a hold, px.
-    jumps : whether the gel is dragged to a new position every third frame. creep : drag of the gel, px per
-    frame.
-    dilation : outward displacement by a press, pitches. contacts : number spread over the recording; 0: as
-    many as fit. partial : whether slip starts at the edge of the contact; for balls. rolls : whether a ball
-    turns as it travels, without slip. tilts : rotation about the direction of motion and across it, from 0 to
-    this and back during a hold, degrees. holds : turn up to which the gel follows, degrees, before it slips,
-    in holds in which the indenter turns on and not back; None: always.
+    indenters : functions that make them. offsets : their positions, px.
+    period : time between contacts. rise : time from touch to full depth, and back. hold : time at full depth.
+    contacts : number spread over the recording; 0: as many as fit. depths : relative ones of successive
+    contacts. place : mean position as a fraction of the frame. wander : maximum deviation from it, px.
+    angles : range of the indenter's angle, degrees. dilation : outward displacement by a press, pitches.
+    travel : distance the indenter slides during a hold, px. partial : whether a ball slips at the edge of the
+    contact first. rolls : whether a ball turns as it travels, without slip.
+    jumps : whether the gel is dragged to a new position every third frame. creep : its drag, px per frame.
+    tilts : rotation about the direction of motion and across it, from 0 to this and back during a hold,
+    degrees. holds : the indenter turns on during a hold, and the gel follows by up to this angle, degrees,
+    before it slips; None: it turns back, and the gel always follows.
     """
 
     indenters: tuple[Callable[..., Shape], ...]
@@ -174,27 +165,6 @@ def _dragged(
     return drag, drag, None, False
 
 
-def _tilt(
-    programme: Programme,
-    shape: Shape,
-    depth: float,
-    angle: float,
-    timing: _Timing,
-    ahead: NDArray[np.float64],
-    travelled: NDArray[np.float64],
-    sink: float,
-) -> tuple[float, float]:
-    """`tilt` of `Press`."""
-    across = np.array([-ahead[1], ahead[0]])
-    if programme.rolls:
-        # Rolling without slip: the mean of the surface in contact does not move.
-        about = across * float(travelled @ ahead) / (shape.center - depth * (1 - sink) / 2)
-    else:
-        about = np.radians(programme.tilts) @ np.stack([ahead, across]) * timing.swing
-    cos, sin = np.cos(angle), np.sin(angle)
-    return float(about[0] * cos + about[1] * sin), float(about[1] * cos - about[0] * sin)
-
-
 def presses(
     programme: Programme,
     shapes: tuple[Shape, ...],
@@ -222,18 +192,25 @@ def presses(
         sliding |= turn != twist and timing.progress < 1
     full = programme.depths[timing.cycle % len(programme.depths)] * settings.depth
     depth = timing.envelope * full
-    tilts = [
-        _tilt(programme, s, full * s.depth, angle + turn, timing, ahead, travelled, settings.sink)
-        for s in shapes
-    ]
-    indenters = [
-        Press(
-            shape.rotated(np.asarray(cv2.Rodrigues(np.array([*tilt, 0.0]))[0], np.float64))
-            if any(tilt)
-            else shape,
+    angle += turn
+    cos, sin = np.cos(angle), np.sin(angle)
+    across = np.array([-ahead[1], ahead[0]])
+
+    def indenter(shape: Shape, offset_x: float, offset_y: float) -> Press:
+        if programme.rolls:
+            # Rolling without slip: the mean of the surface in contact does not move.
+            arm = shape.center - full * shape.depth * (1 - settings.sink) / 2
+            about = across * float(travelled @ ahead) / arm
+        else:
+            about = np.radians(programme.tilts) @ np.stack([ahead, across]) * timing.swing
+        tilt = float(about[0] * cos + about[1] * sin), float(about[1] * cos - about[0] * sin)
+        if any(tilt):
+            shape = shape.rotated(np.asarray(cv2.Rodrigues(np.array([*tilt, 0.0]))[0], np.float64))
+        return Press(
+            shape,
             x + offset_x + float(travelled[0]),
             y + offset_y + float(travelled[1]),
-            angle + turn,
+            angle,
             depth * shape.depth,
             (float(drag[0]), float(drag[1])),
             twist,
@@ -244,6 +221,6 @@ def presses(
             sliding,
             tilt,
         )
-        for shape, tilt, (offset_x, offset_y) in zip(shapes, tilts, programme.offsets, strict=True)
-    ]
-    return tuple(indenters), timing.cycle
+
+    placed = zip(shapes, programme.offsets, strict=True)
+    return tuple(indenter(shape, *offset) for shape, offset in placed), timing.cycle

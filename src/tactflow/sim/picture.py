@@ -130,8 +130,6 @@ class Painter:
         image = light.untouched_gel(self._light, raw_x, raw_y, dim)
         if settings.texture:
             image *= light.texture((height, width), settings.texture, settings.seed)
-        if settings.specular:
-            light.add_mirror_spots(image, raw_x, raw_y, settings.specular, settings.seed)
         if settings.vignette:
             radius = ((raw_x - CENTER[0]) ** 2 + (raw_y - CENTER[1]) ** 2) / np.float32(HALF_DIAGONAL**2)
             image *= (np.float32(1.0) - np.float32(settings.vignette) * radius)[..., None]
@@ -232,12 +230,9 @@ class Painter:
         full = (region.shape[1], region.shape[0])
         fine = cv2.resize(light.shading(self._light, sunk, _STEP), full, interpolation=cv2.INTER_LINEAR)
         lit = cv2.multiply(region, fine, dtype=cv2.CV_32F)
-        extra = light.brightness(self._light, press, depth) if self._light.brightening else None
-        if self._settings.specular:
-            spots = light.highlight(sunk, _STEP, self._settings.specular)
-            extra = spots if extra is None else extra + spots
-        if extra is not None:
-            wide = cv2.resize(extra, full, interpolation=cv2.INTER_LINEAR) * np.float32(FIXED_POINT)
+        if self._light.brightening:
+            added = light.brightness(self._light, press, depth)
+            wide = cv2.resize(added, full, interpolation=cv2.INTER_LINEAR) * np.float32(FIXED_POINT)
             if self._settings.aperture:
                 wide *= self._aperture[
                     _STEP * rows.start : _STEP * rows.stop, _STEP * columns.start : _STEP * columns.stop

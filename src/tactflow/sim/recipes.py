@@ -142,7 +142,6 @@ SCENES: dict[str, Recipe] = {
         {"worn": 0.3, "missing": 0.08, "dirty": 0.3, "vanish": 0.15, "shear": 0.4},
     ),
     "dense": Recipe("520 small markers", _PRESS, {"markers": (26, 20), "shear": 0.6}),
-    "sparse": Recipe("25 markers", _PRESS, {"markers": (5, 5), "dot": 12.0}),
     "bright_dots": Recipe("bright markers on a darker gel", _PRESS, {"polarity": "bright"}),
     "square_dots": Recipe("square markers", _PRESS, {"shape": "square"}),
     "doubled_dots": Recipe("each marker is a pair of dots", _PRESS, {"shape": "doubled"}),
@@ -151,7 +150,6 @@ SCENES: dict[str, Recipe] = {
     "bright": Recipe("a gel whose pressed area brightens in all channels", _PRESS, {"light": "bright"}),
     "bright_cable": Recipe("a cable on a gel that brightens", _CABLE, {"light": "bright"}),
     "mixed": Recipe("a gel that responds with colour and brightness", _PRESS, {"light": "mixed"}),
-    "glossy": Recipe("a gel with mirror-like highlights", _PRESS, {"specular": 0.8}),
     "tilted": Recipe("a tilted camera with a wide lens", _PRESS, {"perspective": 0.22, "distortion": 0.12}),
     "noisy": Recipe(
         "a poor camera: noise, shot noise, hot pixels, JPEG, blur",
@@ -180,10 +178,6 @@ SCENES: dict[str, Recipe] = {
     "coin": Recipe(
         "a coin: a large disc with a raised rim and figures",
         Programme((shapes.coin,), wander=(120.0, 80.0), angles=(-90.0, 90.0), dilation=0.1),
-    ),
-    "key": Recipe(
-        "a flat key",
-        Programme((shapes.key,), wander=(90.0, 60.0), angles=(-40.0, 40.0), dilation=0.1),
     ),
     "long_edge": Recipe(
         "the edge of a box, one flank steep and one flat, at several angles",

@@ -64,7 +64,6 @@ class Settings(BaseModel):
     )
     lamp: float = _number(0, -0.5, 0.5, "light of a lamp that comes on before the second half, relative")
     vignette: float = _number(0.2, 0, 1, "loss of light in the corners, relative")
-    specular: float = _number(0, 0, 1, "strength of mirror-like highlights")
     stray: float = _number(0, 0, 1, "strength of the reflection of a contact on the far side of the gel")
     texture: float = _number(1, 0, 10, "grain of the gel's coating, % of the light")
     blur: float = _number(0, 0, 20, "standard deviation of a Gaussian blur in addition to the lens's own, px")

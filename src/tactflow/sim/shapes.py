@@ -79,6 +79,10 @@ def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
     def gap(x: Array, y: Array) -> Array:
         return np.asarray((x * x + y * y) * np.float32(0.5 / radius), dtype=np.float32)
 
+    return _rotation_invariant(gap, radius, depth)
+
+
+def _rotation_invariant(gap: Callable[[Array, Array], Array], radius: float, depth: float) -> Shape:
     contact = float(np.sqrt(radius * depth))
     plain = Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact, radius)
     return replace(plain, tilted=lambda _: plain)
@@ -92,9 +96,7 @@ def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
         round_part = np.float32(radius) - np.sqrt(np.float32(radius**2) - squared)
         return np.asarray(round_part + np.hypot(x, y) - np.sqrt(squared), dtype=np.float32)
 
-    contact = float(np.sqrt(radius * depth))
-    plain = Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact, radius)
-    return replace(plain, tilted=lambda _: plain)
+    return _rotation_invariant(gap, radius, depth)
 
 
 def bumpy_ball(radius: float = 95.0, depth: float = 26.0, relief: float = 2.5) -> Shape:
@@ -198,23 +200,6 @@ def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape
     return Shape(gap, radius + 3.8 * float(np.sqrt(tube * depth)), depth, np.zeros((1, 2)), radius)
 
 
-def _lookup(picture: Array, outside: float) -> Callable[[Array, Array], Array]:
-    """Interpolate a picture (H, W) centred on the origin at (x, y), px; `outside` beyond its border."""
-    center_x, center_y = np.float32((picture.shape[1] - 1) / 2), np.float32((picture.shape[0] - 1) / 2)
-
-    def value(x: Array, y: Array) -> Array:
-        if not x.size:  # `remap` takes no empty maps: a gel without markers
-            return np.empty(x.shape, np.float32)
-        map_x = np.ascontiguousarray(x + center_x).reshape(len(x), -1)
-        map_y = np.ascontiguousarray(y + center_y).reshape(len(y), -1)
-        values = cv2.remap(
-            picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(outside,)
-        )
-        return np.asarray(values, dtype=np.float32).reshape(x.shape)
-
-    return value
-
-
 def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Shape:
     """A disc with a raised rim and text, `relief` px high, on a face that also makes contact."""
     font, text, scale, thickness, margin = cv2.FONT_HERSHEY_SIMPLEX, "10c", 3.4, 14, 60
@@ -222,7 +207,16 @@ def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Sha
     letters = np.zeros((height + 2 * margin, width + 2 * margin), np.uint8)
     cv2.putText(letters, text, (margin, margin + height), font, scale, (255.0,), thickness, cv2.LINE_8)
     smooth = np.asarray(cv2.GaussianBlur(letters, (0, 0), 2.5), dtype=np.float32)
-    raised = _lookup(smooth / np.float32(255.0), 0.0)
+    relief_map = smooth / np.float32(255.0)
+    middle_x, middle_y = (np.float32((side - 1) / 2) for side in relief_map.shape[::-1])
+
+    def raised(x: Array, y: Array) -> Array:
+        if not x.size:  # `remap` takes no empty maps: a gel without markers
+            return np.empty(x.shape, np.float32)
+        map_x = np.ascontiguousarray(x + middle_x).reshape(len(x), -1)
+        map_y = np.ascontiguousarray(y + middle_y).reshape(len(y), -1)
+        values = cv2.remap(relief_map, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return np.asarray(values, dtype=np.float32).reshape(x.shape)
 
     def gap(x: Array, y: Array) -> Array:
         from_center = np.hypot(x, y)
@@ -243,24 +237,6 @@ def block(half_width: float = 215.0, half_height: float = 135.0, depth: float = 
         return np.asarray(plain.gap(x, y) + np.float32(5.0) * groove**4, dtype=np.float32)
 
     return Shape(gap, plain.reach, depth, plain.sources, plain.spread)
-
-
-def key(depth: float = 11.0) -> Shape:
-    """A flat key along x: a bow with a hole, a shaft, and teeth of several lengths."""
-    canvas = np.full((330, 560), 255, np.uint8)
-    cv2.circle(canvas, (145, 165), 85, (0.0,), -1)
-    cv2.circle(canvas, (115, 165), 26, (255.0,), -1)
-    cv2.rectangle(canvas, (215, 142), (485, 182), (0.0,), -1)
-    for number, length in enumerate((26, 14, 34, 20)):
-        cv2.rectangle(canvas, (330 + 40 * number, 182), (350 + 40 * number, 182 + length), (0.0,), -1)
-    distance = cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # The blur smooths the steps of distances between pixels along the outline.
-    outside = _lookup(np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.2), dtype=np.float32), 60.0)
-
-    def gap(x: Array, y: Array) -> Array:
-        return _flank(outside(x, y))
-
-    return Shape(gap, 290.0, depth, _segment(150.0, 7), 75.0)
 
 
 def screw(

@@ -39,8 +39,6 @@ class Truth:
         without a contact. slipping : whether an indenter slides over the gel.
     origin, position : (N, 2) float64, printed markers on the untouched gel and now.
     visible : (N,) bool, whether a marker is visible: centre inside the frame, lit, not vanished.
-    inside : (N,) bool, whether a marker is visible and its centre lies in the contact.
-    mean_flow : (dx, dy), mean displacement of the markers inside, px; None if there are none.
     """
 
     def __init__(
@@ -75,12 +73,6 @@ class Truth:
         pixel = np.rint(self.position)
         in_frame = np.all((pixel >= 0) & (pixel < mapping.size), axis=1)
         self.visible = shown & (camera.aperture(raw) >= 0.5) & in_frame
-        gel = camera.to_gel(raw).astype(np.float32)
-        self.inside = self.visible & in_contact(presses, gel[:, 0], gel[:, 1])
-        self.mean_flow: tuple[float, float] | None = None
-        if self.inside.any():
-            dx, dy = (self.position - self.origin)[self.inside].mean(axis=0)
-            self.mean_flow = float(dx), float(dy)
 
     def displacement(self, points: Points) -> Points:
         """Displacement (N, 2) float64, px, of the gel that rests at points (N, 2)."""
@@ -90,10 +82,7 @@ class Truth:
 
     @cached_property
     def contact_flow(self) -> tuple[float, float] | None:
-        """Area-weighted mean displacement (dx, dy), px, of the gel in contact; None without contact.
-
-        Unlike `mean_flow`, it does not depend on the positions of markers.
-        """
+        """Area-weighted mean displacement (dx, dy), px, of the gel in contact; None without contact."""
         if not self.touching:
             return None
         rows, columns = np.nonzero(self.contact_mask)

@@ -74,8 +74,8 @@ LEAST_CLUSTER: Final = 6
 
 PROBABILITY: Final = (-0.37, -4.72, 5.65, 2.42)
 """Log odds of a mark: constant, and weights of its `evidence`. Fitted to 18 sensors by `python -m
-tactflow.bench.judge_dots --fit`, which also tells how often marks of a probability are marks on a sensor that
-was left out."""
+benchmarks.probability dots`, which also tells how often marks of a probability are marks on a sensor that was
+left out."""
 
 WINDOW: Final = 2.6
 """Radius of the discs that are compared, in radii of the marks: they hold the gaps to the neighbours, too.
