@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Literal
 
 import cv2
@@ -12,9 +12,9 @@ from pydantic import Field
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
-from tactflow.outputs import cannot_write
+from tactflow.outputs import cannot_write, locked_folder
 from tactflow.ports import Picture
-from tactflow.system.files import expanded, make_folder, next_name
+from tactflow.system.files import expanded, next_name
 
 UNFINISHED = ".unfinished"
 """Name of a picture until it is complete."""
@@ -46,6 +46,7 @@ class Images(Sink):
         super().__init__(params)
         self._folder = expanded(params.folder)
         self.description = str(self._folder)
+        self._lock = ExitStack()
         self._files = 0
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
 
@@ -62,12 +63,10 @@ class Images(Sink):
     def open(self) -> None:
         """Create the folder.
 
-        Raises StageError if it already holds frames and `overwrite` is not set, or it cannot be created.
+        Raises StageError if it already holds frames and `overwrite` is not set, another run is writing to it,
+        or it cannot be created.
         """
-        try:
-            make_folder(self._folder)
-        except OSError as error:
-            raise StageError(f"{self._folder}: cannot be written into: {error.strerror or error}") from error
+        self._lock.enter_context(locked_folder(self._folder))
         present = next(self._folder.glob("frame-*.[pj][np]g"), None)
         if present is not None and not self.params.overwrite:
             raise StageError(
@@ -93,3 +92,7 @@ class Images(Sink):
             kept = f"the {self._files} pictures written before are complete"
             raise cannot_write(path, error, kept) from error
         self._files += 1
+
+    def close(self) -> None:
+        """Let other runs have the folder."""
+        self._lock.close()

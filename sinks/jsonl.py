@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 from pydantic import Field
 
-from tactflow.engine.contract import Output, Sink
+from tactflow.engine.contract import Output
 from tactflow.engine.control import Control
 from tactflow.message.lines import LineFile, LineStream
 from tactflow.message.result import Result, encode_message
-from tactflow.outputs import AppendParams, refuse_existing
+from tactflow.outputs import AppendParams, OutputSink
 from tactflow.system.files import expanded, is_device
 
 
-class Jsonl(Sink):
+class Jsonl(OutputSink):
     """Writes result messages as complete lines to a file, a pipe or standard output.
 
     Lines reach a file at least every `flush` seconds and at the end, and standard output at once. If the
@@ -22,7 +22,6 @@ class Jsonl(Sink):
     reader; in a live run, lines are dropped and counted instead.
     """
 
-    threaded = True
     queue_capacity = 16
 
     class Params(AppendParams):
@@ -54,29 +53,19 @@ class Jsonl(Sink):
     @classmethod
     def outputs(cls, params: Jsonl.Params) -> Sequence[Output]:
         """The file, or none for standard output."""
-        if params.path == "-":
-            return ()
-        return (Output(expanded(params.path), "file", "path", params.refuses_existing),)
-
-    @classmethod
-    def on_restart(cls, params: Jsonl.Params) -> Jsonl.Params:
-        """Continue the file."""
-        return params.changed(overwrite=False, append=True)
+        return () if params.path == "-" else super().outputs(params)
 
     def open(self) -> None:
         """Open or create the file and its folder, or wait for the reader of a pipe.
 
-        Raises StageError if the file exists and neither `overwrite` nor `append` is set, or it cannot be
-        written.
+        Raises StageError if the file exists and neither `overwrite` nor `append` is set, another run is
+        writing to it, or it cannot be written.
         """
-        path, p = expanded(self.params.path), self.params
+        p = self.params
         if p.path == "-" or is_device(p.path):
             self._out = LineStream(p.path, self._control)
-            return
-        empty = path.is_file() and path.stat().st_size == 0
-        changes = p.overwrite or p.append or empty
-        refuse_existing(path, overwrite=changes, advice="append: true to continue it, ")
-        self._out = LineFile(path, replaces=p.overwrite, every=p.flush)
+        else:
+            self._out = LineFile(expanded(p.path), replaces=p.overwrite, continues=p.append, every=p.flush)
 
     def wants(self) -> bool:
         """False once the reader of standard output has closed it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field, model_validator
 
 from tactflow.drawing.jpeg import encode_jpeg
-from tactflow.engine.contract import Output, Recorder, StageParams
+from tactflow.engine.contract import Recorder
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.message.result import Result, encode_message
+from tactflow.outputs import OutputParams, OutputSink
 from tactflow.recording import missing_packages
 from tactflow.system.files import expanded, next_name
 
@@ -30,7 +31,7 @@ BACKLOG_SHARE = 4
 """Frames of the ring written per new frame, so that saving them does not delay the run."""
 
 
-class Record(Recorder):
+class Record(OutputSink, Recorder):
     """Records from the start, on command, or during contacts.
 
     With `ring`, the last seconds are kept in memory, compressed, and become the beginning of the file. A
@@ -41,17 +42,15 @@ class Record(Recorder):
     files, each of which can be played by itself.
     """
 
-    threaded = True
     takes_references = True
     queue_capacity = 32
 
-    class Params(StageParams):
+    class Params(OutputParams):
         """Destination, and start of a recording."""
 
         path: str = Field(
             "recording.mcap", pattern=r"\.mcap$", description="file, relative to the current directory"
         )
-        overwrite: bool = Field(False, description="replace an existing file")
         trigger: Literal["start", "button", "contact"] | None = Field(
             None,
             description="what starts a recording: the start of the run, the button of the view, or a contact "
@@ -91,6 +90,11 @@ class Record(Recorder):
             """The trigger, with the default resolved."""
             return self.trigger or ("start" if self.ring is None else "button")
 
+        @property
+        def refuses_existing(self) -> bool:
+            """Whether an existing file is an error; numbered files never replace one."""
+            return self.begins == "start" and not self.overwrite
+
         def needed_inputs(self) -> Mapping[str, str]:
             """The trigger `contact` requires the port `contact`."""
             return {"contact": "trigger"} if self.trigger == "contact" else {}
@@ -101,7 +105,6 @@ class Record(Recorder):
         sensor : names the channels of the file. control : the run, whose settings are attached; or None.
         """
         super().__init__(params)
-        self.description = params.path
         self._sensor = sensor
         self._control = control
         self._counts = {"frames": 0, "files": 0, "bytes": 0}
@@ -116,22 +119,11 @@ class Record(Recorder):
         self._warned = False
         self._touching = False
 
-    @classmethod
-    def outputs(cls, params: Record.Params) -> Sequence[Output]:
-        """The file; numbered files have its name and a number."""
-        refuses = params.begins == "start" and not params.overwrite
-        return (Output(expanded(params.path), "file", "path", refuses_existing=refuses),)
-
-    @classmethod
-    def on_restart(cls, params: Record.Params) -> Record.Params:
-        """Continue in another file."""
-        return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
-
     def open(self) -> None:
         """Create the file, if recording starts with the run.
 
-        Raises StageError if the file exists and `overwrite` is not set, it cannot be written, or a package is
-        missing.
+        Raises StageError if the file exists and `overwrite` is not set, another run is writing to it, it
+        cannot be written, or a package is missing.
         """
         problem = missing_packages()
         if problem is not None:

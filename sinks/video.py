@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import Field, model_validator
 
 from tactflow.drawing.film import CODECS, Film
-from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.frame import Tick
+from tactflow.outputs import OutputParams, OutputSink
 from tactflow.ports import Picture
-from tactflow.system.files import expanded, next_name
+from tactflow.system.files import expanded
 
 
-class Video(Sink):
+class Video(OutputSink):
     """Writes annotated frames to a video file; its extension chooses the codec.
 
     The file plays at the rate of capture: without `fps`, that is the median rate of the first frames. Players
     show frames at a constant rate, so frames dropped by a live run shorten the film.
     """
 
-    threaded = True
-
-    class Params(StageParams):
+    class Params(OutputParams):
         """Destination and rate."""
 
         path: str = Field(
@@ -34,7 +31,6 @@ class Video(Sink):
         fps: float | None = Field(
             None, gt=0, le=1000, description="rate of the file, frames per second; default: as captured"
         )
-        overwrite: bool = Field(False, description="replace an existing file")
 
         @model_validator(mode="after")
         def _known_extension(self) -> Video.Params:
@@ -45,27 +41,16 @@ class Video(Sink):
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is opened yet."""
         super().__init__(params)
-        self._path = expanded(params.path)
-        self.description = str(self._path)
         self._film: Film | None = None
-
-    @classmethod
-    def outputs(cls, params: Video.Params) -> Sequence[Output]:
-        """The file."""
-        return (Output(expanded(params.path), "file", "path", refuses_existing=not params.overwrite),)
-
-    @classmethod
-    def on_restart(cls, params: Video.Params) -> Video.Params:
-        """Continue in another file, `annotated-001.avi`."""
-        return params.changed(path=str(next_name(expanded(params.path))), overwrite=False)
 
     def open(self) -> None:
         """Create the file and its folder.
 
-        Raises StageError if the file exists, is a pipe or device, or cannot be written.
+        Raises StageError if the file exists, another run is writing to it, it is a pipe or device, or it
+        cannot be written.
         """
         p = self.params
-        self._film = Film(self._path, fps=p.fps, overwrite=p.overwrite)
+        self._film = Film(expanded(p.path), fps=p.fps, overwrite=p.overwrite)
 
     def counters(self) -> dict[str, int]:
         """frames : written so far."""

@@ -1,23 +1,40 @@
-"""Output files of a run: their parameters, creating them, and detecting interference."""
+"""Output files of a run: their parameters, opening and locking them, and detecting interference."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from io import BufferedRandom
 from pathlib import Path
-from typing import Self
+from typing import Any, ClassVar, Literal, Self, cast
 
 from pydantic import Field, model_validator
 
-from tactflow.engine.contract import StageParams
+from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
-from tactflow.system.files import is_device, make_folder
+from tactflow.system.files import expanded, is_device, lock, lock_folder, make_folder, next_name
 
 
-class AppendParams(StageParams):
-    """Parameters of a sink that can replace or continue its output."""
+class OutputParams(StageParams):
+    """Parameters of a sink that writes a file or a folder."""
 
     path: str = Field(min_length=1, description="relative to the current directory")
     overwrite: bool = Field(False, description="replace existing output")
+
+    @property
+    def refuses_existing(self) -> bool:
+        """Whether existing output is an error."""
+        return not self.overwrite
+
+    def restarted(self) -> Self:
+        """The parameters after a restart in the same run: for a numbered output beside the one begun."""
+        return self.changed(path=str(next_name(expanded(self.path))), overwrite=False)
+
+
+class AppendParams(OutputParams):
+    """Parameters of a sink that can also continue its output."""
+
     append: bool = Field(False, description="continue existing output")
 
     @model_validator(mode="after")
@@ -31,38 +48,97 @@ class AppendParams(StageParams):
         """Whether existing output is an error."""
         return not (self.overwrite or self.append)
 
+    def restarted(self) -> Self:
+        """The parameters after a restart in the same run: for the same output, continued."""
+        return self.changed(overwrite=False, append=True)
+
+
+class OutputSink(Sink):
+    """Base class of sinks that write `params.path`, in their own thread."""
+
+    threaded = True
+    output_kind: ClassVar[Literal["file", "folder"]] = "file"
+
+    def __init__(self, params: Any) -> None:
+        """Prepare; nothing is opened yet."""
+        super().__init__(params)
+        self.description = params.path
+
+    @classmethod
+    def outputs(cls, params: Any) -> Sequence[Output]:
+        """The file or folder."""
+        return (Output(expanded(params.path), cls.output_kind, "path", params.refuses_existing),)
+
+    @classmethod
+    def on_restart(cls, params: Any) -> StageParams:
+        """See `OutputParams.restarted`."""
+        return cast(StageParams, params.restarted())
+
 
 def cannot_write(path: Path | str, error: OSError, kept: str = "") -> StageError:
     """The error for a file that cannot be written. kept : what is complete, and the remedy."""
     return StageError(f"{path}: cannot be written: {error.strerror or error}{kept and f'; {kept}'}")
 
 
-def refuse_existing(path: Path, *, overwrite: bool, advice: str = "") -> None:
-    """Raise StageError for an existing file, unless it may be replaced, and for a pipe or device.
+def open_output(
+    path: Path, *, overwrite: bool = False, append: bool = False, advice: str = ""
+) -> BufferedRandom:
+    """Open a file for appending, create its folder, and lock it against other runs until it is closed.
 
-    advice : another remedy, such as `append: true to continue it, `.
-    """
-    if path.exists() and not path.is_dir() and not overwrite:
-        raise StageError(
-            f"{path}: this file exists; set overwrite: true to replace it, {advice}or give another path"
-        )
-    if is_device(str(path)):
-        raise StageError(f"{path}: required a file, not a pipe or device; give another path")
-
-
-def create(path: Path, *, overwrite: bool) -> None:
-    """Create an empty file and its folder, or truncate an existing file with `overwrite`.
+    overwrite, append : truncate or continue an existing file, which is otherwise refused unless it is empty.
+    advice : a remedy for an existing file besides overwrite, such as `append: true to continue it, `.
 
     Raises
     ------
-    StageError : it exists, or cannot be written.
+    StageError : another run is writing to it, it exists, it is a pipe or a device, or it cannot be written.
     """
-    refuse_existing(path, overwrite=overwrite)
+    if is_device(str(path)):
+        raise StageError(f"{path}: required a file, not a pipe or device; give another path")
     try:
         make_folder(path.parent)
-        path.open("wb").close()
+        # In append mode, no gap of NULs follows if another program truncates the file.
+        file = path.open("ab+")
     except OSError as error:
         raise cannot_write(path, error) from error
+    try:
+        if not lock(file.fileno()):
+            raise _taken(path)
+        if overwrite:
+            file.truncate(file.seek(0))
+        elif not append and os.fstat(file.fileno()).st_size:
+            raise StageError(
+                f"{path}: this file exists; set overwrite: true to replace it, {advice}or give another path"
+            )
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+@contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Create a folder, and lock it against other runs while the block lasts; it is removed if empty then.
+
+    Raises StageError if it cannot be created, or another run is writing to it.
+    """
+    try:
+        make_folder(folder)
+        descriptor = lock_folder(folder)
+    except BlockingIOError:
+        raise _taken(folder) from None
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _taken(path: Path) -> StageError:
+    return StageError(f"{path}: another run is writing to it; end that run, or give another path")
 
 
 def refuse_interference(path: Path, ours: os.stat_result, lost: str, length: int = 0) -> None:

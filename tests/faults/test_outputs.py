@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import resource
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -13,8 +14,10 @@ from pathlib import Path
 import pytest
 
 from tactflow.cli.main import main
+from tactflow.engine.run import Runner
+from tactflow.outputs import locked_folder
 from tests.faults.outputs import KINDS, settings_of
-from tests.faults.rig import At, Seen, array, fill, run, small_disk, write_pipeline
+from tests.faults.rig import FRAMES, At, Seen, array, fill, run, small_disk, write_pipeline
 
 THEIRS = "somebody else's"
 
@@ -122,6 +125,45 @@ def test_a_folder_that_is_read_only_is_refused_at_the_start(kind: str, tmp_path:
         _, seen = run(tmp_path, settings_of(kind, place / KINDS[kind].output), source=str(array(tmp_path)))
         seen.must_be(3, "Read-only|denied")
         assert not list(place.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a file is not locked there")
+@pytest.mark.parametrize(
+    ("kind", "existing"),
+    [
+        *((kind, "overwrite") for kind in ("jsonl", "images", "video .avi", "record", "parquet")),
+        *(("jsonl", "append"), ("record", None)),
+    ],
+)
+def test_a_second_run_to_the_same_output_is_refused(kind: str, existing: str | None, tmp_path: Path) -> None:
+    output, source = tmp_path / KINDS[kind].output, str(array(tmp_path))
+    sinks, other = settings_of(kind, output), tmp_path / "other"
+    other.mkdir()
+    seen: list[Seen] = []
+
+    def run_again(_: Runner) -> None:
+        changed = {
+            id_: {**settings, **({existing: True} if existing else {})} for id_, settings in sinks.items()
+        }
+        seen.append(run(other, changed, source=source)[1])
+
+    _, first = run(tmp_path, sinks, run_again, source=source)
+    seen[0].must_be(3, f"{output}: another run is writing to it; end that run, or give another path")
+    first.must_be(0)
+    assert KINDS[kind].look(output).startswith(f"{FRAMES} ")
+
+
+def test_a_second_export_to_the_same_folder_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("h5py", reason="the extra hdf5 is not installed")
+    out = tmp_path / "out"
+    words = ["export", "hdf5", "sim:press?frames=3", "--pipeline", "mini", "--out", str(out)]
+    with locked_folder(out):
+        assert main(words) == 3
+        assert "another run is writing to it" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(words) == 0
 
 
 def test_statistics_that_do_not_fit_the_disk_are_said_and_left_empty(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -64,20 +63,6 @@ def test_an_existing_file_is_neither_replaced_nor_touched_unasked(tmp_path: Path
     with pytest.raises(StageError, match=r"r\.jsonl: this file exists.*overwrite: true.*append: true"):
         opened(path)
     assert seqs_in(path) == [7]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="a file is not locked there")
-@pytest.mark.parametrize("params", [{"overwrite": True}, {"append": True}])
-def test_a_file_that_another_run_writes_is_left_to_it(tmp_path: Path, params: dict[str, bool]) -> None:
-    path = tmp_path / "results.jsonl"
-    first = opened(path, flush=0)
-    write(first, range(3))
-    with pytest.raises(StageError, match=r"another run is writing to it; give another path \(--set"):
-        opened(path, **params)
-    write(first, range(3, 5))
-    first.close()
-    assert seqs_in(path) == list(range(5))
-    opened(path, append=True).close()
 
 
 def test_standard_output_gets_every_line_at_once(capfdbinary: pytest.CaptureFixture[bytes]) -> None:

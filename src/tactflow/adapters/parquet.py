@@ -6,19 +6,19 @@ import errno
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
 import orjson
 from pydantic import Field
 
-from tactflow.engine.contract import Output, Sink
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
 from tactflow.message.encoding import SCHEMA
 from tactflow.message.result import Result, encode_message
-from tactflow.outputs import AppendParams, cannot_write
+from tactflow.outputs import AppendParams, OutputSink, cannot_write, locked_folder
 from tactflow.recording.provenance import facts, kept_files
 from tactflow.system.extras import missing
 from tactflow.system.files import completed, expanded, make_folder
@@ -43,7 +43,7 @@ Rows = dict[str, list[tuple[Any, ...]]]
 """Name of a table -> its rows."""
 
 
-class Parquet(Sink):
+class Parquet(OutputSink):
     """Writes result messages to `path/frames/`, `path/contacts/` and `path/markers/`.
 
     `frames` has a row per frame, `contacts` one per separate contact, `markers` one per dot and frame. Each
@@ -52,7 +52,7 @@ class Parquet(Sink):
     process ends abruptly, at most the rows since the last part are lost.
     """
 
-    threaded = True
+    output_kind = "folder"
     queue_capacity = 16
 
     class Params(AppendParams):
@@ -70,7 +70,7 @@ class Parquet(Sink):
         """
         super().__init__(params)
         self._folder = expanded(params.path)
-        self.description = params.path
+        self._lock = ExitStack()
         self._sensor = sensor
         self._control = control
         self._schemas: dict[str, pa.Schema] = {}
@@ -79,21 +79,11 @@ class Parquet(Sink):
         self._next = 0
         self._counts = {"frames": 0, "parts": 0}
 
-    @classmethod
-    def outputs(cls, params: Parquet.Params) -> Sequence[Output]:
-        """The folder."""
-        return (Output(expanded(params.path), "folder", "path", params.refuses_existing),)
-
-    @classmethod
-    def on_restart(cls, params: Parquet.Params) -> Parquet.Params:
-        """Append to the tables."""
-        return params.changed(overwrite=False, append=True)
-
     def open(self) -> None:
         """Create the folders.
 
-        Raises StageError if there are tables and neither `overwrite` nor `append` is set, the folder cannot
-        be written, or a package is missing.
+        Raises StageError if there are tables and neither `overwrite` nor `append` is set, another run is
+        writing to the folder, it cannot be written, or a package is missing.
         """
         problem = missing("Parquet tables", "parquet", ["pyarrow"])
         if problem is not None:
@@ -102,6 +92,7 @@ class Parquet(Sink):
         import pyarrow.parquet  # type: ignore[import-untyped]
 
         pyarrow.array([0])
+        self._lock.enter_context(locked_folder(self._folder))
         try:
             for name in TABLES:
                 make_folder(self._folder / name)
@@ -132,7 +123,8 @@ class Parquet(Sink):
 
     def close(self) -> None:
         """Write the last part. Raises as `write`."""
-        self._flush()
+        with self._lock:
+            self._flush()
 
     def _check_existing(self) -> None:
         """Refuse existing tables, remove them, or continue them."""

@@ -26,7 +26,7 @@ from pydantic import TypeAdapter
 
 from tactflow.batch.recordings import Recording
 from tactflow.engine.errors import ConfigError
-from tactflow.system.files import claim_path, completed, make_folder
+from tactflow.system.files import completed, lock_folder, make_folder
 
 Format = Literal["parquet", "jsonl"]
 Status = Literal["done", "failed", "not done"]
@@ -104,7 +104,7 @@ class Store:
         try:
             for folder in (self.path / "results", self.records, scratch):
                 make_folder(folder)
-            claim = claim_path(scratch)
+            claim = lock_folder(scratch)
             for path in scratch.iterdir():
                 remove(path)
         except BlockingIOError:

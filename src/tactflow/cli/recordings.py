@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 from tactflow.cli.options import add_overwrite, add_quiet, refuse_output, writing
 from tactflow.engine.errors import ConfigError, SourceError, StageError
+from tactflow.outputs import locked_folder
 from tactflow.recording import missing_packages
 from tactflow.system.arguments import number
 from tactflow.system.files import completed
@@ -70,17 +71,17 @@ def run_export(args: argparse.Namespace) -> int:
     Raises
     ------
     ConfigError : there is no such format, or the folder is there already. Nothing was written.
-    TactflowError : as `tactflow run`; nothing is left behind.
+    TactflowError : as `tactflow run`, or another run is writing to the folder; nothing is left behind.
     """
     exporter = _exporter(args.format)
-    if args.out.exists():
+    if args.out.is_file() or (args.out.is_dir() and any(args.out.iterdir())):
         raise ConfigError(f"--out: {args.out} already exists; give another folder")
     rate = signature(exporter).parameters.get("fps")
     keeps_every_frame = rate is not None and rate.default is None
     fps = args.fps if args.fps or keeps_every_frame else _rate(args.recordings[0])
     started: list[str] = []
     try:
-        with notes(), writing(args.out), completed(args.out) as folder:
+        with notes(), writing(args.out), locked_folder(args.out), completed(args.out) as folder:
             episodes = _episodes(args.recordings, args.pipeline, started)
             exporter(folder, episodes, fps=fps, task=args.task, pictures=args.pictures)
     except StageError as error:

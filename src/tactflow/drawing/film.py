@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import statistics
 from itertools import pairwise
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import StageError
-from tactflow.outputs import create, refuse_interference
+from tactflow.outputs import open_output, refuse_interference
 
 log = logging.getLogger("tactflow")
 
@@ -51,8 +52,9 @@ class Film:
         self._held: list[tuple[float, NDArray[np.uint8]]] = []
         self._writer: cv2.VideoWriter | None = None
         self._size: tuple[int, int] | None = None
-        create(path, overwrite=overwrite)
-        self._ours = path.stat()
+        # OpenCV opens the file again; this one holds the lock.
+        self._file = open_output(path, overwrite=overwrite)
+        self._ours = os.fstat(self._file.fileno())
         self._codec = CODECS[path.suffix.lower()]
 
     def add(self, t: float, picture: NDArray[np.uint8]) -> None:
@@ -83,6 +85,7 @@ class Film:
             writer, self._writer = self._writer, None
             if writer is not None:
                 writer.release()
+            self._file.close()
         if writer is not None:
             refuse_interference(self._path, self._ours, f"its {self.frames} frames are not in it")
             problem = film_problem(self._path, self.frames)

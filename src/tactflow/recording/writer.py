@@ -13,7 +13,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from tactflow.message.schema import message_schema
-from tactflow.outputs import cannot_write, create, refuse_interference
+from tactflow.outputs import cannot_write, open_output, refuse_interference
 from tactflow.recording.frames import RawFrame
 from tactflow.recording.schemas import channel_type, channel_types
 
@@ -61,8 +61,7 @@ class RecordingWriter:
     ) -> None:
         self.path = path
         self.frames = self.begins = self.bytes = 0
-        create(path, overwrite=overwrite)
-        self._file = path.open("ab")
+        self._file = open_output(path, overwrite=overwrite)
         self._writer = Writer(self._file, chunk_size=NEVER, compression=CompressionType.NONE)
         self._writer.start(profile="", library="tactflow")
         with self._errors():

@@ -145,28 +145,36 @@ def make_folder(folder: Path) -> None:
         raise NotADirectoryError(errno.ENOTDIR, f"{file} is a file, not a folder") from None
 
 
-def claim_path(path: Path) -> int | None:
-    """Lock an existing file or folder until the returned descriptor is closed.
+def lock(descriptor: int) -> bool:
+    """Lock an open file or folder until it is closed; False if another process has locked it.
 
     The lock is advisory and ends with the process. It always succeeds on file systems without locks, and does
     nothing on Windows, which does not allow replacing an open file.
-
-    Raises
-    ------
-    OSError : another run holds the lock (BlockingIOError), or it cannot be opened.
     """
-    if sys.platform == "win32":
-        return None
-    else:  # noqa: RET505 (mypy knows branches)
-        descriptor = os.open(path, os.O_RDONLY)
+    if sys.platform != "win32":
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(descriptor)
-            raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it") from None
+            return False
         except OSError:
             pass
-        return descriptor
+    return True
+
+
+def lock_folder(folder: Path) -> int | None:
+    """Lock a folder until the returned descriptor is closed; None on Windows, which cannot open a folder.
+
+    Raises
+    ------
+    OSError : another process has locked it (BlockingIOError), or it cannot be opened.
+    """
+    if sys.platform == "win32":
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    if not lock(descriptor):
+        os.close(descriptor)
+        raise BlockingIOError(errno.EWOULDBLOCK, "another run is writing to it")
+    return descriptor
 
 
 class LossyStream(io.TextIOWrapper):
