@@ -16,8 +16,7 @@ from tactflow.engine.control import Control
 from tactflow.engine.rate import RateLimit
 from tactflow.message.result import Result, encode_message
 from tactflow.network.address import Address
-from tactflow.network.commands import Commands
-from tactflow.network.control_socket import ControlSocket
+from tactflow.network.commands import Commands, ControlSocket
 from tactflow.network.publisher import Publisher
 from tactflow.ports import Image
 

@@ -62,7 +62,7 @@ def test_the_reader_of_a_pipe(
     def send_signal(runner: Runner) -> None:
         if "hangs, and a signal" in reader_does:
             # More than the pipe takes.
-            until(lambda: runner.progress().frames >= 50)
+            until(lambda: runner.progress().frames >= 20)
         elif "signal" in reader_does:
             time.sleep(0.3)
         if "signal" in reader_does:

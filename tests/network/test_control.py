@@ -16,8 +16,7 @@ from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
 from tactflow.engine.control import Control
 from tactflow.engine.run import Runner
-from tactflow.network.commands import Commands
-from tactflow.network.control_socket import ControlSocket
+from tactflow.network.commands import Commands, ControlSocket
 from tactflow.network.remote_control import RemoteControl
 from tactflow.sinks.record import Record
 from tactflow.sinks.zmq import Zmq

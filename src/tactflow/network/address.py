@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
+class Address(NamedTuple):
     """`tcp://HOST:PORT` or `ipc://PATH`.
 
     host : name, number or `*` (all interfaces); None for ipc. port : None where the system picks one (`*`, 0)
@@ -44,11 +43,7 @@ class Address:
 
     @property
     def is_local(self) -> bool:
-        """Whether only this machine can reach it.
-
-        >>> Address.parse("tcp://[::1]:5556").is_local, Address.parse("tcp://*:5556").is_local
-        (True, False)
-        """
+        """Whether only this machine can reach it."""
         # lo, lo0 : the loopback interface on Linux and macOS.
         return self.host in (None, "lo", "lo0") or is_loopback(str(self.host))
 
@@ -56,11 +51,6 @@ class Address:
     def picks_a_port(self) -> bool:
         """Whether the system picks the port."""
         return self.host is not None and self.port is None
-
-    @property
-    def is_ipv6(self) -> bool:
-        """Whether it is an IPv6 address, which ZeroMQ accepts only where an option is set."""
-        return self.host is not None and ":" in self.host
 
 
 def is_loopback(host: str) -> bool:

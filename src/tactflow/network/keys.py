@@ -47,12 +47,6 @@ def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
     Raises
     ------
     WrongKeysError : the name is invalid or taken. OSError : the files cannot be written.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     publisher, laptop = make_keys(Path(folder, "keys"), "laptop")
-    ...     sorted(path.name for path in laptop.iterdir())
-    ['publisher.key', 'subscriber.key_secret']
     """
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name) or name == "publisher":
         raise WrongKeysError(
@@ -109,10 +103,18 @@ def use_keys(socket: zmq.Socket[bytes], folder: Path) -> None:
 
 
 def _load(file: Path) -> tuple[bytes, bytes]:
-    """Load the public and the secret key of a file; the latter is empty in a file of a public key."""
+    """Load the public and the secret key of a file; the latter is empty in a file of a public key.
+
+    Refuses a key that other users can replace, change or (if it is secret) read.
+    """
     is_secret = file.suffix == ".key_secret"
     try:
-        _refuse_shared(file, is_secret)
+        for path, forbidden in ((file, 0o077 if is_secret else 0o022), (file.parent, 0o022)):
+            status = path.stat()
+            if sys.platform != "win32" and status.st_mode & forbidden:
+                raise WrongKeysError(f"{path}: other users can read or change it; chmod go-rwx {path}")
+            if sys.platform != "win32" and status.st_uid not in (0, os.geteuid()):
+                raise WrongKeysError(f"{path}: belongs to another user, who can change it; chown it")
         public, secret = zmq.auth.load_certificate(file)
     except OSError as error:
         raise WrongKeysError(f"{file}: {error.strerror}; {HINT}") from None
@@ -122,15 +124,3 @@ def _load(file: Path) -> tuple[bytes, bytes]:
     if len(public) != 40 or (is_secret and len(secret or b"") != 40):
         raise WrongKeysError(f"{file}: required keys of 40 characters; {HINT}")
     return public, secret or b""
-
-
-def _refuse_shared(file: Path, is_secret: bool) -> None:
-    """Refuse a key that other users can replace, change or (if it is secret) read."""
-    if sys.platform == "win32":
-        return
-    for path, forbidden in ((file, 0o077 if is_secret else 0o022), (file.parent, 0o022)):
-        status = path.stat()
-        if status.st_mode & forbidden:
-            raise WrongKeysError(f"{path}: other users can read or change it; chmod go-rwx {path}")
-        if status.st_uid not in (0, os.geteuid()):
-            raise WrongKeysError(f"{path}: belongs to another user, who can change it; chown it")

@@ -1,23 +1,42 @@
-"""The socket that results are published on: by the sink `zmq`, and by the relay of several sensors."""
+"""ZeroMQ sockets that a run binds: for results, by the sink `zmq` or the relay of several sensors."""
 
 from __future__ import annotations
 
+import errno
+import socket
+import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zmq
 
-from tactflow.network.bound_socket import BoundSocket
+from tactflow.engine.errors import StageError
+from tactflow.network.address import Address
+from tactflow.network.keys import require_keys
+from tactflow.system.files import expanded
 
+if TYPE_CHECKING:
+    from zmq.auth.thread import ThreadAuthenticator
+
+BOUND: dict[int, int] = {
+    # Largest subscription or command, bytes; usual ones have some twenty. ZeroMQ keeps subscriptions in a
+    # tree and recurses once per byte: a subscription of a megabyte overflows the stack.
+    zmq.MAXMSGSIZE: 4096,
+    # Handshake timeout, ms. Chosen by hand.
+    zmq.HANDSHAKE_IVL: 5000,
+    # Idle time before the first keep-alive probe, s. Chosen by hand.
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 10,
+}
 SEND_BUFFER = 65_536
-"""Kernel send buffer per subscriber, bytes. One segment of the loopback device:
-longer messages than the buffer wait for delayed acknowledgements. With 32 kB, depth maps of 480 kB at 30 Hz
-took 0.3 s each, and 43 % of the results beside them arrived (147 of 345; with 64 kB 350 of 350). Larger ones
-hold more stale messages."""
-MOST_EVENTS = 1000
-"""Subscriptions read at a time, in about 2 ms. Chosen by hand."""
+"""Kernel send buffer per subscriber, bytes: one segment of the loopback device, as messages longer than the
+buffer wait for delayed acknowledgements (depth maps took 0.3 s each with 32 kB). Larger ones hold more stale
+messages."""
 _READABLE = int(zmq.POLLIN)
 """As a plain number: an operation with the `enum` takes 25 us."""
 _HINT = (
@@ -26,17 +45,77 @@ _HINT = (
 )
 
 
+class BoundSocket:
+    """A bound socket and, if keys are required, its authenticator.
+
+    Parameters
+    ----------
+    kind : ZeroMQ's type of the socket. endpoint : address to bind.
+    hint : advice if the address is in use. options : ZeroMQ's option -> value.
+    keys : the publisher's folder made by `tactflow keys new`: only clients with a key in it are admitted, and
+        everything is encrypted. None admits every client that can reach the address.
+
+    Raises
+    ------
+    StageError : the address is invalid, in use or cannot be bound, or the keys are wrong.
+
+    Attributes
+    ----------
+    socket : to be used by one thread at a time. endpoint : the bound address, with the actual port.
+    """
+
+    def __init__(
+        self, kind: int, endpoint: str, hint: str, options: Mapping[int, int], keys: str | None = None
+    ) -> None:
+        self._authenticator: ThreadAuthenticator | None = None
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.socket = self._context.socket(kind)
+        try:
+            address = Address.parse(endpoint)
+            # ZeroMQ accepts an IPv6 address only with this option.
+            for option, value in {zmq.IPV6: ":" in str(address.host), **BOUND, **options}.items():
+                self.socket.setsockopt(option, value)
+            if keys is not None:
+                self._authenticator = require_keys(self.socket, self._context, expanded(keys))
+            if address.host is None:
+                _refuse_taken_path(Path(endpoint.removeprefix("ipc://")))
+            self.socket.bind(endpoint)
+        except ValueError as error:
+            BoundSocket.close(self)
+            raise StageError(str(error)) from error
+        except zmq.ZMQError as error:
+            BoundSocket.close(self)
+            is_taken = error.errno == errno.EADDRINUSE
+            reason = f"is in use: {hint}" if is_taken else f"cannot be bound: {error.strerror}"
+            raise StageError(f"{endpoint} {reason}") from error
+        self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def close(self, linger: float = 0.0) -> None:
+        """Deliver pending messages for at most `linger` seconds, then free the address. Idempotent."""
+        if self._authenticator is not None:
+            self._authenticator.stop()
+            self._authenticator = None
+        self.socket.close(linger=int(linger * 1000))
+        self._context.term()
+
+
+def _refuse_taken_path(path: Path) -> None:
+    """Refuse the path of a file or of another run's socket: ZeroMQ would delete it."""
+    if sys.platform == "win32" or not path.exists():
+        return
+    if not path.is_socket():
+        raise ValueError(f"ipc://{path}: {path} is a file; an address needs an unused path")
+    with socket.socket(socket.AF_UNIX) as probe:
+        # A socket left behind by a killed run refuses the connection, and may be replaced.
+        if probe.connect_ex(str(path)) == 0:
+            raise zmq.ZMQError(errno.EADDRINUSE)
+
+
 class Publisher(BoundSocket):
     """A bound XPUB socket. Any thread may send; sending never waits for subscribers.
 
     endpoint, keys, Raises : as for `BoundSocket`. backlog : messages queued for each subscriber at most.
     subscriptions : number of distinct prefixes that are subscribed to.
-
-    >>> publisher = Publisher("tcp://127.0.0.1:*", backlog=32)
-    >>> publisher.send(b"tactflow.main {}")
-    >>> publisher.is_subscribed(b"tactflow.main ")
-    False
-    >>> publisher.close()
     """
 
     def __init__(self, endpoint: str, backlog: int, keys: str | None = None) -> None:
@@ -66,11 +145,8 @@ class Publisher(BoundSocket):
         return not self._topics.keys().isdisjoint(_beginnings(topic, len(topic) - 1 if by_name else 0))
 
     def _read_events(self) -> None:
-        """Count subscriptions by topic, at most `MOST_EVENTS` changes at a time."""
-        for _ in range(MOST_EVENTS):
-            event = self.next_event()
-            if event is None:
-                return
+        """Count the subscriptions to each topic."""
+        while (event := self.next_event()) is not None:
             topic, space, _ = event[1:].partition(b" ")
             change = {b"\x01": 1, b"\x00": -1}.get(event[:1], 0)
             self._topics[topic + space] += change
@@ -81,8 +157,8 @@ class Publisher(BoundSocket):
     def wait_for(self, topic: bytes, seconds: float) -> bool:
         """Wait for a subscription to a topic; returns whether there is one."""
         end = time.monotonic() + seconds
-        while not self.is_subscribed(topic) and (remaining := end - time.monotonic()) > 0:
-            self.socket.poll(max(int(min(remaining, 0.1) * 1000), 1))
+        while not self.is_subscribed(topic) and time.monotonic() < end:
+            self.socket.poll(10)
         return self.is_subscribed(topic)
 
     def send(self, message: bytes) -> None:

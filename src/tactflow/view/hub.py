@@ -114,15 +114,7 @@ class Hub:
         self._number = 0
         self._sent = 0
         self._end: str | None = None
-        self._by_name: dict[str, Callable[[Any], Any]] = {
-            "pause": lambda value: self._commands.pause(value is True),
-            "step": lambda _: self._commands.step(),
-            "reference": lambda _: self._commands.take_reference(),
-            "record": lambda value: self._commands.record(value is True),
-            "stop": lambda _: self._commands.stop(),
-        }
         self._answers = answers or {}
-        self._by_name |= self._answers
 
     # -- from other threads -------------------------------------------------------------------------------
 
@@ -223,7 +215,7 @@ class Hub:
                 "total": None if source is None else source.total,
                 "state": "paused" if paused and condition == "running" else condition,
             },
-            refused={name: self._refusal(name) for name in self._by_name},
+            refused={name: self._refusal(name) for name in (*Commands.NAMES, *self._answers)},
         )
 
     # -- inside the loop ----------------------------------------------------------------------------------
@@ -299,13 +291,17 @@ class Hub:
     async def _command(self, page: Page, message: Mapping[str, Any]) -> None:
         name = message.get("do")
         try:
-            if not isinstance(name, str) or name not in self._by_name:
+            if name not in [*Commands.NAMES, *self._answers]:
                 raise RefusedError(f"there is no command {name!r}")
             refusal = self._refusal(name)
             if refusal is not None:
                 raise RefusedError(refusal)
+            value = message.get("value")
             # Starting or ending a recording may access the disk.
-            await asyncio.to_thread(self._by_name[name], message.get("value"))
+            if name in self._answers:
+                await asyncio.to_thread(self._answers[name], value)
+            else:
+                await asyncio.to_thread(self._commands.execute, name, value is True)
         except Exception as error:
             if not isinstance(error, RefusedError):
                 log.warning("view: %s failed: %s: %s", name, type(error).__name__, error)
