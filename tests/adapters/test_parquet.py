@@ -110,7 +110,7 @@ def test_every_value_of_the_message_has_a_column_with_its_description(tmp_path: 
     write(sink, range(1))
     sink.close()
     schema = pq.read_schema(tmp_path / "frames" / "part-00000.parquet")
-    described = message_schema()["$defs"]["_ContactModel"]["properties"]["depth_mm"]["description"]
+    described = message_schema()["$defs"]["Contact"]["properties"]["depth_mm"]["description"]
     assert schema.field("contact_depth_mm").metadata[b"description"].decode() == described
     assert schema.metadata[b"schema"] == b"tactflow.frame/1"
     assert {b"tactflow", b"numpy", b"opencv", b"sensor"} <= set(schema.metadata)
