@@ -310,10 +310,6 @@ def test_one_signal_ends_all_sensors_well(folder: Path, number: int) -> None:
             "left and right would both listen at tcp://127.0.0.1:5557; "
             "give right its own, as sensors.right.sinks.zmq.control",
         ),
-        *[
-            (GRAPH, [option, "new/"], f"{option} new/: required a file, not a folder")
-            for option in ("--jsonl", "--stats")
-        ],
         (GRAPH.replace("rotate: 0", "rotate: 7"), [], "pipeline.yaml:8:28"),
         (GRAPH.replace("  left: {stages:", "  left: {stagse:"), [], "did you mean stages?"),
         (GRAPH.replace("  left:", "  'le ft':"), [], "should be a word of letters"),

@@ -90,15 +90,10 @@ def chunk(data: bytes, compression: str, size: int) -> bytes:
         (zstandard.compress(bytes(100)), "zstd", 1 << 60),
         (b"no such thing", "zstd", 100),
         (b"no such thing", "lz4", 100),
-        (bytes(range(1, 101)), "", 1 << 60),
-        (lz4.frame.compress(bytes(1 << 29)), "lz4", 100),
-        (zstandard.compress(bytes(1 << 24)), "zstd", 1 << 24),
-        (b"\x80" + bytes(8), "", 9 * 2_000_000),
+        (bytes(range(1, 101)), "", 100),
+        (b"unknown", "brotli", 100),
     ],
-    ids=[
-        *("absurd size", "garbage", "lz4 garbage", "plain garbage"),
-        *("larger than it says", "records of kind 0", "too few bytes"),
-    ],
+    ids=["absurd size", "garbage", "lz4 garbage", "plain garbage", "unknown compression"],
 )
 def test_a_chunk_that_cannot_be_unpacked_is_passed_over(
     tmp_path: Path, data: bytes, compression: str, size: int

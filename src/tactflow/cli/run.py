@@ -22,9 +22,8 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
-from tactflow.fleet.names import name_problems, with_name
 from tactflow.fleet.run import run_fleet
-from tactflow.fleet.sinks import added
+from tactflow.fleet.sinks import added, with_name
 from tactflow.system.arguments import positive
 from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
@@ -85,17 +84,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_all(args: argparse.Namespace, file: Path, sensors: Sequence[str]) -> int:
     """Run every sensor in a process of its own."""
-    problems = []
     if args.source is not None:
-        problems.append(
+        raise ConfigError(
             f"--source: the pipeline has {len(sensors)} sensors, each with its own source; choose one with "
             f"--sensor {sensors[0]}, or use --set sensors.NAME.stages.capture.source=..."
         )
-    files = {"--jsonl": args.jsonl, "--video": args.video, "--out": args.out, "--stats": args.stats}
-    named = {option: str(path) for option, path in files.items() if path is not None}
-    problems += name_problems(named, sensors)
-    if problems:
-        raise ConfigError("\n".join(problems))
     sinks = {sensor: _added_sinks(args, sensor) for sensor in sensors}
     pipelines = {sensor: _load(args, file, sensor, sinks[sensor]) for sensor in sensors}
     arguments = {

@@ -12,8 +12,24 @@ from tactflow.config.overrides import as_yaml
 from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.contract import Output, Publication, StageParams
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.fleet.names import STREAMS
 from tactflow.system.files import is_device, status
+
+STREAMS = ("-", "/dev/stdout", "/dev/stderr")
+"""Streams that lead to the supervisor, even if they are redirected to a regular file."""
+
+
+def with_name(path: str, sensor: str) -> str:
+    """The file that one sensor's process writes, given the `path` on the command line.
+
+    Standard output and devices are shared by all.
+
+    >>> with_name("out.jsonl", "left"), with_name("{sensor}/out.jsonl", "left")
+    ('out-left.jsonl', 'left/out.jsonl')
+    """
+    if path in STREAMS or is_device(path):
+        return path
+    name, suffix = os.path.splitext(path)
+    return path.replace(PLACEHOLDER, sensor) if PLACEHOLDER in path else f"{name}-{sensor}{suffix}"
 
 
 class WatchedSink:

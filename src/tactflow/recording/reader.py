@@ -18,9 +18,6 @@ from tactflow.recording.records import (
     read_summary,
 )
 
-MOST_NAMED = 20
-"""Maximum number of topics in a message. Chosen by hand."""
-
 
 @dataclass(frozen=True, slots=True)
 class Contents:
@@ -72,9 +69,9 @@ def _frame_topics(described: Summary) -> tuple[str, str]:
         schema = described.schemas.get(channel.schema_id)
         if schema is not None and schema.name == TYPE_NAME and channel.topic.endswith("/frames"):
             return channel.topic, channel.topic.removesuffix("frames") + "references"
-    topics = list(dict.fromkeys(channel.topic for channel in channels))
+    topics = dict.fromkeys(channel.topic for channel in channels)
     if topics:
-        names = ", ".join(topics[:MOST_NAMED])
+        names = ", ".join([*topics][:20])
         raise ForeignRecordingError(
             f"holds no frames that tactflow recorded; choose by ?topic= one of {names}"
         )

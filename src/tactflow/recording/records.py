@@ -7,8 +7,8 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from importlib import import_module
+from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from typing import BinaryIO
 
 import zstandard
@@ -39,15 +39,9 @@ MAGIC = b"\x89MCAP0\r\n"
 
 LARGEST_CHUNK = 256 << 20
 """Maximum size of an unpacked chunk, bytes: twice a raw 8K picture. Larger ones count as damaged."""
-RECORD_HEAD = 9
-"""Size of the type and length of a record, bytes."""
-MOST_RECORDS = 1_000_000
-"""Maximum number of records of a chunk: hours of a sensor's messages. More count as damage."""
 
 _FOOTER = struct.Struct("<QQI")
 """Offsets of the index and of its offset section, and checksum: the last bytes of a file before `MAGIC`."""
-_PIECE = 1 << 20
-"""Size of the blocks for a checksum, bytes."""
 
 _DATA = (Attachment, Channel, Header, Message, Metadata, Schema)
 """All records outside chunks except the index, which can be derived from the rest."""
@@ -71,35 +65,19 @@ class Damage:
 
 def read_summary(file: BinaryIO) -> Summary | None:
     """The index at the end of the file; None if it is damaged or missing, or the file is not an MCAP file."""
-    size = file.seek(0, io.SEEK_END)
     try:
-        if not _index_is_intact(file, size):
-            return None
+        with mmap(file.fileno(), 0, access=ACCESS_READ) as data, memoryview(data) as view:
+            size = len(view)
+            start, _, checksum = _FOOTER.unpack_from(view, size - _FOOTER.size - len(MAGIC))
+            # From the index to the end, without the checksum itself and the magic bytes.
+            with view[start : -4 - len(MAGIC)] as index:
+                if checksum and zlib.crc32(index) != checksum:
+                    return None
         file.seek(0)
         return SeekingReader(file, record_size_limit=size).get_summary()
     except (*DAMAGE, OSError):
         # The file is shorter than a footer, or does not end with one.
         return None
-
-
-def _index_is_intact(file: BinaryIO, size: int) -> bool:
-    """Verify the checksum of the index, if the footer has one.
-
-    size : of the file, bytes. Raises OSError, ValueError or struct.error if the file is too short.
-    """
-    file.seek(size - _FOOTER.size - len(MAGIC))
-    start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
-    if not checksum:
-        return True
-    file.seek(start)
-    # From the index to the end, without the checksum itself and the magic bytes.
-    remaining, computed = size - start - len(MAGIC) - 4, 0
-    while remaining > 0:
-        piece = file.read(min(remaining, _PIECE))
-        remaining, computed = remaining - len(piece), zlib.crc32(piece, computed)
-        if not piece:
-            return False
-    return bool(computed == checksum)
 
 
 def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
@@ -159,39 +137,11 @@ def _first_behind(place: int, chunks: Sequence[int], size: int) -> int:
 def _unpacked(chunk: Chunk, place: Damage) -> Iterator[McapRecord | Damage]:
     """The records of a chunk, or its location if it is damaged."""
     try:
-        data = _content(chunk)
-        _check_lengths(data)
-        records = breakup_chunk(replace(chunk, data=data, compression=""), validate_crc=True)
+        # Before memory is allocated.
+        if chunk.uncompressed_size > LARGEST_CHUNK:
+            raise ValueError(f"required a chunk of {LARGEST_CHUNK} bytes at most")
+        records = breakup_chunk(chunk, validate_crc=True)
     except DAMAGE:
         yield place
     else:
         yield from records
-
-
-def _content(chunk: Chunk) -> bytes:
-    """Unpack a chunk. Raises ValueError, before memory is allocated, if it is too large."""
-    size = chunk.uncompressed_size
-    if size > LARGEST_CHUNK:
-        raise ValueError(f"required a chunk of {LARGEST_CHUNK} bytes at most, got {size}")
-    # One byte more, to detect a chunk that is larger than stated.
-    if chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
-    elif chunk.compression == "lz4":
-        data = import_module("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    elif chunk.compression:
-        raise ValueError(f"chunks of compression {chunk.compression!r} cannot be read")
-    else:
-        data = chunk.data
-    if len(data) != size:
-        raise ValueError(f"required a chunk of {size} bytes, got {len(data)}")
-    return data
-
-
-def _check_lengths(data: bytes) -> None:
-    """Raise ValueError if a chunk has a record of type 0, which is invalid, or too many records."""
-    at = count = 0
-    while at < len(data):
-        count += 1
-        if data[at] == 0 or count > MOST_RECORDS:
-            raise ValueError("is not a sequence of records")
-        at += RECORD_HEAD + int.from_bytes(data[at + 1 : at + RECORD_HEAD], "little")
