@@ -26,9 +26,11 @@ def pictures(count: int, height: int = 48, width: int = 64) -> list[Pixels]:
 def film(path: Path, shown: list[Pixels], step: float = 0.05, **params: Any) -> Video:
     sink = Video(Video.Params(path=str(path), **params))
     sink.open()
-    for index, picture in enumerate(shown):
-        sink.write(Tick(Frame("main", index, 1e9 + index * step, picture)), picture)
-    sink.close()
+    try:
+        for index, picture in enumerate(shown):
+            sink.write(Tick(Frame("main", index, 1e9 + index * step, picture)), picture)
+    finally:
+        sink.close()
     return sink
 
 

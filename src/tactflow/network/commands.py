@@ -55,6 +55,8 @@ class Commands:
     """
 
     NAMES = ("pause", "step", "reference", "record", "stop")
+    """Pause or resume; let one frame through while paused; take the next frames as a new reference; start or
+    finish a recording; end the run."""
 
     def __init__(self, control: Control | None) -> None:
         self._control = control
@@ -76,28 +78,20 @@ class Commands:
         return None
 
     def execute(self, name: str, on: bool = True) -> Answer:
-        """Pause or resume (on, not on); let one frame through while paused (step); take the next frames as a
-        new reference; start or finish a recording; or stop the run.
+        """Execute a command of `NAMES`. on : False resumes a paused run, or finishes a recording.
 
         Raises RefusedError if `refusal` gives a reason, StageError if the recording cannot be written.
         """
         refusal, control = self.refusal(name), self._control
         if control is None or refusal is not None:
             raise RefusedError(refusal)
-        match name:
-            case "pause":
-                control.pause(on)
-                return {"message": "paused" if on else "running"}
-            case "step":
-                control.step()
-            case "reference":
-                control.retake_reference()
-                return {"message": "the next frame is taken as the reference"}
-            case "record":
-                return self._record(control, on)
-            case "stop":
-                control.stop()
-        return {}
+        if name == "record":
+            return self._record(control, on)
+        if name == "pause":
+            control.pause(on)
+            return {"message": "paused" if on else "running"}
+        {"step": control.step, "reference": control.retake_reference, "stop": control.stop}[name]()
+        return {"message": "the next frame is taken as the reference"} if name == "reference" else {}
 
     def _record(self, control: Control, on: bool) -> Answer:
         recorder = control.recorder()
@@ -155,11 +149,11 @@ class ControlSocket(BoundSocket):
                     # A REQ socket sends a return path, an empty part and the request. Drop anything else.
                     if b"" in parts:
                         end = parts.index(b"") + 1
-                        self.socket.send_multipart([*parts[:end], self._answer(parts[end:])])
+                        self.socket.send_multipart([*parts[:end], self._reply(parts[end:])])
 
-    def _answer(self, request: list[bytes]) -> bytes:
+    def _reply(self, request: list[bytes]) -> bytes:
         try:
-            return self._encoded({"ok": True, **self._carry_out(request)})
+            return self._encoded({"ok": True, **self._answer(request)})
         except (RefusedError, StageError) as error:
             message = str(error)
         except Exception as error:
@@ -171,7 +165,7 @@ class ControlSocket(BoundSocket):
         answer = answer | {"state": {"sensor": self._sensor, **self._commands.state()}}
         return orjson.dumps(answer, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
 
-    def _carry_out(self, request: list[bytes]) -> Answer:
+    def _answer(self, request: list[bytes]) -> Answer:
         try:
             (body,) = request
             name = str(orjson.loads(body)["do"])

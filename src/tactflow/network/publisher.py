@@ -48,20 +48,14 @@ _HINT = (
 class BoundSocket:
     """A bound socket and, if keys are required, its authenticator.
 
-    Parameters
-    ----------
-    kind : ZeroMQ's type of the socket. endpoint : address to bind.
-    hint : advice if the address is in use. options : ZeroMQ's option -> value.
-    keys : the publisher's folder made by `tactflow keys new`: only clients with a key in it are admitted, and
-        everything is encrypted. None admits every client that can reach the address.
+    kind : ZeroMQ's type of the socket. hint : advice if the address is in use. options : ZeroMQ's option ->
+    value. keys : the publisher's folder made by `tactflow keys new`: only clients with a key in it are
+    admitted, and everything is encrypted. None admits every client that can reach the address.
+    socket : to be used by one thread at a time. endpoint : the bound address, with the actual port.
 
     Raises
     ------
     StageError : the address is invalid, in use or cannot be bound, or the keys are wrong.
-
-    Attributes
-    ----------
-    socket : to be used by one thread at a time. endpoint : the bound address, with the actual port.
     """
 
     def __init__(
@@ -114,8 +108,7 @@ def _refuse_taken_path(path: Path) -> None:
 class Publisher(BoundSocket):
     """A bound XPUB socket. Any thread may send; sending never waits for subscribers.
 
-    endpoint, keys, Raises : as for `BoundSocket`. backlog : messages queued for each subscriber at most.
-    subscriptions : number of distinct prefixes that are subscribed to.
+    backlog : messages queued for each subscriber at most. subscriptions : number of distinct prefixes.
     """
 
     def __init__(self, endpoint: str, backlog: int, keys: str | None = None) -> None:

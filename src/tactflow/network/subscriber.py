@@ -115,9 +115,8 @@ class Connection:
 class Subscriber(Connection):
     """Receives results from a running tactflow; a context manager and an iterator of `Result`.
 
-    Use it in one thread at a time. Connecting does not wait: tactflow may start before or after. Only
-    messages published after the connection is established are received. A received result has the content of
-    its message: no pictures, masks or height maps. `result.to_dict()` is the message itself.
+    Use it in one thread at a time. Connecting does not wait: tactflow may start before or after. A received
+    result has the content of its message, `result.to_dict()`: no pictures, masks or height maps.
 
     Parameters
     ----------
@@ -140,9 +139,9 @@ class Subscriber(Connection):
 
     Examples
     --------
-    >>> with Subscriber("tcp://127.0.0.1:5556", latest=True, timeout=5) as results:
-    ...     results.received, results.lost  # `for result in results:` waits for them
-    (0, 0)
+    with tactflow.Subscriber(latest=True, timeout=5) as results:
+        for result in results:
+            print(result.seq, result.contact)
     """
 
     def __init__(
