@@ -1,7 +1,7 @@
-"""What a frame at rest looks like, and whether the light of a camera is steady yet.
+"""Tests on raw frames, before any processing.
 
-`rest` tells from a raw frame which results could differ from those before. `settling` looks at the first
-frames of a source for the untouched gel in steady light.
+`rest` decides which results could differ from those of earlier frames. `settling` searches the first frames
+of a source for the untouched gel in steady light.
 """
 
 from tactflow.vision.change.rest import RestTest

@@ -1,11 +1,11 @@
-"""Does anything touch the gel that did not, has anything moved? A cheap look at a raw frame.
+"""A cheap test on a raw frame: has a contact begun, or has anything moved?
 
 Some lines of the frame are summed over tiles: the light of each channel, and the least-squares displacement
-of the gel's edges (Lucas and Kanade, 1981). The light is tested as `ContactDetector` tests it, against the
-untouched gel under the lamps of this frame. While no tile has changed by half of what is contact, or none
-departs further than when the detector found nothing, the detector would find nothing. Displacements are
-compared with the sensor's own noise, which is learned tile by tile from the differences between frames in a
-row (von Neumann, 1941).
+of the gel's edges (Lucas and Kanade, 1981). The light is tested as in `ContactDetector`, against the
+untouched gel under the illumination of this frame. As long as no tile has changed by half the detection
+threshold, or by more than in a frame without contact, the detector would find nothing. Displacements are
+compared with the sensor's own noise, which is learned tile by tile from the differences of consecutive frames
+(von Neumann, 1941).
 """
 
 from __future__ import annotations
@@ -26,26 +26,27 @@ from tactflow.vision.contact.components import WIDE_DEVIATION
 from tactflow.vision.contact.illumination import positions
 
 TILES: Final = 24
-"""Tiles along the longer side of a frame: a contact of 4 % of its width fills one. A smaller
-spot that has no colour may pass unseen."""
+"""Tiles along the longer side of a frame: a contact of 4 % of its width fills one. A smaller spot without
+colour may be missed."""
 READ: Final = 250_000
-"""Bytes of a frame that are read: all of a small one, a sixth of 800 x 600 px. More cost time."""
+"""Bytes of a frame that are read: all of a small one, a sixth of 800 x 600 px. More would cost time."""
 LINES: Final = 6
-"""Lines of a tile that are read at least. A third of all is evenly spaced, so that no contact falls between
-them; the others are those with the strongest edges, which show best how far the gel has moved."""
+"""Minimum number of lines that are read per tile. A third of the lines is evenly spaced, so that no contact
+falls between them; the others are those with the strongest edges, which show motion best."""
 NOISE: Final = 1.0
-"""Standard deviation of a tile's light, grey levels: compression moves it by up to as much."""
+"""Standard deviation of a tile's light, grey levels: compression changes it by up to as much."""
 STRAY: Final = 0.077
-"""How far the untouched gel moves against the camera, tiles: the detector's 1 px of 300."""
+"""Movement of the untouched gel against the camera, tiles: the detector's 1 px of 300."""
 ALIKE: Final = 0.05
-"""Part of the threshold by which a departure that showed no contact may grow. At 0 to 0.05 none of 360 real
+"""Tolerated growth of a deviation that showed no contact, in thresholds. At 0 to 0.05 none of 360 real
 contacts begins late, at 0.1 one does; at 0 flicker and noise cost 2 % of the frames at rest."""
 NEAR: Final = 3
 """Width of the windows in which a displacement is measured, tiles."""
 BLOCK: Final = 8
-"""Differences of frames from which noise is learned, and half as many at first."""
+"""Number of frame differences per estimate of the noise; half as many for the first one."""
 BLOCKS: Final = 5
-"""Blocks whose median is the noise, so that motion in two of them does not count: a second or so."""
+"""Number of estimates whose median is the noise, so that motion in two of them has no effect: about a
+second."""
 SHIFT: Final = 0.05
 """px: tolerance of the dots' positions."""
 ROUNDING: Final = 1 / 12
@@ -53,40 +54,40 @@ ROUNDING: Final = 1 / 12
 
 
 class Look(NamedTuple):
-    """What a frame needs.
+    """What has to be computed for a frame.
 
     changed : whether anything may have moved by more than the tolerance; if not, all results are repeated.
-    suspect : whether something may touch the gel that did not in the last frame that was worked on in full;
-        implies `changed`. If not, the contact stays, and only the dots are looked at.
+    suspect : whether a contact may have begun since the last frame that was processed in full; implies
+        `changed`. If not, the contact stays the same, and only the dots are measured.
     """
 
     changed: bool
     suspect: bool
 
 
-class _Seen(NamedTuple):
-    """What a frame shows. departure : (rows, columns) float32, of the light from that of the untouched gel;
-    from 1 on, it has changed. shift : (2, rows, columns) float32, of the edges along x and y, in units of
-    `_px_per_edge`, in which noise is the same everywhere."""
+class _Measurement(NamedTuple):
+    """Measurements of a frame. departure : (rows, columns) float32, deviation of the light from that of the
+    untouched gel, in thresholds. shift : (2, rows, columns) float32, of the edges along x and y, in units of
+    `_px_per_edge`, in which the noise is uniform."""
 
     departure: Floats32
     shift: Floats32
 
 
 class RestTest:
-    """Tells from a raw frame what of its results could differ from those of the frames before.
+    """Decides from a raw frame which of its results could differ from those of earlier frames.
 
-    A contact may begin only where the light departs further from that of the untouched gel than the contact
-    test allows, and further than in the last frame that was worked on in full and showed no contact: a gel
-    that creeps back does not begin one. While something touches, every frame is worked on in full. Dots have
-    moved if edges near them have, by the sensor's own noise, since the last frame in which they were looked
-    at; on a sensor with which 0.05 px cannot be told from noise, they always may have.
+    A contact can begin only where the light deviates from that of the untouched gel by more than the contact
+    test allows, and by more than in the last frame that was processed in full and showed no contact: a gel
+    that creeps back does not begin one. During contact, every frame is processed in full. Dots have moved if
+    edges near them have, beyond the sensor's own noise, since the last frame in which they were measured; on
+    a sensor whose noise hides 0.05 px, they always may have.
 
     frame : (H, W, 3) uint8 BGR, the untouched gel.
-    repeatability, tint : as of `ContactDetector`.
-    false_alarms : share of still frames in which the dots are looked at all the same, in (0, 0.5].
+    repeatability, tint : see `ContactDetector`.
+    false_alarms : share of still frames in which the dots are measured nevertheless, in (0, 0.5].
 
-    Raises ValueError for a frame of another kind or shape, or a parameter out of range.
+    Raises ValueError for a frame of another type or shape, or a parameter out of range.
 
     >>> still = np.full((48, 64, 3), 100, np.uint8)
     >>> test = RestTest(still)
@@ -126,7 +127,7 @@ class RestTest:
         self._z = np.float32(-NormalDist().inv_cdf(false_alarms / (4 * rows * columns)))
         self._light = _LightTest(self._sums(frame)[:3] / np.float32(self._pixels), repeatability, tint)
         self._frame: NDArray[np.uint8] | None = None
-        self._last: _Seen | None = None
+        self._last: _Measurement | None = None
         self._allowed: Floats32 | None = None
         self._followed: Floats32 | None = None
         self._steps: list[Floats32] = []
@@ -134,25 +135,25 @@ class RestTest:
         self._bound: Floats32 | None = None
 
     def look(self, frame: NDArray[np.uint8], *, touching: bool = False, due: bool = False) -> Look:
-        """Compare a frame with those before.
+        """Compare a frame with the earlier ones.
 
-        frame : of the first one's shape. It is kept until the next, and must not be written to meanwhile.
-        touching : whether something touched the gel in the frame before. due : that the frame is worked on
-        in full whatever it shows.
+        frame : of the first one's shape. It is kept until the next call and must not be modified until then.
+        touching : whether the previous frame showed contact. due : whether the frame will be processed in
+        full in any case.
         """
         check_color_image(frame)
         if frame.shape != self._shape:
             raise ValueError(f"required a frame of shape {self._shape}, got {frame.shape}")
         before, self._frame = self._frame, frame
         if touching:
-            # Nothing is looked at, and the rest begins anew behind the contact.
+            # Measure nothing; start over after the contact.
             self._last = None
             return Look(True, True)
         if self._last is None and before is not None:
-            # In the frame before, nothing touched any more.
-            self._last = self._see(before)
+            # The contact had ended in the previous frame.
+            self._last = self._measure(before)
             self._allowed, self._followed = self._last
-        last, self._last = self._last, (now := self._see(frame))
+        last, self._last = self._last, (now := self._measure(frame))
         if before is None or last is None or self._allowed is None or self._followed is None:
             self._allowed, self._followed = now
             return Look(True, True)
@@ -161,47 +162,46 @@ class RestTest:
         elif not due:
             return Look(False, False)
         suspect = due or bool((now.departure > np.maximum(self._allowed + np.float32(ALIKE), 1)).any())
-        # What has crept back may not come again unseen.
+        # A deviation that has crept back must not return unnoticed.
         self._allowed = now.departure if suspect else np.minimum(self._allowed, now.departure)
         moved = self._bound is None or bool((np.abs(now.shift - self._followed) > self._bound).any())
         if suspect or moved:
             self._followed = now.shift
         return Look(suspect or moved, suspect)
 
-    def _see(self, frame: NDArray[np.uint8]) -> _Seen:
-        """Measure a frame."""
+    def _measure(self, frame: NDArray[np.uint8]) -> _Measurement:
         sums = self._sums(frame)
         departure = self._light.departure(sums[:3] / np.float32(self._pixels))
-        return _Seen(departure, _near(sums[3:]) * self._px_per_edge)
+        return _Measurement(departure, _near(sums[3:]) * self._px_per_edge)
 
     def _sums(self, frame: NDArray[np.uint8]) -> Floats32:
-        """(5, rows, columns): as of `sum_tiles`."""
+        """(5, rows, columns), see `sum_tiles`."""
         sums = np.empty((5, *self._px_per_edge.shape[1:]), np.float32)
         lines = frame[self._used].reshape(len(self._resting), -1)
         sum_tiles(lines, self._resting, self._slopes, sums)
         return sums
 
     def _learn(self, step: Floats32) -> None:
-        """Take in how the displacements of two frames in a row differ."""
+        """Update the noise with the difference of displacements in two consecutive frames."""
         self._steps.append(step)
         if len(self._steps) < (BLOCK if self._variances else BLOCK // 2):
             return
-        # A steady drag is no noise.
-        seen = np.var(self._steps, axis=0) / np.float32(2)
+        # The variance excludes a steady drag.
+        variance = np.var(self._steps, axis=0) / np.float32(2)
         self._steps.clear()
-        # Neighbouring tiles are alike; one that is much louder than they are is louder.
-        near = np.stack([cv2.blur(plane, (5, 5)) for plane in seen])
-        self._variances.append(np.maximum(np.maximum(near, seen / 2), np.float32(ROUNDING / NEAR**2)))
+        # Neighbouring tiles are alike, except for one that is much noisier.
+        near = np.stack([cv2.blur(plane, (5, 5)) for plane in variance])
+        self._variances.append(np.maximum(np.maximum(near, variance / 2), np.float32(ROUNDING / NEAR**2)))
         bound = self._z * np.sqrt(2 * np.median(self._variances, axis=0))
         shifts = bound * self._px_per_edge
         self._bound = np.asarray(bound, np.float32) if np.median(shifts) <= SHIFT else None
 
 
 class _LightTest:
-    """The test of `ContactDetector`, on tiles instead of its cells; a departure of 1 is half of a contact's.
+    """The test of `ContactDetector` on tiles instead of cells; its threshold is half of the detector's.
 
-    untouched : (3, rows, columns) float32, light of the untouched gel, grey levels. repeatability, tint : as
-    of `ContactDetector`.
+    untouched : (3, rows, columns) float32, light of the untouched gel, grey levels. repeatability, tint : see
+    `ContactDetector`.
     """
 
     def __init__(self, untouched: Floats32, repeatability: float, tint: float) -> None:
@@ -211,7 +211,7 @@ class _LightTest:
         self._before = np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)
 
     def departure(self, light: Floats32) -> Floats32:
-        """(rows, columns) float32: how far the light of a frame, (3, rows, columns), departs."""
+        """Deviation (rows, columns) float32 of the light of a frame, (3, rows, columns), in thresholds."""
         _, high, wide = light.shape
         planes = np.empty((3, high, wide), np.float32)
         known, places = self._known, (positions(wide), positions(high))
@@ -221,20 +221,20 @@ class _LightTest:
 
 
 def _slopes(plane: Floats32) -> Floats32:
-    """(2, h, w): how much a plane (h, w) rises along x and y."""
+    """Gradient (2, h, w) of a plane (h, w) along x and y."""
     axes = ((1, 0), (0, 1))
     border = cv2.BORDER_REPLICATE
     return np.stack([cv2.Sobel(plane, cv2.CV_32F, *axis, scale=1 / 8, borderType=border) for axis in axes])
 
 
 def _near(sums: Floats32) -> Floats32:
-    """Means of planes (2, rows, columns) over windows of `NEAR` tiles; outside of the frame lies nothing."""
+    """Means of planes (2, rows, columns) over windows of `NEAR` tiles; values outside the frame are 0."""
     size, border = (NEAR, NEAR), cv2.BORDER_CONSTANT
     return np.stack([cv2.blur(plane, size, borderType=border) for plane in sums])
 
 
 def _used_lines(energy: Floats32, number: int) -> NDArray[np.intp]:
-    """The lines that are read, ascending: so many of each row of tiles.
+    """The lines that are read, ascending: `number` lines in each row of tiles.
 
     energy : (rows, lines of a tile), >= 0, of the edges in each line.
     """
@@ -253,7 +253,7 @@ def sum_tiles(lines: NDArray[np.uint8], resting: NDArray[np.uint8], slopes: Floa
     """Sums over tiles of blue, green and red, and of the change of green times its slopes along x and y.
 
     lines : (n * rows, m * columns * 3), n < 258. resting : (n * rows, m * columns), green of the untouched
-    gel. slopes : (2, n * rows, m * columns), levels per px. sums : (5, rows, columns), to be written.
+    gel. slopes : (2, n * rows, m * columns), levels per px. sums : (5, rows, columns), filled.
     """
     _, rows, columns = sums.shape
     thick, wide = resting.shape[0] // rows, resting.shape[1] // columns

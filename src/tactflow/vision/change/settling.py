@@ -1,4 +1,4 @@
-"""The first frames of a camera: from when on is its light steady, and which frame shows the untouched gel?"""
+"""The first frames of a camera: find when its light is steady, and the frame that shows the untouched gel."""
 
 from __future__ import annotations
 
@@ -16,58 +16,59 @@ COLUMNS: Final = 40
 SIDE: Final = 4
 """Samples along the side of a cell. Sixteen of them take the noise of a pixel down to a quarter."""
 DARK, BRIGHT = 8, 247
-"""Grey levels up to which a sample is taken for black, and from which for saturated: such a one does not
-follow the exposure. Chosen by hand."""
+"""Grey levels below which a sample is black and above which it is saturated: it does not follow the exposure.
+Chosen by hand."""
 CLIPPED: Final = 0.1
-"""Share of such samples from which a cell is left out. Chosen by hand."""
+"""Share of such samples from which a cell is ignored. Chosen by hand."""
 
 CALM: Final = 0.4
-"""For how long frames in a row must be alike before the light counts as steady, s. Chosen on franka_mini,
-whose first frames may still show the grasp before, for at most 0.32 s."""
+"""Duration for which consecutive frames must be alike for the light to be steady, s. Chosen on franka_mini,
+whose first frames may show the previous grasp for up to 0.32 s."""
 FEWEST, MOST = 4, 10
-"""How many frames these are at least, so that they tell a trend, and at most, for a camera sets its exposure
-from frame to frame. The least was chosen on every second recording of franka_mini, with two of three and
-three of four frames left out."""
+"""Minimum number of these frames, so that they reveal a trend, and maximum, because a camera sets its
+exposure from frame to frame. The minimum was chosen on every second recording of franka_mini, with two of
+three and three of four frames left out."""
 SHORT: Final = 0.4
-"""Part of these frames that a state of the gel must last to be considered at all. Chosen by hand."""
+"""Minimum length of a state of the gel, as a fraction of these frames. Chosen by hand."""
 STEADY: Final = 0.02
-"""Relative change of a channel that is steady: less than what a contact must exceed (`repeatability`)."""
+"""Maximum relative change of a channel in steady light: less than that of a contact (`repeatability`)."""
 SCATTER: Final = 2.5
-"""The same in standard deviations of a light that flickers. Chosen by hand."""
+"""The same for flickering light, in standard deviations. Chosen by hand."""
 UNRELATED: Final = 1.0
-"""Ratio of the squared changes from frame to frame to the squared deviations from the mean, above which
-frames scatter without a trend. It is 2 for frames that are independent; in ten of them it falls below 1.06 by
-chance once in twenty times (J. von Neumann, Annals of Mathematical Statistics 12, 1941)."""
+"""Ratio of the squared changes from frame to frame to the squared deviations from the mean above which frames
+scatter without a trend. It is 2 for independent frames; in ten of them it falls below 1.06 by chance once in
+twenty times (J. von Neumann, Annals of Mathematical Statistics 12, 1941)."""
 LOCAL: Final = 0.06
-"""Relative change of a place against the rest of the picture from which something moved there, after a mean
+"""Minimum relative change of a cell against the rest of the picture if something moved there, after a mean
 over 3 x 3 cells. Chosen on franka_mini: key frames of its compression stay below."""
 MOVED: Final = 0.01
-"""Share of the cells that must have moved. Chosen by hand."""
+"""Minimum share of cells that moved. Chosen by hand."""
 SMOOTH: Final = 3
-"""Degree of the polynomial in x and y that follows the light of an untouched gel. Chosen by hand."""
+"""Degree of the polynomial in x and y that models the light of an untouched gel. Chosen by hand."""
 MEDIAN: Final = 5
-"""Side, cells, of the median filter that takes dots out. Chosen by hand."""
+"""Side of the median filter that removes dots, cells. Chosen by hand."""
 EVENER: Final = 0.8
-"""Ratio of two states' unevenness below which the evener one is the untouched gel, where the light was still
-changing, or the first state so brief that it may be the end of a touch. Chosen on franka_mini: a gel that is
-touched has 1.2 to 50 times the unevenness of the same gel at rest, and for faint contacts at least 0.9."""
+"""Ratio of two states' unevenness below which the evener one is the untouched gel, if the light was still
+changing, or if the first state is so brief that it may be the end of a touch. Chosen on franka_mini: a
+touched gel has 1.2 to 50 times the unevenness of the same gel at rest, and for faint contacts at least
+0.9."""
 MUCH_EVENER: Final = 0.5
-"""The same where nothing but this speaks for the later state. Chosen by hand."""
+"""The same if there is no other reason to prefer the later state. Chosen by hand."""
 AS_EVEN: Final = 1.5
 """Ratio up to which a state with steady light is preferred to one whose light was changing. Chosen on
 franka_mini, where darker pictures have less contrast."""
 
 
 class Look(NamedTuple):
-    """What is kept of a frame: light : (h, w, channels) float32, logarithm of the mean of each cell. seen :
-    the same shape, bool, whether it is neither black nor saturated."""
+    """Summary of a frame. light : (h, w, channels) float32, logarithm of the mean of each cell. seen : bool
+    of the same shape, whether the cell is neither black nor saturated."""
 
     light: Floats32
     seen: NDArray[np.bool_]
 
 
 def look_at(frame: NDArray[np.uint8]) -> Look:
-    """Sample a frame sparsely: some 160 x 120 of its pixels, whatever its size.
+    """Sample a frame sparsely: about 160 x 120 of its pixels, whatever its size.
 
     frame : (H, W) or (H, W, channels) uint8.
 
@@ -87,10 +88,10 @@ def look_at(frame: NDArray[np.uint8]) -> Look:
 
 
 def change_between(before: Look, after: Look) -> tuple[Floats32, bool]:
-    """How the light changed from one frame to another, and whether anything else did.
+    """Change of the light from one frame to another, and whether anything moved.
 
-    Returns the logarithm of each channel's gain, (channels,) float32: the median over the picture, which an
-    object that covers less than half of it does not move; and whether places changed against it.
+    Returns the logarithm of each channel's gain, (channels,) float32, the median over the picture, which is
+    robust against an object that covers less than half of it; and whether cells changed relative to it.
     """
     both = before.seen & after.seen
     change = np.where(both, after.light - before.light, np.float32(np.nan))
@@ -103,11 +104,11 @@ def change_between(before: Look, after: Look) -> tuple[Floats32, bool]:
 
 
 def unevenness(look: Look) -> float:
-    """How much the light of a gel deviates from a smooth course over the picture, dots left out.
+    """Deviation of the light of a gel from a smooth polynomial over the picture, ignoring dots.
 
-    Whatever touches a gel bends its surface, which makes parts of it brighter, darker or of another colour.
-    Returns the mean squared residual of a polynomial in x and y, in squared relative changes, summed over the
-    channels; infinite if too little of the picture is seen.
+    An object that touches a gel bends its surface, which changes brightness and colour locally. Returns the
+    mean squared residual of a polynomial in x and y, in squared relative changes, summed over the channels;
+    infinite if too few cells are usable.
     """
     basis = _polynomials(*look.light.shape[:2])
     residuals = []
@@ -130,13 +131,13 @@ def _polynomials(high: int, wide: int) -> Floats32:
 
 
 class Settling:
-    """Looks at the first frames of a source, until the light is steady.
+    """Examines the first frames of a source until the light is steady.
 
-    A camera sets exposure and white balance during its first frames, and some still show what was before.
-    Frames in a row that differ by the light alone, a gain for each channel, form a *state* of the gel;
-    another one begins when something moves. The frame that later ones are best compared with is one with
-    steady light, of the state that shows the untouched gel: the first one, unless a later state is much
-    evener, or is as even and has the steady light that the first one had not.
+    A camera sets exposure and white balance during its first frames, and some still deliver older pictures.
+    Consecutive frames that differ only by a gain for each channel form a *state* of the gel; a new state
+    begins when something moves. The best reference has steady light and belongs to the state that shows the
+    untouched gel: the first one, unless a later state is much evener, or is as even and has steady light
+    while the first one had not.
 
     Examples
     --------
@@ -158,7 +159,7 @@ class Settling:
         return len(self._looks)
 
     def add(self, frame: NDArray[np.uint8], t: float) -> None:
-        """Look at the next frame, taken at t, s: (H, W) or (H, W, channels) uint8, all of one size."""
+        """Add the next frame, taken at t, s: (H, W) or (H, W, channels) uint8, all of one size."""
         now, index = look_at(frame), len(self._looks)
         if index == 0:
             gain, moved = np.zeros(now.light.shape[2], np.float32), True
@@ -175,13 +176,13 @@ class Settling:
 
     @property
     def _calm(self) -> int:
-        """How many frames in a row must be alike: those of the time `CALM`."""
+        """Number of consecutive frames that must be alike: those within the time `CALM`."""
         step = float(np.median(np.diff(self._times))) if len(self) > 1 else 0.0
         return int(np.clip(round(CALM / step), FEWEST, MOST)) if step > 0 else MOST
 
     @property
     def _short(self) -> int:
-        """How many frames a state must last to be considered."""
+        """Minimum number of frames of a state."""
         return round(SHORT * self._calm)
 
     @property
@@ -191,7 +192,7 @@ class Settling:
 
     @property
     def touched(self) -> bool:
-        """Whether the light was steady from the first frame on, until something touched the gel."""
+        """Whether the light was steady from the first frame until something touched the gel."""
         first, *later = self._states
         if not later or len(first) < self._short:
             return False
@@ -200,9 +201,9 @@ class Settling:
 
     @property
     def undecided(self) -> bool:
-        """Whether the gel came to rest in another state than the first, which is taken all the same.
+        """Whether the gel came to rest in another state than the first, although the first one is chosen.
 
-        Its evenness does not tell which of the two is the untouched gel.
+        Their evenness does not reveal which of the two is the untouched gel.
         """
         if not self.steady or self.touched or self.best() not in self._states[0]:
             return False
@@ -215,7 +216,7 @@ class Settling:
 
     @property
     def scattered(self) -> bool:
-        """Whether most frames show the gel in another state than the one before."""
+        """Whether most frames show another state of the gel than the previous frame."""
         return len(self) > 1 and 2 * len(self._states) > len(self)
 
     @property
@@ -225,12 +226,12 @@ class Settling:
 
     @property
     def changing(self) -> bool:
-        """Whether frames in a row show the same gel, but in a light that is not steady."""
+        """Whether consecutive frames show the same gel in unsteady light."""
         return not self.steady and len(self._states[-1]) >= self._calm
 
     @property
     def drift(self) -> float:
-        """By how much the light of a channel changed over the last frames, relative."""
+        """Largest relative change of a channel over the last frames."""
         gains = np.array(self._gains[-self._calm :])
         return float(np.expm1(np.ptp(gains, axis=0).max()))
 
@@ -239,10 +240,8 @@ class Settling:
         return index not in self._states[0]
 
     def best(self) -> int:
-        """Index of the frame that shows the untouched gel in steady light; the first one where it is as good.
-
-        Of all such frames it is the most typical one.
-        """
+        """Index of the most typical frame of the untouched gel in steady light; 0 if the first is one of
+        them."""
         calm = self.alike()
         if calm[0] == 0:
             return 0
@@ -284,13 +283,13 @@ class Settling:
         return bool(np.all((np.ptp(gains, axis=0) < STEADY) | (steps > UNRELATED * scatter)))
 
     def _level(self, state: list[int]) -> tuple[Floats32, Floats32]:
-        """Where the light of a state ends, and how far from there it is still the same: (channels,) each."""
+        """Final light of a state, and its tolerance: (channels,) each."""
         gains = np.array([self._gains[i] for i in state[-self._calm :]])
         level = np.median(gains, axis=0)
         spread = np.float32(MAD_TO_SIGMA) * np.median(np.abs(gains - level), axis=0)
         return level, np.maximum(np.float32(STEADY), np.float32(SCATTER) * spread)
 
     def _calm_frames(self, state: list[int]) -> list[int]:
-        """The frames of a state that have the light of its end."""
+        """The frames of a state in its final light."""
         level, tolerance = self._level(state)
         return [i for i in state if np.all(np.abs(self._gains[i] - level) <= tolerance)]

@@ -1,7 +1,7 @@
-"""Background model of a gel: what it looks like untouched, and how unusual a frame is beside that.
+"""Background model of a gel: its mean and noise when untouched, and how far a frame deviates from them.
 
-Frames are compared as means over cells of 4 x 4 px, lightly smoothed; where a contact is to be outlined, as
-means over 2 x 2 px.
+Frames are compared as means over cells of 4 x 4 px, lightly smoothed; to outline a contact, as means over
+2 x 2 px.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from tactflow.vision.geometry.valid_area import lit_area
 CELL: Final = 4
 """Side of a cell, px: averages 16 pixels, so that noise of 2 grey levels is half a level."""
 PRIOR_FRAMES: Final = 8
-"""Number of frames that the noise guessed from the first frame's own grain counts for. Chosen by hand."""
+"""Weight, in frames, of the noise that is estimated from the grain of the first frame. Chosen by hand."""
 QUANTISATION: Final = 12**-0.5
 """Standard deviation of rounding to whole grey levels, grey levels: that of a uniform variable of width 1."""
 BRIGHTNESS_BINS: Final = 6
-"""Ranges of brightness for which noise is guessed separately: shot noise grows with the light. By hand."""
+"""Brightness ranges whose noise is estimated separately: shot noise grows with the light. Chosen by hand."""
 NOISE_CORRELATION: Final = 2.0
-"""How much less than white noise the guessed noise shrinks by smoothing: demosaicing and video compression
-leave little noise between neighbours, and more over distances. Chosen by hand."""
+"""Ratio of the noise left by smoothing to that of white noise: demosaicing and video compression correlate
+neighbouring pixels. Chosen by hand."""
 CELL_VALID: Final = 128
-"""Mean of a valid area, 0 to 255, over a cell that counts, at least: half of it."""
+"""Minimum mean of the valid area, 0 to 255, over a cell that counts: half of the cell."""
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
 _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
-"""What `weigh_change` takes where nothing was in contact in the previous frame."""
+"""Arguments of `weigh_change` without contact in the previous frame."""
 
 
 class Change(NamedTuple):
@@ -51,10 +51,9 @@ class Change(NamedTuple):
     half : (2h, 2w, 3) uint8, the frame at half resolution. cells : (3, h, w) float32, grey levels.
     illumination : (3, 4) float32, coefficients of `IlluminationModel.fit`. squared : (h, w) float32, squared
     deviation of each cell, chi-square with three degrees of freedom where nothing touches. colour : the
-    same of its colour alone, with two. evidence : the larger of both. largest, largest_colour : of `squared`
-    and `colour`.
-    remaining : ratio of this change to that of the previous frame, over the cells that were in contact then;
-    1 if none was.
+    same for colour alone, with two degrees of freedom. evidence : the larger of the two. largest,
+    largest_colour : maxima of `squared` and `colour`. remaining : ratio of this change to that of the
+    previous frame, over the cells that were in contact then; 1 if none was.
     """
 
     half: NDArray[np.uint8]
@@ -70,10 +69,10 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Untouched:
-    """What outlines are compared with, (h, 3 w) float32 each, at half resolution.
+    """The untouched gel at half resolution, for outlines; (h, 3 w) float32 each.
 
-    mean : grey levels. scale : turns grey levels into standard deviations. pattern : part of such a change
-    that is left out, as `scaled_change` takes it.
+    mean : grey levels. scale : one over the standard deviation. pattern : direction in which a change is
+    ignored, see `scaled_change`.
     """
 
     mean: Floats32
@@ -83,11 +82,11 @@ class _Untouched:
 
 @dataclass(frozen=True, slots=True)
 class Derived:
-    """What follows from what is known of the untouched gel: (3, h, w) float32 of cells.
+    """Quantities derived from the mean and noise of the untouched gel; (3, h, w) float32 of cells.
 
-    weight : one over the standard deviation. brightness : (h, w), one over the squared length of the mean, so
-    weighed. colour_factor : (h, w), how much more a change of colour counts than one of brightness. scale :
-    (h, w), one over the standard deviation for `signed_change`; 0 where the light tells nothing.
+    weight : one over the standard deviation. brightness : (h, w), one over the squared length of the weighted
+    mean. colour_factor : (h, w), how much more a change of colour counts than one of brightness. scale :
+    (h, w), one over the standard deviation for `signed_change`; 0 where the light is not informative.
     """
 
     illumination: IlluminationModel
@@ -106,13 +105,13 @@ class Derived:
         tint: float,
         gel: NDArray[np.bool_] | None = None,
     ) -> Derived:
-        """mean : grey levels. steady : variance of what does not grow with the light, of the same shape.
-        repeatability, tint : as of `ContactDetector`. gel : (h, w) bool, cells that show it; None: all do.
+        """mean : grey levels. steady : variance that does not grow with the light, of the same shape.
+        repeatability, tint : see `ContactDetector`. gel : (h, w) bool, cells that show it; None: all do.
         """
         variance = steady + (repeatability * mean) ** 2
         illumination = IlluminationModel(mean, np.asarray(variance, np.float32), gel)
         weight = 1 / np.sqrt(variance)
-        # One factor for all channels, so that a change in proportion to the brightness is none of colour.
+        # One factor for all channels: a change in proportion to the brightness must not count as colour.
         factor = (variance / (steady + (tint * mean) ** 2)).min(axis=0)
         length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
         scale = 1 / np.sqrt(steady.max(axis=0) + (repeatability * mean.mean()) ** 2)
@@ -130,16 +129,16 @@ class Derived:
 
 
 class BackgroundModel:
-    """Mean and noise of a gel that nothing touches, learned from one frame or several.
+    """Mean and noise of an untouched gel, learned from one frame or several.
 
-    Computed in float32, relative 1e-5.
+    Computed in float32, with a relative error of 1e-5.
 
     Parameters
     ----------
     image : (H, W, 3) uint8, BGR grey levels, without markers.
-    repeatability, tint, shift : as `ContactDetector` takes them.
-    valid : (H, W) uint8, 0 where no gel is. Cells there never differ, nor do those where the gel is black, as
-        the light says nothing there. None: all cells show gel.
+    repeatability, tint, shift : see `ContactDetector`.
+    valid : (H, W) uint8, 0 where there is no gel. Cells there never differ, and neither do cells where the
+        gel is black. None: all cells show gel.
 
     Examples
     --------
@@ -173,7 +172,7 @@ class BackgroundModel:
         self._untouched: _Untouched | None = None
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Learn from one more frame of the same size; the more, the better the noise is known."""
+        """Learn from one more frame of the same size; more frames estimate the noise better."""
         known = self._derived()
         half = _halved(image)
         smooth = _smoothed(half)
@@ -190,14 +189,14 @@ class BackgroundModel:
     def compare(
         self, image: NDArray[np.uint8], before: NDArray[np.bool_] | None, evidence_before: Floats32 | None
     ) -> Change:
-        """How a frame of the same size differs.
+        """Compare a frame of the same size with the background.
 
-        before : (h, w) bool, cells in contact in the previous frame; None if none was. evidence_before :
-        (h, w) float32, the previous frame's evidence.
+        before : (h, w) bool, cells in contact in the previous frame; None if there were none.
+        evidence_before : (h, w) float32, the previous frame's evidence.
         """
         known = self._derived()
         if self._untouched is None:
-            # At the reference: the first frame with contact shall not wait for it.
+            # Computed with the reference, so that the first frame with contact does not wait for it.
             self._untouched = self._compared_with()
         high, wide = known.colour_factor.shape
         half = _halved(image)
@@ -227,11 +226,11 @@ class BackgroundModel:
         )
 
     def signed_change(self, change: Change) -> Floats32:
-        """(3, h, w): how each cell has changed, in standard deviations that are the same for all channels.
+        """Signed change of each cell, (3, h, w), in standard deviations that are the same for all channels.
 
-        change : of this frame. 0 where the light tells nothing. How far the light varies is taken from the
-        brightness of the whole picture: relative to itself, a dark channel that a tilt lights up would
-        outshine the others.
+        change : of this frame. The result is 0 where the light is not informative. The variation of the light
+        is relative to the brightness of the whole picture: relative to its own, a dark channel that a tilt
+        lights up would dominate the others.
         """
         known = self._derived()
         expected = under_illumination(known.mean, change.illumination)
@@ -240,10 +239,10 @@ class BackgroundModel:
     def window_change(
         self, change: Change, rows: slice, columns: slice, inside: NDArray[np.bool_]
     ) -> Floats32:
-        """How a window has changed: (2 h, 2 w, 3) float32, at half resolution, in standard deviations.
+        """Signed change in a window, (2 h, 2 w, 3) float32, at half resolution, in standard deviations.
 
-        change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, which of its cells
-        count; the others have not changed.
+        change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, the cells of it that
+        count; the result is 0 in the others.
         """
         assert self._untouched is not None
         high, wide = 2 * inside.shape[0], 2 * inside.shape[1]
@@ -276,11 +275,11 @@ class BackgroundModel:
         return self._known
 
     def _compared_with(self) -> _Untouched:
-        """What outlines are compared with.
+        """The untouched gel at half resolution, for outlines.
 
-        How far the light varies is taken from the brightness of the whole picture, as for `signed_change`.
-        Where a pattern on the gel has moved, all channels change in proportion: in that direction e, standard
-        deviations, the variance is 1 + e^2, in others still 1.
+        The variation of the light is relative to the brightness of the whole picture, as in `signed_change`.
+        Where a pattern on the gel has moved, all channels change in proportion: in that direction, of length
+        e in standard deviations, the variance is 1 + e^2, in all others it remains 1.
         """
         mean, shift = self._half, self._shift / 2
         light = self._repeatability * mean.mean()
@@ -314,7 +313,7 @@ def _smoothed(half: NDArray[np.uint8]) -> Floats32:
 
 
 def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Means over 2 x 2 px; the border is repeated to make whole cells."""
+    """Means over 2 x 2 px; the border is replicated to make whole cells."""
     bottom, right = -image.shape[0] % CELL, -image.shape[1] % CELL
     whole = np.ascontiguousarray(image)
     if bottom or right:
@@ -323,7 +322,7 @@ def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
-    """Cells (h, w) that show gel and have light; None where all do. half : the gel at half resolution."""
+    """Cells (h, w) that show lit gel; None if all do. half : the gel at half resolution."""
     if valid is None:
         return None
     gel = lit_area(half)[::2, ::2]
@@ -334,15 +333,13 @@ def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDAr
 
 
 def _steepness(planes: Floats32) -> Floats32:
-    """Grey levels per cell by which the brightness changes, here or in the cells around; (3, h, w)."""
+    """Largest gradient of the brightness in 3 x 3 cells, grey levels per cell; (3, h, w)."""
     return np.stack([_length_around(*_gradient(plane)) for plane in planes])
 
 
 def _steepness_of_pattern(planes: Floats32) -> tuple[Floats32, Floats32]:
-    """Grey levels per cell by which all channels change in proportion, and those by which each does beside.
-
-    As `_steepness`.
-    """
+    """The part of `_steepness` in which all channels change in proportion, and the remainder of each channel;
+    (3, h, w) each."""
     gradients = [_gradient(plane) for plane in planes]
     total = np.maximum(planes.sum(axis=0), np.float32(1))
     across, down = (np.asarray(sum(parts) / total, np.float32) for parts in zip(*gradients, strict=True))
@@ -354,22 +351,22 @@ def _steepness_of_pattern(planes: Floats32) -> tuple[Floats32, Floats32]:
 
 
 def _gradient(plane: Floats32) -> tuple[Floats32, Floats32]:
-    """Changes per cell along x and y, (h, w) each."""
+    """Gradient per cell along x and y, (h, w) each."""
     across = cv2.Scharr(plane, cv2.CV_32F, 1, 0, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
     down = cv2.Scharr(plane, cv2.CV_32F, 0, 1, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(across, np.float32), np.asarray(down, np.float32)
 
 
 def _length_around(across: Floats32, down: Floats32) -> Floats32:
-    """(h, w): the largest length of a gradient, here or in the cells around."""
+    """(h, w): the largest magnitude of a gradient in 3 x 3 cells."""
     return np.asarray(cv2.dilate(cv2.magnitude(across, down), np.ones((3, 3), np.uint8)), np.float32)
 
 
 def _spatial_noise(picture: NDArray[np.uint8]) -> Floats32:
-    """Standard deviation of smoothed cells guessed from one frame, as a function of brightness: (3, h, w).
+    """Standard deviation of smoothed cells, estimated from one frame as a function of brightness: (3, h, w).
 
-    Second differences of neighbouring cells see the noise and hardly the shading; their median is not moved
-    by markers. Grain of the gel counts as noise here, which errs on the side of silence.
+    Second differences of neighbouring cells respond to noise and hardly to shading; their median is robust
+    against markers. The grain of the gel counts as noise here, which makes false contacts rarer.
     """
     cells = _planes(picture)
     noise = np.full_like(cells, QUANTISATION)
@@ -385,20 +382,19 @@ def _spatial_noise(picture: NDArray[np.uint8]) -> Floats32:
         center = [float(level[part].mean()) for part in bins]
         spread = [float(np.median(second[channel].ravel()[part])) for part in bins]
         noise[channel] = np.interp(cells[channel], center, spread)
-    # Smoothing 3 x 3 would divide by three were the cells independent; demosaicing and compression see to
-    # it that they are not quite.
+    # Smoothing 3 x 3 independent cells divides the noise by three, but these are correlated.
     return np.asarray(np.hypot(noise, QUANTISATION) * (NOISE_CORRELATION / 3), np.float32)
 
 
 def _fine_noise(planes: Floats32) -> Floats32:
-    """Variance of smoothed pixels at half resolution, guessed from a picture (3, 2 h, 2 w): (3, 1, 1).
+    """Variance of smoothed pixels at half resolution, estimated from a picture (3, 2 h, 2 w): (3, 1, 1).
 
-    Two pixels of a cell along one diagonal minus those along the other: noise differs between them, while
-    shading, and grain and blotches wider than a cell, hardly do. To tell whether anything touches the gel,
-    that is too little.
+    The sum of two pixels of a cell along one diagonal minus that along the other responds to noise, and
+    hardly to shading or to blotches wider than a cell. To decide whether anything touches the gel, this
+    estimate would be too low.
     """
     above, below = planes[:, ::2], planes[:, 1::2]
     diagonal = np.abs(above[:, :, ::2] - above[:, :, 1::2] - below[:, :, ::2] + below[:, :, 1::2])
-    # Four independent pixels; their mean is as noisy as one that is smoothed.
+    # The mean of four independent pixels is as noisy as a smoothed one.
     noise = np.median(diagonal, axis=(1, 2), keepdims=True) * (MAD_TO_SIGMA / 4)
     return np.asarray((noise**2 + QUANTISATION**2) * (NOISE_CORRELATION / 3) ** 2, np.float32)

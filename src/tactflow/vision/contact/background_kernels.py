@@ -1,7 +1,7 @@
 """Compiled loops of `background`.
 
-Pictures of several channels come as planes, (3, h, w), which vectorise; interleaved ones as (h, 3 w).
-Neighbours beyond the border are those mirrored about the last pixel, as OpenCV takes them by default.
+Pictures of several channels are passed as planes, (3, h, w), which vectorise, or interleaved, (h, 3 w).
+Borders are reflected about the last pixel, OpenCV's default.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from tactflow.vision.contact.illumination import WHITE
 Byte = NDArray[np.uint8]
 
 BLUR_SIGMA: Final = 0.8
-"""Standard deviation by which changes are smoothed, pixels of the window. Chosen by hand."""
+"""Standard deviation of the smoothing of changes, pixels of the window. Chosen by hand."""
 _AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA**2))
 MIDDLE: Final = np.float32(1 / (1 + 2 * _AT_ONE))
 BESIDE: Final = np.float32(_AT_ONE / (1 + 2 * _AT_ONE))
-"""Weights of a pixel and of each of its two neighbours, those of a Gaussian with that standard deviation."""
+"""Weights of a pixel and of each of its two neighbours: a Gaussian with that standard deviation."""
 NINTH: Final = np.float32(1 / 9)
 """Weight of one of 3 x 3 cells."""
 
 
 @kernel("void(uint8[:, ::1], float32[:, :, ::1])")
 def smooth_cells(half: Byte, smooth: Floats32) -> None:
-    """Means over 3 x 3 cells into the planes `smooth`, (3, h, w).
+    """Fill the planes `smooth`, (3, h, w), with means over 3 x 3 cells.
 
-    half : (2 h, 6 w), a picture of which 2 x 2 pixels are a cell; their mean is rounded, as `halved` does.
+    half : (2 h, 6 w), a picture with cells of 2 x 2 pixels; their mean is rounded, as in `halved`.
     """
     _, high, wide = smooth.shape
-    # Of each pixel and the next one, of two lines; lines of cells, of which three are in use.
+    # Means of 2 x 2 pixels at each pixel of two lines; and a ring buffer of three lines of cells.
     means, cells = np.empty(6 * wide, np.uint8), np.empty((3, 3 * wide), np.uint8)
     sums, squares = np.empty(3 * wide + 6, np.int16), np.empty(3 * wide, np.int16)
     for row in range(high + 1):
@@ -85,11 +85,13 @@ def weigh_change(
 ) -> tuple[float, float, float, float]:
     """Squared deviations of each cell from the background under this frame's illumination.
 
-    Returns the largest of squared and of colour, and the sums of the evidence over `before`, now and then.
+    Returns the maxima of squared and of colour, and the sums of the evidence over `before` in this frame and
+    in the previous one.
 
     smooth, mean, weight : (3, h, w). brightness, colour_factor : (h, w). coefficients : (3, 4). across,
     down : positions, (w,) and (h,). before : (h, w), cells in contact in the previous frame, and
-    evidence_before : the evidence there; both (0, 0) if none. squared, colour, evidence : (h, w), filled.
+    evidence_before : the evidence there; both (0, 0) if there were none. squared, colour, evidence : (h, w),
+    filled.
     """
     high, wide = squared.shape
     along = np.empty(wide, np.float32)
@@ -144,17 +146,17 @@ def scaled_change(
     pattern: Floats32,
     change: Floats32,
 ) -> None:
-    """How a window has changed, in standard deviations, smoothed along x.
+    """Signed change in a window, in standard deviations, smoothed along x.
 
     picture : (H, 3 W), the frame at the window's resolution. top, left : of the window. coefficients :
     (3, 4), of `IlluminationModel.fit`. across, down : positions, (W,) and (H,). mean, scale : (H, 3 W).
-    pattern : (H, 3 W), direction p in which the channels change where the gel's pattern moves: of a change
-    v, (p . v) p is left out. change : (h, 3 w), filled.
+    pattern : (H, 3 W), direction p in which the channels change where the gel's pattern moves; the component
+    (p . v) p of a change v is subtracted. change : (h, 3 w), filled.
     """
     high, wide = change.shape
     light = _light_along(coefficients, across[left : left + wide // 3])
     first, last = 3 * left, 3 * left + wide
-    # With a pixel more on both sides.
+    # One more pixel on either side.
     line = np.empty(wide + 6, np.float32)
     for y in range(high):
         row = top + y
@@ -170,7 +172,7 @@ def scaled_change(
 
 @helper
 def _light_along(coefficients: Floats32, places: Floats32) -> Floats32:
-    """(3, 3 w) float32: gain in the frame's middle row, its slope along y, offset; of each channel."""
+    """(3, 3 w) float32: gain in the middle row of the frame, its slope along y, and offset, interleaved."""
     light = np.empty((3, 3 * places.size), np.float32)
     for x in range(places.size):
         for c in range(3):
@@ -189,7 +191,7 @@ def _scale_line(
     place: np.float32,
     changes: Floats32,
 ) -> None:
-    """Fill `changes` with the change of a line, standard deviations; light : of `_light_along`."""
+    """Fill `changes` with the change of a line, standard deviations; light : from `_light_along`."""
     gain, slope, offset = light
     for i in range(values.size):
         value, usual = np.float32(values[i]), mean[i]

@@ -1,4 +1,4 @@
-"""Pictures as means over a coarse grid of cells, the same whatever their resolution."""
+"""Pictures as means over a coarse grid of cells, independent of their resolution."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Floats32
 
 CELLS: Final = 128
-"""Cells along the longer side of a picture, whatever its size."""
+"""Cells along the longer side of a picture."""
 HALF: Final = 127
-"""Mean of a mask, 0 to 255, above which a cell belongs to it."""
+"""Mean of a mask, 0 to 255, above which a cell counts as masked."""
 
 
 def grid_size(shape: tuple[int, ...]) -> tuple[int, int]:

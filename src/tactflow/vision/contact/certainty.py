@@ -1,7 +1,7 @@
-"""How probable it is that a region that has changed is a contact.
+"""The probability that a changed region is a contact, by logistic regression.
 
-Two things tell: an object that presses changes the slopes of the gel, and with it the colour of its light,
-while shadows and lamps change its brightness; and around a contact the markers move.
+It rests on two cues: an object that presses changes the slopes of the gel, and so the colour of its light,
+while shadows and lamps change its brightness; and the markers move around a contact.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from tactflow.vision.types import Contact
 WEIGHTS: Final = (0.37, 1.59, 1.67)
 """Constant and weights of `contact_evidence` in the log odds: `python -m benchmarks.probability contacts`."""
 DOUBTFUL: Final = 0.25
-"""Probability below which a region beside another does not count: three to one against it."""
+"""Probability below which a region beside another is rejected: odds of three to one against it."""
 LEAST_SHARE: Final = 1e-3
-"""Of the change of colour in all of a change, at least: its logarithm has to be finite."""
+"""Lower bound of the share of colour in a change, so that its logarithm is finite."""
 
 
 def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32) -> Floats:
@@ -31,13 +31,13 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
 
     Parameters
     ----------
-    parts : the separate regions. mask : (H, W) uint8, not 0 inside them.
+    parts : the separate regions. mask : (H, W) uint8, non-zero inside them.
     deviations : (2, h, w) float32, squared deviations of each cell, of its light and of its colour alone.
 
     Returns
     -------
-    (n, 2) : logarithm of the part that colour has in its largest change; 1 where markers moved as well, else
-    0.
+    (n, 2) : logarithm of the share of colour in the region's largest change; 1 if markers moved as well, else
+        0.
     """
     high, wide = deviations.shape[1:]
     inside = np.asarray(cv2.resize(mask, (wide, high), interpolation=cv2.INTER_NEAREST), np.uint8)
@@ -51,9 +51,9 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
 
 
 def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32) -> list[Contact]:
-    """The regions with the probability that each is a contact. As for `contact_evidence`.
+    """Set the probability of each region; arguments as in `contact_evidence`.
 
-    What only the markers show has no probability: there the light tells nothing.
+    Regions that only the markers show have none, because there is no change of light to judge.
     """
     odds = WEIGHTS[0] + contact_evidence(parts, mask, deviations) @ WEIGHTS[1:]
     return [
@@ -63,9 +63,9 @@ def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
 
 
 def without_doubtful(parts: Sequence[Contact], mask: Mask) -> tuple[list[Contact], Mask]:
-    """Remove improbable regions, from the list and from the mask; the most probable one always stays.
+    """Remove improbable regions from the list and the mask; the most probable one is always kept.
 
-    parts : every region of the mask, (H, W) uint8, 0 or 255, which is returned itself if all of them stay.
+    parts : all regions of the mask, (H, W) uint8, 0 or 255. The mask itself is returned if all are kept.
     """
     best = max(parts, key=_probability)
     probable = [part for part in parts if part is best or _probability(part) >= DOUBTFUL]

@@ -1,7 +1,6 @@
-"""Connected cells that have changed: which of them are contact.
+"""Connected components of changed cells: which of them are contacts.
 
-`contact_cells` keeps those that are strong enough, by two thresholds; `wide_change` those that are faint, but
-wide.
+`contact_cells` selects strong components by hysteresis; `wide_change` selects faint but wide ones.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ from tactflow.vision.arrays import Flags, Floats32
 SQUARE: Final = np.ones((3, 3), np.uint8)
 """A cell and its neighbours."""
 MIN_CELLS: Final = 8
-"""Cells that must change together. Chosen by hand: 128 px^2 is the halo of a ball's first touch."""
+"""Minimum size of a contact, cells. Chosen by hand: 128 px^2 is the halo of a ball's first touch."""
 WIDE_DEVIATION: Final = 12.0
-"""Squared deviation of the colour from which a cell counts as part of a wide change: 1 of 400 by chance
-(chi-square with two degrees of freedom)."""
+"""Minimum squared deviation of colour in a wide change: exceeded by 1 cell of 400 by chance (chi-square with
+two degrees of freedom)."""
 
 
 def wide_change(colour: Floats32, extent: float) -> Flags | None:
-    """Cells of connected changes of colour that cover `extent` cells at least.
+    """Connected changes of colour that cover at least `extent` cells.
 
     colour : (h, w) float32, squared deviations. Returns (h, w) bool, or None if there is no such change.
 
@@ -45,11 +44,11 @@ def wide_change(colour: Floats32, extent: float) -> Flags | None:
 def contact_cells(
     squared: Floats32, weak: float, start: float, stay: float, before: Flags | None
 ) -> Flags | None:
-    """Cells of connected changes that are contact, small gaps closed; (h, w) bool, or None if none are.
+    """Cells in contact by hysteresis, small gaps closed; (h, w) bool, or None if there are none.
 
-    squared : (h, w) float32, squared deviations. weak : a cell above belongs to a contact if connected to it.
-    start : a peak that makes a new contact. stay : a peak that keeps one. before : (h, w) bool, the cells in
-    contact in the previous frame.
+    squared : (h, w) float32, squared deviations. weak : low threshold, for cells connected to a contact.
+    start : peak that starts a contact. stay : peak that continues one. before : (h, w) bool, cells in contact
+    in the previous frame.
 
     >>> import numpy as np
     >>> squared = np.zeros((9, 9), np.float32)

@@ -1,12 +1,12 @@
-"""The outline of a contact in the picture of how a gel has changed.
+"""The outline of a contact in the change of a gel's picture.
 
-A contact is where the surface of the object lies below the surface of the untouched gel. What shows of that
-depends on how the gel is lit. Light from the side answers with the slope of the surface: a ball's middle
-looks unchanged, and the change is largest in a ring around it, where the gel leaves the object, and falls off
-further out (Hertz; K. L. Johnson, "Contact Mechanics", 1985, ch. 4). White light through a coating answers
-with the depth of the surface: the touched area brightens or darkens as a whole, most in the middle. In both
-cases the contact ends where the change has fallen to a certain part of the largest one nearby: light is never
-even, so what is far away is no measure.
+A contact is where the surface of the object lies below the surface of the untouched gel. How that looks
+depends on the lighting. Light from the side responds to the slope of the surface: the middle of a ball looks
+unchanged, and the change is largest in a ring around it, where the gel leaves the object, and decays farther
+out (Hertz; K. L. Johnson, "Contact Mechanics", 1985, ch. 4). White light through a coating responds to the
+depth of the surface: the touched area brightens or darkens as a whole, most in the middle. In both cases the
+contact ends where the change has fallen to a fixed fraction of its local maximum; a global maximum would not
+do, because the light is uneven.
 """
 
 from __future__ import annotations
@@ -21,16 +21,15 @@ import numpy as np
 from tactflow.vision.arrays import Flags, Floats32, Mask
 
 OUTER: Final = 0.55
-"""Fraction of the largest change nearby at which a change of slope is cut. Lower takes in more of the
-surroundings of a contact and of gel that wrinkles; higher opens the ring where the light is faint. On
-outlines of fifteen labs 0.5 to 0.6 overlap as well within 0.02 (`tactflow.bench.judge`)."""
+"""Slope at the border of a contact, as a fraction of its local maximum. Lower includes more of the
+surroundings and of wrinkled gel; higher opens the ring where the light is faint. On outlines of fifteen labs,
+values from 0.5 to 0.6 overlap equally well within 0.02 (`tactflow.bench.judge`)."""
 SHALLOW: Final = 0.2
-"""Part of the largest depth nearby that the gel has at the border of a contact. Under a ball it is 0.32 on a
-half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap as well with real
-outlines within 0.02."""
+"""Depth at the border of a contact, as a fraction of its local maximum. Under a ball it is 0.32 on a
+half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap equally well with
+real outlines within 0.02."""
 FAINT: Final = 0.3
-"""Fraction of the largest change of the whole contact that the largest one nearby counts for at least.
-Chosen by hand."""
+"""Lower bound of the local maximum, as a fraction of the maximum of the contact. Chosen by hand."""
 
 
 def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
@@ -38,9 +37,9 @@ def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
 
     Parameters
     ----------
-    change : (h, w, 3) float32, of the contact's window, in standard deviations; 0 where nothing belongs to
-        the contact. core : (h, w) uint8, 1 where the contact surely is, else 0. mixtures :
-        (k, 3) float32, of the channels: one shows depth, several show slope.
+    change : (h, w, 3) float32, in the window of the contact, standard deviations; 0 outside its region.
+    core : (h, w) uint8, 1 where the contact certainly is, else 0.
+    mixtures : (k, 3) float32, weights of the channels; one mixture gives depth, several give slopes.
 
     Returns
     -------
@@ -48,7 +47,7 @@ def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
 
     Examples
     --------
-    A disc that has brightened as a whole, of radius 8 px:
+    A disc of radius 8 px that has brightened as a whole:
 
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> disc = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
@@ -60,13 +59,13 @@ def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
     shows, border = _what_shows(change, mixtures)
     level = np.asarray(shows / largest_nearby(shows) - np.float32(border), np.float32)
     inside = _around(np.asarray((level > 0) | (core > 0)), core)
-    # What is filled in is as deep inside as what has changed most, what is left out as far outside.
+    # Pixels that are filled in or removed get the extreme values of the level.
     np.clip(level, -0.5, 0.5, out=level)
     return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
 
 
 def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
-    """What tells of the contact, (h, w), and the part of its largest value at which the contact ends."""
+    """Size of the slope, or depth, (h, w), and its fraction of the local maximum at the contact's border."""
     shown = np.asarray(cv2.transform(change, mixtures), np.float32)
     if len(mixtures) > 1:
         # OpenCV's lengths take a tenth of the time of NumPy's.
@@ -76,10 +75,10 @@ def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
 
 
 def largest_nearby(values: Floats32) -> Floats32:
-    """(h, w): the largest value around, smoothed; no less than `FAINT` of the largest anywhere.
+    """Local maximum (h, w), smoothed; at least `FAINT` of the global maximum.
 
-    "Around" reaches as far as the radius of a disc of as many pixels as have clearly changed: it holds a side
-    of the contact, but not its other end. Beyond the window there is no change.
+    The neighbourhood reaches as far as the radius of a disc with the area of the clearly changed pixels, so
+    that it holds one side of the contact but not the other. There is no change beyond the window.
     """
     smooth = np.asarray(cv2.blur(values, (3, 3)), np.float32)
     peak = max(float(smooth.max()), 1e-9)
@@ -96,7 +95,7 @@ def largest_nearby(values: Floats32) -> Floats32:
 
 
 def _around(changed: Flags, core: Mask) -> Flags:
-    """(h, w): those parts of what has changed, with what they enclose, that hold some of the core."""
+    """(h, w): changed components that overlap the core, with their holes filled."""
     inside = np.zeros(core.shape, np.uint8)
     outlines, _ = cv2.findContours(changed.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     for outline in outlines:
@@ -108,9 +107,9 @@ def _around(changed: Flags, core: Mask) -> Flags:
 
 
 def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) -> None:
-    """Set to 255 the pixels of a mask where a level set, interpolated to its resolution, is positive.
+    """Set the pixels of a mask to 255 where a level set, interpolated to its resolution, is positive.
 
-    level : (h, w) float32. top, left : its place in the mask, px, over whose border it may reach. mask :
+    level : (h, w) float32. top, left : its place in the mask, px; it may extend beyond the mask. mask :
     (H, W) uint8, changed in place. side : of the level's pixels, px.
 
     >>> mask = np.zeros((2, 4), np.uint8)

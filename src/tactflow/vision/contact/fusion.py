@@ -1,8 +1,9 @@
-"""Whether and where something touches the gel, from what the light and what the markers say.
+"""Fusion of the contacts that the light and the markers show.
 
-Each has a test with a rate of false alarms of its own, and if either sees a contact there is one: the rates
-add up. The markers also check the light: a change that covers many of them, none of which moves, is one of
-the lamp or the camera; and one no larger than a marker, beside a marker, is what its removal has left.
+Each has a test with its own rate of false alarms, and a contact is reported if either detects one, so the
+rates add up. The markers also check the light: a change that covers many markers of which none moves comes
+from the lamp or the camera; and a change no larger than a marker, beside a marker, is a residue of
+inpainting.
 """
 
 from __future__ import annotations
@@ -21,23 +22,22 @@ from tactflow.vision.geometry.region import Region, measure_region
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
 UNMOVED: Final = 6
-"""Markers below a change of the light, none of which moves, from which on it is no contact. Measured: of the
-frames in contact of the simulator, mini_ball, gelslim_ball, handmade_dots, sts_640 and franka_mini, those in
-which no marker moved had 5 at most."""
+"""Minimum number of resting markers below a change of the light that make it a change of illumination.
+Measured: frames in contact in which no marker moved had at most 5 (simulator, mini_ball, gelslim_ball,
+handmade_dots, sts_640 and franka_mini)."""
 MARGIN: Final = 0.125
-"""How much wider than the hull of its markers a region is, pitches. Chosen by hand."""
+"""Margin of a region around the hull of its markers, pitches. Chosen by hand."""
 SPREAD: Final = 5.0
-"""How far beyond a marker's border what is left of it may be drawn, px: a cell of `background`, and a pixel
-more for smoothing. Chosen by hand. On sts_640 and tactip_video the middle of such remains is up to 4.4 px
-beyond it."""
+"""Maximum distance of inpainting residue from a marker's border, px: a cell of `background`, and a pixel for
+smoothing. Chosen by hand. On sts_640 and tactip_video the centres of residues lie up to 4.4 px away."""
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 
 
 class FusedContact(NamedTuple):
-    """Where a frame shows contact.
+    """The contact of a frame.
 
-    mask : (H, W) uint8, 255 in contact. evidence : what showed it; None where nothing touches.
-    light_changed : whether there is a change of the light that is no contact.
+    mask : (H, W) uint8, 255 in contact. evidence : what showed it; None without contact.
+    light_changed : whether a change of the light is not a contact.
     """
 
     mask: Mask
@@ -53,17 +53,17 @@ class FusedContact(NamedTuple):
 def fuse_contact(
     light: Mask, markers: Markers, test: MotionTest, deviations: Floats32 | None = None
 ) -> FusedContact:
-    """Join the contact that the light shows and the one that the markers show.
+    """Combine the contact that the light shows with the one that the markers show.
 
     Parameters
     ----------
-    light : (H, W) uint8, 255 where the light shows contact; returned as it is where it shows the contact.
-    markers : of the same frame. test : of the motion of these markers, given every frame in order.
-    deviations : (2, h, w) float32, not 0 in the cells that have changed; None: what the light shows.
+    light : (H, W) uint8, 255 where the light shows contact; returned unchanged if that is the contact.
+    markers : of the same frame. test : motion test of these markers; it must see every frame in order.
+    deviations : (2, h, w) float32, non-zero in cells that have changed; None: those of `light`.
 
     Returns
     -------
-    FusedContact : the region is that of the light if it sees any, for its outline is the finer one; else the
+    FusedContact : with the region of the light if there is one, because its outline is finer; otherwise the
         convex hull of the most stretched part of the gel.
 
     Examples
@@ -93,13 +93,13 @@ def fuse_contact(
 
 
 def changed_mask(deviations: Floats32, shape: tuple[int, ...]) -> Mask:
-    """(H, W) uint8, 255 in the cells that have changed; deviations : (2, h, w), 0 in all others."""
+    """(H, W) uint8, 255 in changed cells; deviations : (2, h, w), 0 in all other cells."""
     cells = (deviations.max(axis=0) > 0).view(np.uint8) * np.uint8(255)
     return np.ascontiguousarray(cells.repeat(CELL, axis=0).repeat(CELL, axis=1)[: shape[0], : shape[1]])
 
 
 def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
-    """Whether many markers lie below a change of the light, and all of them are at rest."""
+    """Whether enough markers lie below a change of the light, and all of them are at rest."""
     seen = markers.status == _TRACKED
     below = inside_mask(markers.position[seen], light)
     resting = motion.still()[seen][below]
@@ -107,10 +107,10 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
 
 
 def _without_rims(light: Mask, region: Region, markers: Markers, coarse: int = 0) -> Mask:
-    """The regions that are more than what removing a marker leaves at its rim; the same array if all are.
+    """Remove regions that are residue of inpainting at the rim of a marker; the same array if there are none.
 
-    region : all of them. coarse : side of the regions' cells, px.
-    A marker that has moved by a part of a pixel is not quite where it is painted over.
+    region : of the whole mask. coarse : side of the cells that the mask consists of, px.
+    A marker that has moved by a fraction of a pixel is not quite where it is painted over.
     """
     radius = markers.radius
     if radius is None or not len(markers.position):
@@ -133,7 +133,7 @@ def _without_rims(light: Mask, region: Region, markers: Markers, coarse: int = 0
 
 
 def _hull_of(points: NDArray[np.float64], pitch: float, like: Mask) -> Mask:
-    """The convex hull of markers, a little wider, so that markers in a line have one, too."""
+    """The convex hull of markers with a margin, so that collinear markers have one, too."""
     region = np.zeros_like(like)
     hull = cv2.convexHull(np.rint(points).astype(np.int32))
     cv2.fillConvexPoly(region, hull, 255)

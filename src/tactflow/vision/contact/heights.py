@@ -1,16 +1,16 @@
-"""The shape of a gel, up to a factor, from how its light has changed.
+"""The shape of a gel, up to a factor, from the change of its light.
 
-Light from the side answers with slope: of a gel whose surface is z, the channels of the picture change by
-A (dz/dx, dz/dy), where the three rows of A say how the lamps of this sensor stand. Nobody tells A, but slopes
-are those of a surface: they can be integrated (A. Yuille, D. Snow, "Shape and albedo from multiple images
-using integrability", CVPR 1997). So the two mixtures of the channels that differ least from the slopes of any
-surface are the slopes, up to a factor, and that surface is the gel's (R. Frankot, R. Chellappa, "A method for
-enforcing integrability in shape from shading algorithms", PAMI 10, 1988).
+Light from the side responds to slope: for a gel with surface z, the channels of the picture change by
+A (dz/dx, dz/dy), where the three rows of A describe the directions of this sensor's lamps. A is unknown, but
+slopes must be integrable (A. Yuille, D. Snow, "Shape and albedo from multiple images using integrability",
+CVPR 1997). So the two mixtures of the channels that are closest to the slopes of a surface are the slopes, up
+to a factor, and that surface is the gel's (R. Frankot, R. Chellappa, "A method for enforcing integrability in
+shape from shading algorithms", PAMI 10, 1988).
 
-Where all channels change alike, as those of a gray camera do, there is one mixture, and it is the slope along
-the direction in which it differs least from that of a surface; or it answers with depth, which brightens or
-darkens the contact as a whole. Where it does, or no mixtures are nearly integrable so far, the size of the
-change stands for the shape.
+If all channels change alike, as in a gray camera, there is one mixture. Either it is the slope along the
+direction in which it is closest to that of a surface, or it responds to depth, which brightens or darkens the
+contact as a whole. In the latter case, and as long as no mixtures are nearly integrable, the size of the
+change stands in for the height.
 """
 
 from __future__ import annotations
@@ -25,35 +25,34 @@ from scipy import linalg
 from tactflow.vision.arrays import Floats32
 
 MARGIN: Final = 0.15
-"""Part of each side of the picture by which it is extended with gel at rest at both ends: the surface that is
-integrated ends as high as it began."""
+"""Padding with gel at rest at both ends of a side, as a fraction of it: the integrated surface is
+periodic."""
 SHORTEST: Final = 4
-"""Length of the shortest waves, cells: cells are means over three by three."""
+"""Shortest wavelength, cells: cells are means over three by three."""
 INTEGRABLE: Final = 0.2
-"""Part of the slopes' power that may be missing in those of a surface. One slope of a round contact, which is
-what light from one side shows, misses 0.25 with nothing beside it; sensors with lamps on several sides miss
-0.00 to 0.15."""
+"""Largest fraction of the slopes' power that an integrable pair may lack. A single slope of a round contact,
+as seen in light from one side, lacks 0.25; sensors with lamps on several sides lack 0.00 to 0.15."""
 ONE_SLOPE: Final = 3 / 8
-"""The same where all channels change alike: one slope of a round contact misses a quarter, depth a half."""
+"""The same if all channels change alike: one slope of a round contact lacks a quarter, depth a half."""
 WEAKEST: Final = 0.01
-"""Power of a mixture of channels, relative to the strongest one, from which on it tells of a slope: a tenth
-in size. Below is noise, in a faint contact that brightens as a whole."""
+"""Minimum power of a mixture of channels, relative to the strongest one, to count as a slope: a tenth in
+amplitude. Weaker ones are noise, in a faint contact that brightens as a whole."""
 CLEAR: Final = 2.0
-"""Size of a change that is more than noise, standard deviations."""
+"""Minimum size of a change that is more than noise, standard deviations."""
 ONE_WAY: Final = 1 / 3
-"""Part of the clear changes that is left when they are added up, from which on they are depth: slopes go up
+"""Length of the sum of clear changes over the sum of their lengths from which they are depth: slopes go up
 as well as down. In gray pictures of fifteen labs it is 0.0 to 0.3, or 0.4 to 0.9."""
 MORE: Final = 0.1
-"""Part of all the power so far that a frame has at least to tell more: a sensor is known after ten such
-frames. From 0.02 to 0.3 outlines overlap as well with real ones within 0.01."""
+"""Minimum power of a frame to learn from, relative to the total so far: a sensor is known after ten such
+frames. With 0.02 to 0.3, outlines overlap equally well with real ones within 0.01."""
 
 
 class Heights(NamedTuple):
     """The shape of a gel.
 
-    values : (h, w) float32, height of each cell above the gel at rest, in some unit, or how much it has
-    changed. mixtures : (k, 3) float32, of the channels, that show the shape: two, which are the slopes along
-    x and y; one, which is the depth; or all three channels, where nobody knows.
+    values : (h, w) float32, height of each cell above the gel at rest, in an arbitrary unit, or the size of
+    its change. mixtures : (k, 3) float32, weights of the channels: two are the slopes along x and y; one is
+    the depth; three, the identity, if neither is known yet.
     """
 
     values: Floats32
@@ -61,18 +60,18 @@ class Heights(NamedTuple):
 
     @property
     def sloping(self) -> bool:
-        """Whether slopes are known, and the values are heights."""
+        """Whether slopes are known, so that the values are heights."""
         return len(self.mixtures) == 2
 
 
 class HeightModel:
-    """Learns how the light of a sensor answers to slopes, and integrates them.
+    """Learns how the light of a sensor responds to slopes, and integrates them.
 
-    alike : whether all channels have changed alike so far, as those of a gray camera do.
+    alike : whether all channels have changed alike so far, as in a gray camera.
 
     Examples
     --------
-    Red answers to slopes along x, blue to those along y:
+    Red responds to slopes along x, blue to those along y:
 
     >>> y, x = np.mgrid[-16:16, -16:16] / 6
     >>> bump = np.exp(-(x**2 + y**2))
@@ -103,7 +102,7 @@ class HeightModel:
         return Heights(np.asarray(down.values.T @ climbs @ across.values, np.float32), self._mixtures)
 
     def _learn(self, change: Floats32) -> None:
-        """Add the power of a change, and what of it would be missing in a surface, if that tells more."""
+        """Add a change to the statistics of power and integrability, unless it is too weak to matter."""
         flat = change.reshape(3, -1)
         if not cv2.norm(flat, cv2.NORM_L2SQR) > MORE * self._power.trace():
             return
@@ -122,7 +121,7 @@ class HeightModel:
         self._size += float(sizes[clear].sum())
         self._mixtures = self._showing()
         if len(self._mixtures) == 2:
-            # Up to the sign, which stays as it was.
+            # The sign is arbitrary, so keep it.
             self._mixtures *= np.float32(1 if (self._mixtures * self._before).sum() >= 0 else -1)
             self._before = self._mixtures
 
@@ -141,10 +140,10 @@ class HeightModel:
 
 
 class _Waves(NamedTuple):
-    """Waves of a surface along one side of the picture, extended at both ends: cosines, then sines.
+    """Fourier basis along one padded side of the picture: cosines, then sines.
 
-    values : (k, n) float32, at each cell. slopes : (k, n) float32, of the waves, per cell. frequencies :
-    (k,) float32, radians per cell, from 0. The squares of a wave sum up to 1 over the extended side.
+    values : (k, n) float32, at each cell. slopes : (k, n) float32, their derivatives per cell. frequencies :
+    (k,) float32, radians per cell, from 0. The squares of a wave sum up to 1 over the padded side.
     """
 
     values: Floats32
@@ -154,7 +153,7 @@ class _Waves(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _waves(side: int) -> _Waves:
-    """Those of a side of so many cells."""
+    """The basis for a side of this many cells."""
     margin = max(round(MARGIN * side), 1)
     length = side + 2 * margin
     frequencies = 2 * np.pi / length * np.arange(length // SHORTEST + 1)[:, None]
@@ -173,7 +172,7 @@ def _waves(side: int) -> _Waves:
 
 @lru_cache(maxsize=4)
 def _squares(high: int, wide: int) -> Floats32:
-    """(k, l) float32: squared slopes of each wave of a picture, summed over it; of the flat one infinite."""
+    """(k, l) float32: squared slopes of each wave, summed over the picture; infinite for the constant one."""
     squares = np.add.outer(_waves(high).frequencies ** 2, _waves(wide).frequencies ** 2)
     squares[0, 0] = np.inf
     return squares

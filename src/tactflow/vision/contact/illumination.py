@@ -1,4 +1,4 @@
-"""Smooth changes of the illumination over the whole frame, fitted although something touches the gel."""
+"""Robust fit of a smooth change of the illumination over the whole frame, also during contact."""
 
 from __future__ import annotations
 
@@ -14,39 +14,38 @@ from tactflow.vision.compiled import kernel
 BLOCK: Final = 8
 """Side of the blocks whose means are fitted, cells. Chosen by hand."""
 CLIP: Final = 2.0
-"""Standard deviations of a cell at which a residual is clipped. Chosen by hand."""
+"""Residuals are clipped at this number of standard deviations of a cell. Chosen by hand."""
 REJECT: Final = 6.0
-"""Times as much, from which a residual does not count at all once the fit is close. Chosen on the simulator's
+"""Residuals above this multiple of the clipping limit are rejected in the second fit. Chosen on the simulated
 bright_cable, whose centre moves by 0.1 px more the lower it is, down to 2."""
 NEVER: Final = 1e6
-"""The same for the first fit, in which all residuals count."""
+"""The same for the first fit, which rejects no residuals."""
 MAX_STEPS: Final = 12
-"""Least-squares steps at most. Chosen by hand; the fit mostly converges earlier."""
+"""Maximum number of least-squares steps. Chosen by hand; the fit usually converges earlier."""
 CONVERGED: Final = 0.05
-"""The fit ends when no coefficient moves by as much, grey levels. Chosen by hand."""
+"""The fit has converged when no coefficient moves by more than this, grey levels. Chosen by hand."""
 RIDGE: Final = (0.0, 0.05, 0.05, 0.1)
-"""Weights, relative to the data, that draw slopes and offset towards zero: an offset is nearly the same as
-a gain on a gel of one brightness, and slopes follow wide, faint contacts. Chosen on wedge_grasp, where slopes
-of 0.01 miss 8 of 324 frames more than of 0.1, and seu_a, whose light smaller ones follow better."""
+"""Ridge penalties of gain, slopes and offset, relative to the data: on a gel of uniform brightness an offset
+is nearly the same as a gain, and slopes follow wide, faint contacts. Chosen on wedge_grasp, where 0.01 for
+the slopes misses 8 of 324 frames more than 0.1, and seu_a, whose light smaller values follow better."""
 WHITE: Final = np.float32(255)
-"""Grey levels at which a camera saturates: more light looks the same."""
+"""Grey level at which a camera saturates."""
 DARK: Final = 0.25
-"""Brightness of a block, relative to the mean of its channel, below which its ratio of change is too noisy to
-begin with. Chosen by hand."""
+"""Minimum brightness of a block, relative to the mean of its channel, to take part in the initial estimate.
+Chosen by hand."""
 
 
 class IlluminationModel:
     """Robust fit of gain, slopes of the gain and offset per channel between a frame and the untouched gel.
 
-    Exposure, white balance and lamps multiply the light; the offset is what a camera's black level and
-    scattered light add. The four coefficients of a channel are fitted to means over blocks of 8 x 8 cells
-    by Huber's method of modified residuals: residuals are clipped to twice their standard deviation before
-    each least-squares step, in which blocks count by one over their variance, so a contact, however strong,
-    pulls no harder than noise; the matrix of the step is constant. A second fit goes on from there without
-    residuals of several times that size, so that a strong contact does not pull at all. The first starts at
-    the median, so a contact may cover nearly half of the frame. Saturated blocks are left out; where a
-    channel has no others, its gain is the least that saturates them. Computed in float32, to 1e-3 grey levels
-    of what float64 gives.
+    Exposure, white balance and lamps multiply the light; a camera's black level and scattered light add an
+    offset. The four coefficients of a channel are fitted to means over blocks of 8 x 8 cells by Huber's
+    method of modified residuals: residuals are clipped to twice their standard deviation before each step of
+    weighted least squares, so a contact, however strong, pulls no harder than noise, and the matrix of the
+    step is constant. A second fit continues from there and rejects residuals of several times that size, so
+    that a strong contact does not pull at all. The first fit starts at the median, so a contact may cover
+    nearly half of the frame. Saturated blocks are excluded; if a channel has no others, its gain is the
+    smallest that saturates them. Computed in float32, within 1e-3 grey levels of the result in float64.
 
     Parameters
     ----------
@@ -96,8 +95,8 @@ class IlluminationModel:
         """Coefficients of the change of illumination between the reference and a frame.
 
         cells : (3, h, w) float32, the frame's cells, grey levels.
-        Returns (3, 4) float32: how much the gain exceeds 1, its slope along x and along y (over the whole
-        frame), and the offset, grey levels.
+        Returns (3, 4) float32: gain minus 1, its slopes along x and y (over the whole frame), and the offset,
+        grey levels.
         """
         coefficients = np.zeros((3, 4), np.float32)
         excess, limit = np.empty_like(self._reference), np.empty_like(self._reference)
@@ -116,20 +115,21 @@ class IlluminationModel:
         return coefficients
 
     def _fitted_blocks(self, gel: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-        """Blocks (n,) of which at least half is gel; None for all, also where there is none of them."""
+        """Blocks (n,) of which at least half is gel; None for all, also if there is no such block."""
         if gel is None:
             return None
         fitted = self._block_means(gel[None].astype(np.float32))[0] >= np.float32(0.5)
         return fitted if fitted.any() else None
 
     def _block_means(self, planes: Floats32) -> Floats32:
-        """(n, blocks) float32: means over blocks of (n, h, w) planes; a cell may belong to two in parts."""
+        """(n, blocks) float32: means over blocks of planes (n, h, w); two blocks may share a cell in
+        parts."""
         means = self._row_weights @ planes @ self._column_weights.T
         return np.asarray(means.reshape(len(planes), -1), np.float32)
 
 
 def under_illumination(untouched: Floats32, coefficients: Floats32) -> Floats32:
-    """The untouched gel under another illumination, grey levels up to 255: (3, h, w) float32.
+    """The untouched gel under another illumination, (3, h, w) float32, grey levels up to 255.
 
     untouched : (3, h, w) float32, grey levels. coefficients : (3, 4) float32, from `IlluminationModel.fit`.
     """
@@ -141,12 +141,12 @@ def under_illumination(untouched: Floats32, coefficients: Floats32) -> Floats32:
 
 @lru_cache(maxsize=16)
 def positions(count: int) -> Floats32:
-    """(count,) float32: places of a line's pixels, -0.5 to 0.5 across the frame; not to be written."""
+    """(count,) float32: positions of pixels along a line, -0.5 to 0.5; cached, so do not modify."""
     return np.linspace(-0.5, 0.5, count, dtype=np.float32)
 
 
 def _block_weights(blocks: int, count: int) -> Floats32:
-    """(blocks, count) float32: weight of each of `count` pixels of a line in the mean of each block."""
+    """(blocks, count) float32: weights of the `count` pixels of a line in the mean of each block."""
     edges = np.arange(blocks + 1) * (count / blocks)
     pixels = np.arange(count)
     covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
@@ -168,12 +168,12 @@ def compare_blocks(
     limit: Floats32,
     coefficients: Floats32,
 ) -> None:
-    """What a fit starts from: `excess` and `limit`, (3, n), and gains in `coefficients`, (3, 4), are filled.
+    """Initialise a fit: fill `excess` and `limit`, (3, n), and the gains in `coefficients`, (3, 4).
 
     cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference :
-    (3, n), their means, which excess is beyond. usual_limit : (3, n); limit is 0 where a block is saturated.
-    per_brightness : (3, n), one over the brightness, 0 where it is not lit: a gain is the median of the
-    relative change of the blocks that are lit and not saturated, or the largest one where all are saturated.
+    (3, n), their means, subtracted to give `excess`. usual_limit : (3, n); `limit` is 0 for saturated blocks.
+    per_brightness : (3, n), one over the brightness, 0 where it is unlit: a gain is the median of the
+    relative changes of lit, unsaturated blocks, or the largest one if all are saturated.
     """
     _, high, wide = cells.shape
     down, across = len(row_weights), len(column_weights)
@@ -182,7 +182,7 @@ def compare_blocks(
         count, most = 0, np.float32(0)
         for row in range(down):
             line[:] = 0
-            # A block takes no other lines and columns than those from its first to its last one.
+            # Only the lines and columns of the block have a weight.
             for y in range(row * high // down, -(-(row + 1) * high // down)):
                 for x in range(wide):
                     line[x] += row_weights[row, y] * cells[c, y, x]
@@ -196,7 +196,7 @@ def compare_blocks(
                     ratios[count] = excess[c, at] * per_brightness[c, at]
                     most = max(most, ratios[count])
                     count += limit[c, at] > 0
-        # The median by bisection: of the others, only those between too small and too large ones.
+        # The median by bisection: skip candidates outside the current bounds.
         least, largest = np.float32(-np.inf), np.float32(np.inf)
         for i in range(count):
             if least < ratios[i] < largest:
@@ -227,12 +227,12 @@ def fit_robustly(
     center: Floats32,
     coefficients: Floats32,
 ) -> None:
-    """Least-squares steps with clipped residuals; `coefficients`, (3, 4), start and result.
+    """Least-squares steps with clipped residuals; `coefficients`, (3, 4), holds the start and the result.
 
-    excess, limit : (3, n), the data and where their residuals are clipped; in the second fit, those of more
-    than `REJECT` times as much do not count. basis, step : (3, 4, n), the model and its
-    pseudo-inverse. shrink : (3, 4, 4), what the ridge takes from the coefficients in a step. center :
-    (3,), by which the first three coefficients are divided in the end.
+    excess, limit : (3, n), the data and the limits of their residuals; the second fit rejects residuals above
+    `REJECT` times the limit. basis, step : (3, 4, n), the model and its pseudo-inverse. shrink : (3, 4, 4),
+    effect of the ridge on the coefficients in a step. center : (3,), divides the first three coefficients at
+    the end.
     """
     change = np.empty(4, np.float32)
     for reject in (np.float32(NEVER), np.float32(REJECT)):

@@ -1,9 +1,9 @@
 """Contacts as level lines of the shape of a gel.
 
 Around an object the gel climbs from rest to the object, so the mean slope along a level line is largest where
-it leaves the object. A line stands out by its mean slope in standard errors, which shrink with the square
-root of its length: a long line is less likely to be steep by chance (A. Desolneux, L. Moisan, J.-M. Morel,
-"Edge detection by Helmholtz principle", Journal of Mathematical Imaging and Vision 14, 2001).
+it leaves the object. The salience of a line is its mean slope in standard errors, which shrink with the
+square root of its length: a long line is less likely to be steep by chance (A. Desolneux, L. Moisan, J.-M.
+Morel, "Edge detection by Helmholtz principle", Journal of Mathematical Imaging and Vision 14, 2001).
 """
 
 from __future__ import annotations
@@ -20,36 +20,37 @@ from tactflow.vision.contact.heights import Heights
 from tactflow.vision.contact.level_tree import grow_level_lines
 
 LEVELS: Final = 12
-"""Levels between the gel at rest and its highest point: the steepest line lies within a 26th of that."""
+"""Levels between the gel at rest and its highest point: their distance is a 13th of that height."""
 FLATTER: Final = 0.5
-"""Part of the steepest line's mean slope that lines around it have at least where the gel still climbs to the
-object."""
+"""Minimum mean slope of outer lines that still belong to the climb to the object, relative to the
+steepest."""
 BESIDE: Final = 3
-"""Cells beside that line in which the outline is looked for: cells are means over three by three, of which
-the surface has waves of four. From 2 to 6 outlines overlap as well with real ones within 0.01."""
+"""Margin around the outermost of these lines in which the outline is searched, cells: cells are means over
+three by three, and the shortest waves of the surface are four. With 2 to 6, outlines overlap equally well
+with real ones within 0.01."""
 SMALLEST: Final = 9
-"""Cells inside the smallest line: three by three."""
+"""Minimum number of cells inside a line: three by three."""
 WIDEST: Final = 0.6
-"""Part of the picture that a contact covers at most: something else has to be at rest."""
+"""Maximum area of a contact, as a fraction of the picture: the rest must show gel at rest."""
 OPEN: Final = 0.5
-"""Part of a line that may run along the border of the picture."""
+"""Maximum fraction of a line along the border of the picture."""
 DECIDED: Final = 5.0
-"""How many times the slope of a frame's contact decides for good between a bump and a dent. The wrong one is
-flatter by a tenth at least in all outlined frames, by three quarters in the median."""
+"""Accumulated evidence, in slopes of a frame's contact, that settles whether contacts are bumps or dents. The
+wrong one is flatter by at least a tenth in all outlined frames, by three quarters in the median."""
 LESSER: Final = 0.5
-"""Part of the first contact's salience that a further one has at least: less is gel that wrinkles, or light
-that has changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap as well within 0.01)."""
+"""Minimum salience of further contacts, relative to the first: less is gel that wrinkles, or light that has
+changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap equally well within 0.01)."""
 
 
 class LevelLines(NamedTuple):
-    """The level lines of a surface, those of a higher level first.
+    """The level lines of a surface, from the highest level down.
 
-    above : (h, w) int32, how many levels each cell is above; what a line encloses is as high as the line.
+    above : (h, w) int32, number of levels below each cell; holes are filled up to the line around them.
 
-    Of each line, (n,): level : index of its level. inside : a cell inside, as y w + x. encloses : whether
-    cells that have changed are inside. slope : mean slope of the surface along it, per cell; 0 where it is
-    too wide or too open for a contact. salience : how much it stands out. outer : index of the line around
-    it, or -1.
+    For each line, (n,): level : index of its level. inside : a cell inside, as y w + x. encloses : whether
+    it encloses changed cells. slope : mean slope of the surface along it, per cell; 0 if it is too wide or
+    too open for a contact. salience : slope in standard errors, up to a factor. outer : index of the line
+    around it, or -1.
     """
 
     above: NDArray[np.int32]
@@ -62,10 +63,10 @@ class LevelLines(NamedTuple):
 
 
 def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
-    """Lines at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
+    """Level lines at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
     levels = np.linspace(0, heights.max(), LEVELS + 2, dtype=np.float32)[1:-1]
     high, wide = heights.shape
-    # All lines lie in a window, and do not touch its border, but that of the picture.
+    # All lines lie in a window, and touch its border only where it is the picture's.
     left, top, across, down = cv2.boundingRect((heights > levels[0]).view(np.uint8))
     window = slice(max(top - 1, 0), top + down + 1), slice(max(left - 1, 0), left + across + 1)
     surface = np.ascontiguousarray(heights[window])
@@ -79,7 +80,7 @@ def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
     level, inside, cells, enclosed, sides, border, outer = lines[:count].T
     y, x = np.divmod(inside, surface.shape[1])
     inside = (y + window[0].start) * wide + x + window[1].start
-    # A line in any direction is pi / 4 as long as the sides of cells along it.
+    # Averaged over directions, a line is pi / 4 as long as the sides of the cells along it.
     length = np.float32(math.pi / 4) * sides
     possible = (sides >= (1 - OPEN) * (sides + border)) & (cells <= WIDEST * heights.size)
     slope = np.asarray(drops[:count] * possible / np.maximum(length, np.float32(1)), np.float32)
@@ -88,10 +89,10 @@ def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
 
 
 class ContactRegion(NamedTuple):
-    """Where the outline of a contact lies.
+    """A region that holds the outline of a contact.
 
-    rows, columns : window of cells. inside : (h, w) bool, which of them may belong to the contact. core :
-    (h, w) uint8, 1 where they do.
+    rows, columns : window of cells. inside : (h, w) bool, cells that may belong to the contact. core :
+    (h, w) uint8, 1 in cells that certainly do.
     """
 
     rows: slice
@@ -101,19 +102,19 @@ class ContactRegion(NamedTuple):
 
 
 class ContactFinder:
-    """Finds the contacts of frames, one after the other.
+    """Finds the contacts of consecutive frames.
 
-    Slopes do not tell a bump from a dent. Of both, the one that is steeper over all frames is the contact:
-    around it the gel bulges the other way, but less steeply.
+    The sign of the slopes is unknown, so a contact may look like a bump or a dent. The steeper of the two
+    over all frames is the contact: around it the gel bulges the other way, but less steeply.
     """
 
     def __init__(self) -> None:
         self._bumps = 0.0
 
     def __call__(self, heights: Heights, changed: Flags) -> list[ContactRegion]:
-        """Regions whose lines do not overlap, the most salient one first.
+        """Regions of disjoint contacts, the most salient one first.
 
-        heights : of the gel's cells. changed : (h, w) bool, cells of which each contact encloses some.
+        heights : of the gel's cells. changed : (h, w) bool; each contact encloses some of these cells.
         """
         values = heights.values if self._bumps >= 0 or not heights.sloping else -heights.values
         found = _contacts(values, changed)
@@ -127,14 +128,14 @@ class ContactFinder:
 
 
 class _Contacts(NamedTuple):
-    """The contacts of a surface, the most salient one first. slope : of its line; 0 without a contact."""
+    """The contacts of a surface, the most salient first. slope : of the first one's line; 0 without any."""
 
     regions: list[ContactRegion]
     slope: float
 
 
 def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
-    """The steepest lines that are neither around nor within one another, each with a wider one around it."""
+    """Select the most salient lines that are not nested, and grow each outwards to the end of its climb."""
     lines = level_lines(heights, changed)
     regions: list[ContactRegion] = []
     left, first, slope = lines.salience.copy(), 0.0, 0.0
@@ -148,10 +149,10 @@ def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
             continue
         if not regions:
             first, slope = salience, float(lines.slope[steepest])
-        # The gel is steepest between the steepest line and the next one.
+        # The gel is steepest between this line and the next one.
         core, near = (_inside(lines, line) for line in (outwards[:2][-1], wide))
         regions.append(_region(core, near))
-        # Lines within one another are of one contact.
+        # Nested lines belong to the same contact.
         free[: wide + 1][near.ravel()[lines.inside[: wide + 1]] > 0] = False
         while wide >= 0:
             free[wide] = False
@@ -161,7 +162,8 @@ def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
 
 
 def _outwards(lines: LevelLines, steepest: int, free: Flags) -> list[int]:
-    """The lines from the steepest one outwards that are not much flatter, nor of another contact."""
+    """The lines from the steepest one outwards, up to one that is much flatter or belongs to another
+    contact."""
     found, least = [steepest], FLATTER * lines.slope[steepest]
     while (outer := int(lines.outer[found[-1]])) >= 0 and free[outer] and lines.slope[outer] >= least:
         found.append(outer)
@@ -177,7 +179,8 @@ def _inside(lines: LevelLines, line: int) -> Mask:
 
 
 def _region(core: Mask, near: Mask) -> ContactRegion:
-    """core : cells that a contact surely has. near : those inside a wider one; those beside it are added."""
+    """The region of a contact; core : cells that certainly belong to it. near : cells inside the outer
+    line."""
     high, wide = core.shape
     near = np.asarray(cv2.dilate(near, np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8)), np.uint8)
     left, top, across, down = cv2.boundingRect(near)

@@ -1,8 +1,8 @@
-"""The tree of the level lines of a surface: which lines lie within which, and how steep each of them is.
+"""The component tree of a surface: how its level lines are nested, and the slope along each.
 
-A level line is the border of a connected set of cells above a level. These sets are grown from the highest
-level down, each cell joining those beside it (L. Najman, M. Couprie, "Building the component tree in
-quasi-linear time", IEEE Transactions on Image Processing 15, 2006).
+A level line is the border of a connected component of cells above a level. Components are grown from the
+highest level down by union-find (L. Najman, M. Couprie, "Building the component tree in quasi-linear time",
+IEEE Transactions on Image Processing 15, 2006).
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ def grow_level_lines(
     drops: Floats32,
     lines: Numbers,
 ) -> int:
-    """Measure the level lines of a surface, those of the highest level first; returns how many there are.
+    """Measure the level lines of a surface, from the highest level down; returns their number.
 
-    heights, marked : (h, w), the surface, and cells that are counted, not 0. levels : (l,) ascending.
-    least : cells inside of a line that counts.
-    above : (h, w), filled with how many levels each cell is above, or the lines that it is enclosed by.
+    heights, marked : (h, w), the surface, and cells to count (non-zero). levels : (l,) ascending. least :
+    minimum number of cells inside a line.
+    above : (h, w), filled with the number of levels below each cell, or below the lines around it.
     drops : (n,), filled with the sum of the surface's slope along each line, per cell.
-    lines : (n, 7), filled with each line's level, as an index; one of the cells inside, as y w + x; how many
-    cells are inside; how many of these are marked; sides of cells along the line, and along the border of the
-    picture; and the line around it, or -1.
+    lines : (n, 7), filled with each line's level, as an index; one of the cells inside, as y w + x; the
+    number of cells inside; the number of marked ones; the number of cell sides along the line, and along the
+    border of the picture; and the index of the line around it, or -1.
     """
     high, wide = heights.shape
     z, marks = heights.ravel(), marked.ravel()
     order, ends = _by_level(heights, levels, above.ravel())
     root = np.full(z.size, -1, np.int32)
-    # Of the set that a cell is the root of: cells, marked ones, sides along the line and along the border.
+    # For each root: number of cells, of marked ones, of sides along the line and along the border.
     sizes, drop = np.zeros((z.size, 4), np.int32), np.zeros(z.size, np.float32)
     line_of = np.full(z.size, -1, np.int32)
     count, inner = 0, 0
@@ -70,7 +70,7 @@ def grow_level_lines(
 def _join(
     cell: int, z: Floats32, high: int, wide: int, root: Numbers, sizes: Numbers, drop: Floats32
 ) -> None:
-    """Join a cell to the sets beside it, whose common sides are not along their line any more."""
+    """Unite a cell with the components beside it; their common sides no longer belong to a line."""
     root[cell] = cell
     y, x = cell // wide, cell % wide
     for dy, dx in ((-1, 0), (0, -1), (0, 1), (1, 0)):
@@ -96,14 +96,14 @@ def _join(
 
 @helper
 def _by_level(heights: Floats32, levels: Floats32, above: Numbers) -> tuple[Numbers, Numbers]:
-    """Cells by how many levels they are above, most first; and how many are above each level, and above all.
+    """Cells from the highest level down, and the number of cells above each level.
 
-    What is enclosed by cells above a level is above it, too: it is reached from the border of the picture by
-    going up only (P. Soille, "Morphological Image Analysis", 2004, ch. 6, who fills holes so).
+    Holes are filled: a cell counts as above a level if every path from the border of the picture to it climbs
+    above that level (P. Soille, "Morphological Image Analysis", 2004, ch. 6).
     """
     high, wide = heights.shape
     above[:] = -1
-    # The cells that are reached at each level, as lists: the first one, and the one after each.
+    # Linked lists of the cells that are reached at each level: the first one, and the one after each.
     first, after = np.full(levels.size + 1, -1, np.int32), np.empty(heights.size, np.int32)
     for y in range(high):
         for x in range(0, wide, 1 if y in (0, high - 1) else max(wide - 1, 1)):
@@ -129,7 +129,7 @@ def _by_level(heights: Floats32, levels: Floats32, above: Numbers) -> tuple[Numb
 
 @helper
 def _level_of(value: float, levels: Floats32) -> int:
-    """How many levels a value is above."""
+    """The number of levels below a value."""
     level = 0
     while level < levels.size and value > levels[level]:
         level += 1
@@ -146,7 +146,7 @@ def _reach(cell: int, level: int, above: Numbers, first: Numbers, after: Numbers
 
 @helper
 def _root_of(root: Numbers, cell: int) -> int:
-    """Root of the set that a cell is in; the way there becomes half as long."""
+    """Root of the component of a cell, with path halving."""
     while root[cell] != cell:
         root[cell] = root[root[cell]]
         cell = root[cell]

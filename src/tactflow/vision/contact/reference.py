@@ -1,4 +1,4 @@
-"""Whether the reference shows the untouched gel: whatever presses a gel makes it rougher, never smoother."""
+"""Detect a reference that was touched: pressing a gel makes it rougher, never smoother."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from tactflow.vision.arrays import Floats32, Mask
 from tactflow.vision.contact.cells import HALF, grid_size, to_cells, to_planes
 
 SMOOTHER: Final = 0.5
-"""Roughness of a region over that of the same place in the reference, below which the reference was touched
-there. Measured with reference and contact exchanged, on 166 outlined contacts of fifteen labs: 83 % are
-noticed; not exchanged, one is mistaken."""
+"""Ratio of a region's roughness to that in the reference below which the reference was touched there. With
+reference and contact exchanged, 83 % of 166 outlined contacts of fifteen labs are noticed; not exchanged, one
+is a false alarm."""
 ROUGHER: Final = 1.25
-"""The same, from which the reference counts as untouched from then on."""
+"""Ratio above which the reference is known to be untouched from then on."""
 ENOUGH: Final = 10
-"""Frames with a contact that is not smoother, after which it does, too: what a reference shows touched is
-released before another contact begins. Chosen by hand."""
+"""Number of frames with a contact that is not smoother, after which the same holds: a touch in the reference
+is released before another contact begins. Chosen by hand."""
 
 
 class ReferenceCheck:
-    """Compares the roughness of a gel where something changed with that of the reference there.
+    """Compares the roughness of changed regions with that of the same places in the reference.
 
     reference : (H, W, 3) uint8 BGR, without markers.
 
@@ -41,10 +41,10 @@ class ReferenceCheck:
         self._slopes = _squared_slopes(reference, self._size)
         self._passed = 0
         self.confirmed = False
-        """Whether contacts have shown that the reference was untouched."""
+        """Whether contacts have shown that the reference is untouched."""
 
     def was_touched(self, image: NDArray[np.uint8], changed: Mask) -> bool:
-        """Whether the gel is smoother than in the reference where it has changed.
+        """Whether the gel is smoother than in the reference in the changed region.
 
         image : (H, W, 3) uint8 BGR, of the reference's size, without markers. changed : (H, W) uint8.
         """
@@ -62,7 +62,7 @@ class ReferenceCheck:
 
 
 def _squared_slopes(image: NDArray[np.uint8], size: tuple[int, int]) -> Floats32:
-    """Of the logarithm of the light (channels, h, w), blurred by a cell against noise, per cell squared."""
+    """Squared gradient (channels, h, w) of the logarithm of the light, smoothed by one cell against noise."""
     planes = np.log(to_planes(image, size) + 1)
     smooth = [cv2.GaussianBlur(plane, (0, 0), 1.0) for plane in planes]
     slopes = [cv2.Sobel(p, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(p, cv2.CV_32F, 0, 1) ** 2 for p in smooth]
