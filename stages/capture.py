@@ -16,7 +16,7 @@ from tactflow.engine.check import read_only
 from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
-from tactflow.sources import KINDS, Arrival, CameraRequest, FrameReader, StampedReader, Watch, open_source
+from tactflow.sources import KINDS, Arrival, CameraRequest, FrameReader, Watch, open_source
 from tactflow.sources.files import ImageFiles, load_image
 from tactflow.sources.pace import paced
 from tactflow.sources.references import References
@@ -180,7 +180,7 @@ class Capture(Source):
         if source is None:
             raise SourceError(f"{self.description}: is not open")
         arrivals: Iterator[Arrival]
-        if isinstance(source, StampedReader):
+        if source.stamped:
             arrivals = map(self._references.marked, iter(source.read_arrival, None))
         else:
             arrivals = self._references.arranged(self._unskipped(source), source, self._reference_image)

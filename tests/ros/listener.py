@@ -109,13 +109,6 @@ def main() -> None:
             while not node.count_publishers(f"{NODE}/{order['topic']}"):
                 time.sleep(0.02)
             tell(found=order["topic"])
-        elif order["do"] == "ask too much":
-            kept.append(node.create_subscription(Bool, f"{NODE}/touching", print, 10))
-        elif order["do"] == "object":
-            from tactflow_ros.messages import header, object_transform
-
-            found = object_transform(order["message"], header(order["message"], "gel"), "object")
-            tell(transform=plain(found))
         elif order["do"] == "configure":
             configure(order["parameters"])
     rclpy.shutdown()

@@ -273,17 +273,10 @@ def test_the_service_takes_a_new_reference_in_the_run(pair: Pair) -> None:
 
 
 @needs_rclpy
-def test_a_subscriber_that_asks_for_more_is_told_why_it_receives_nothing(pair: Pair) -> None:
-    pair.listener.order(do="ask too much")
-    until(lambda: any("set the parameter reliability" in line for line in pair.bridge.complaints))
-
-
-@needs_rclpy
 @pytest.mark.parametrize(
     ("parameters", "state", "words"),
     [
         ({"reliability": "perhaps"}, "configured", "required best_effort or reliable, got 'perhaps'"),
-        ({"object_frame": "object"}, "configured", "object_frame needs tf2_msgs"),
         ({"endpoint": "nowhere"}, "activated", "required an address such as tcp://127.0.0.1:5556"),
         ({"keys": "/nowhere"}, "activated", "tactflow keys new creates such a folder"),
     ],
@@ -294,18 +287,6 @@ def test_parameters_that_cannot_be_are_refused_with_what_to_do(
     pair.listener.order(do="configure", parameters=parameters)
     assert pair.listener.told(lambda told: "configured" in told)[state] == "FAILURE"
     until(lambda: any(words in line for line in pair.listener.complaints))
-
-
-@needs_rclpy
-def test_the_transform_of_an_object_is_its_pose_and_none_while_it_is_lost(pair: Pair) -> None:
-    pose = {"status": "tracked", "center": [1, 2, -0.5], "translation": [0.5, 0, 0], "rotation": [0, 0, 0]}
-    pair.listener.order(do="object", message={"t": 2.0, "pose": pose})
-    told = pair.listener.told(lambda told: "transform" in told)["transform"]
-    assert (told["header"]["frame_id"], told["child_frame_id"]) == ("gel", "object")
-    assert list(told["transform"]["translation"].values()) == pytest.approx([1.5e-3, 2e-3, -0.5e-3])
-    assert told["transform"]["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-    pair.listener.order(do="object", message={"t": 2.0, "pose": pose | {"status": "lost"}})
-    assert pair.listener.told(lambda told: "transform" in told)["transform"] is None
 
 
 @needs_rclpy

@@ -15,7 +15,7 @@ from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
 from tactflow.sinks.record import Record
-from tactflow.sources import StampedReader, open_source
+from tactflow.sources import open_source
 from tactflow.stages.capture import Capture
 
 FPS = 10.0
@@ -87,7 +87,7 @@ def test_frames_come_back_with_seq_time_and_flags_as_they_were(
 
 def test_a_recording_says_how_long_and_how_fast_it_is(tmp_path: Path) -> None:
     source = open_source(str(record(tmp_path / "a.mcap", frames(range(21)))))
-    assert isinstance(source, StampedReader)
+    assert source.stamped
     assert (source.live, source.total, source.size) == (False, 21, (17, 12))
     assert source.fps == pytest.approx(FPS, rel=1e-9)
     assert "21 frames" in source.description

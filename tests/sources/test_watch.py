@@ -21,8 +21,7 @@ QUICK = {
     "frozen_after": 0.1,
     "black_after": 0.1,
     "silent_after": 0.1,
-    "first_retry": 0.01,
-    "last_retry": 0.04,
+    "retry": 0.01,
 }
 """Short times on the device's clock, s: they bound nothing that really happens."""
 
@@ -69,24 +68,6 @@ def take(source: Watched, count: int = 5) -> list[Arrival]:
     arrivals = [source.read_arrival() for _ in range(count)]
     assert None not in arrivals
     return [arrival for arrival in arrivals if arrival is not None]
-
-
-def test_attempts_back_off_and_start_quickly_again_once_the_source_was_back(
-    device: Flaky, watched: Opens
-) -> None:
-    source = watched(first_retry=0.25, last_retry=2.0)
-    reading = Reading(source)
-
-    def waits(fault: str, openings: int) -> list[float]:
-        device.clock.sleeps.clear()
-        connection = reading.arrivals[-1].connection if reading.arrivals else 0
-        device.fail(fault, openings)
-        until(lambda: reading.arrivals and reading.arrivals[-1].connection > connection)
-        return [round(seconds, 2) for seconds in device.clock.sleeps]
-
-    assert waits("gone", 6) == [0.25, 0.5, 1, 2, 2, 2]
-    assert waits("gone", 2) == [0.25, 0.5]
-    reading.stop()
 
 
 def test_seq_and_time_grow_across_reconnections_even_if_the_devices_clock_does_not(

@@ -19,7 +19,6 @@ from geometry_msgs.msg import PolygonStamped, PoseStamped, Vector3Stamped, Wrenc
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock as Steady
 from rclpy.clock import ClockType
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.logging import get_logger
@@ -47,7 +46,6 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "control": ("", "sinks.zmq.control, for the service ~/take_reference; empty disables it"),
     "keys": ("", "folder of the subscriber, from tactflow keys new; empty for no keys"),
     "frame_id": ("tactile_optical_frame", "frame of the picture: x right, y down, z out of the gel"),
-    "object_frame": ("", "frame of the object on /tf, a child of frame_id; empty for no transform"),
     "reliability": ("best_effort", "of the topics: best_effort or reliable"),
     "timeout": (2.0, "time without a message before /diagnostics reports it, s"),
     "publish_clock": (False, "also publish /clock, from the capture times of a recording"),
@@ -76,15 +74,6 @@ UNITLESS = {
 """Topic -> type, for topics in a single unit."""
 ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
 """Message sent by tactflow only on subscription -> topic."""
-
-
-def _tf_message() -> Any:
-    """`TFMessage`. Raises ImportError, saying what to install."""
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError:
-        raise ImportError("object_frame needs tf2_msgs: apt install ros-$ROS_DISTRO-tf2-msgs") from None
-    return TFMessage
 
 
 class Counts:
@@ -156,7 +145,7 @@ class Bridge(LifecycleNode):
         del state
         try:
             self._make_topics()
-        except (ValueError, ImportError) as error:
+        except ValueError as error:
             self.get_logger().error(str(error))
             self._forget()
             return TransitionCallbackReturn.FAILURE
@@ -214,23 +203,10 @@ class Bridge(LifecycleNode):
         for name, (kind, _) in GEOMETRY.items():
             kinds |= {name: kind, f"{name}_pixels": kind}
         for name, kind in kinds.items():
-            self._topics[name] = self._publisher(kind, f"~/{name}", qos)
+            self._topics[name] = self.create_lifecycle_publisher(kind, f"~/{name}", qos)
         if self.value("publish_clock"):
-            self._topics["/clock"] = self._publisher(Clock, "/clock", qos)
-        if self.value("object_frame"):
-            self._topics["/tf"] = self._publisher(_tf_message(), "/tf", QoSProfile(depth=DEPTH))
+            self._topics["/clock"] = self.create_lifecycle_publisher(Clock, "/clock", qos)
         self._topics["/diagnostics"] = self.create_publisher(DiagnosticArray, "/diagnostics", DEPTH)
-
-    def _publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
-        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._warn_mismatch(topic))
-        return self.create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
-
-    def _warn_mismatch(self, topic: str) -> None:
-        self.get_logger().warning(
-            f"{topic}: a subscriber requests an incompatible quality of service and receives nothing; let it "
-            "request best_effort and volatile (qos_profile_sensor_data), or set the parameter reliability to "
-            "reliable"
-        )
 
     # -- messages -----------------------------------------------------------------------------------------
 
@@ -258,11 +234,6 @@ class Bridge(LifecycleNode):
                 self._offer(name + unit.suffix, lambda make=make, unit=unit: make(message, head, unit))
         self._offer("wrench", lambda: messages.wrench(message, head))
         self._offer("object_pose", lambda: messages.object_pose(message, head))
-        self._offer("/tf", lambda: self._object_transform(message, head))
-
-    def _object_transform(self, message: messages.Message, head: Any) -> Any:
-        place = messages.object_transform(message, head, self.value("object_frame"))
-        return None if place is None else _tf_message()(transforms=[place])
 
     def _offer(self, topic: str, make: Callable[[], Any]) -> None:
         """Create and publish a message, unless the topic has no subscribers or there is nothing to

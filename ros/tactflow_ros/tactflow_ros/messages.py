@@ -17,7 +17,6 @@ from geometry_msgs.msg import (
     Point32,
     PolygonStamped,
     PoseStamped,
-    TransformStamped,
     Vector3Stamped,
     WrenchStamped,
 )
@@ -130,18 +129,6 @@ def object_pose(message: Message, head: Header) -> PoseStamped | None:
     part = math.sin(angle / 2) / math.degrees(angle) if angle else math.radians(0.5)
     turn.x, turn.y, turn.z = (part * axis for axis in found["rotation"])
     turn.w = math.cos(angle / 2)
-    return result
-
-
-def object_transform(message: Message, head: Header, child: str) -> TransformStamped | None:
-    """The same as `object_pose` for /tf. child : frame of the object."""
-    found = object_pose(message, head)
-    if found is None:
-        return None
-    result = TransformStamped(header=head, child_frame_id=child)
-    result.transform.rotation = found.pose.orientation
-    to, place = result.transform.translation, found.pose.position
-    to.x, to.y, to.z = place.x, place.y, place.z
     return result
 
 

@@ -192,7 +192,7 @@ class Network(Stage):
         self._wanted: list[str] = []
 
     def open(self) -> None:
-        """Read the file, and compare its inputs and outputs with the parameters.
+        """Read the file, and compare its inputs with the parameters.
 
         Raises StageError if onnxruntime or the provider is missing, or the file does not fit.
         """
@@ -233,18 +233,11 @@ class Network(Stage):
             feed.fit(f"{self._file}: input {name}", inputs[name].shape, inputs[name].type)
         outputs = {value.name: value for value in session.get_outputs()}
         for port, value in self.params.outputs.items():
-            only = next(iter(outputs)) if len(outputs) == 1 else port
-            name = value.output or (port if port in outputs else only)
+            name = value.output or (next(iter(outputs)) if len(outputs) == 1 else port)
             if name not in outputs:
                 raise StageError(
                     f"{self._file}: there is no output {name}; there are {', '.join(outputs)}: name one by "
                     f"outputs.{port}.output"
-                )
-            wanted = _wanted_shapes(port, value, self._first.params)
-            if not any(_agree(_sides(outputs[name].shape), shape) for shape in wanted):
-                raise StageError(
-                    f"{self._file}: output {name} has the shape {_shown(outputs[name].shape)}, but the port "
-                    f"{port} needs {' or '.join(map(_shown, wanted))}"
                 )
             self._wanted.append(name)
 
@@ -319,8 +312,6 @@ class _Feed:
             self._size = None if height is None or width is None else (width, height)
         width, height = self._size or (None, None)
         self._check_shape(p.shape(p.channels, height, width))
-        if p.channels is not None:
-            self._check_normalisation(p.channels - 2 * p.coordinates)
 
     def _check_shape(self, shape: tuple[Side, ...]) -> None:
         if not _agree(self._sides, shape):
@@ -328,11 +319,6 @@ class _Feed:
                 f"{self._where} takes {_shown(self._sides)}, but the settings give {_shown(shape)} "
                 "(without a batch); see port, size, frames and layout of this input"
             )
-
-    def _check_normalisation(self, channels: int) -> None:
-        for name, numbers in (("mean", self.params.mean), ("std", self.params.std)):
-            if len(numbers) not in (1, channels):
-                raise StageError(f"{self._where}: {name} has {len(numbers)} numbers for {channels} channels")
 
     def reset(self) -> None:
         """Discard earlier frames."""
@@ -366,7 +352,11 @@ class _Feed:
             is_added = p.background == "concat"
             parts = [picture, rest] if is_added else [cv2.subtract(picture, rest, dtype=cv2.CV_32F)]
         planes = [plane for part in parts for plane in cv2.split(part)]
-        self._check_normalisation(len(planes))
+        for name, numbers in (("mean", p.mean), ("std", p.std)):
+            if len(numbers) not in (1, len(planes)):
+                raise StageError(
+                    f"{self._where}: {name} has {len(numbers)} numbers for {len(planes)} channels"
+                )
         scale = p.scale
         if p.background == "subtract_half":
             planes = [np.clip(_linear(plane, scale, 0.5), 0, 1) for plane in planes]
@@ -447,20 +437,6 @@ def _force(numbers: Sequence[float]) -> Force:
     x, y = numbers[:-1] or (None, None)
     unknown = None if x is None else np.nan
     return Force((x, y, max(numbers[-1], 0.0)), (unknown, unknown, np.nan), False)
-
-
-def _wanted_shapes(port: str, params: OutputParams, first: InputParams) -> list[tuple[Side, ...]]:
-    """Valid shapes of an output, without the batch."""
-    if port == "force":
-        return [(1,), (3,)]
-    if port == "features":
-        return [(None,)]
-    if port in ("gradients", "contact_mask"):
-        channels = 2 if port == "gradients" else 1
-        if first.layout == "pixels":
-            return [(None, channels)]
-        return [(channels, None, None) if first.layout == "chw" else (None, None, channels)]
-    return [tuple(side if isinstance(side, int) else None for side in params.shape)]
 
 
 def _sides(shape: Sequence[Any]) -> tuple[Side, ...]:

@@ -15,7 +15,7 @@ from typing import cast
 
 from tactflow.engine.errors import SourceError
 from tactflow.recording import missing_packages
-from tactflow.sources.base import Arrival, FrameReader, StampedReader
+from tactflow.sources.base import Arrival, FrameReader
 from tactflow.sources.devices import Camera, CameraRequest, Stream
 from tactflow.sources.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_image, open_file
 from tactflow.sources.memory import MemoryFrames
@@ -30,7 +30,6 @@ __all__ = [
     "Arrival",
     "CameraRequest",
     "FrameReader",
-    "StampedReader",
     "Watch",
     "Watched",
     "open_source",

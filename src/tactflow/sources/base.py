@@ -26,9 +26,6 @@ if "OPENCV_LOG_LEVEL" not in os.environ:
 
 SPARSE_PEAK = 4096
 """A 16-bit frame with only smaller values is from a sensor with 12 bits or fewer, grey levels."""
-FEWEST_BITS = 10
-"""Minimum number of bits of sensors whose pixels are stored in 16 bits."""
-
 SHORTEST_SIDE = 2
 """Minimum number of rows and columns, px, because stages halve the picture."""
 
@@ -67,6 +64,8 @@ class FrameReader:
     description : one line for messages.
     state : of a live source: `running`, `waiting since ...` or `reconnecting since ...`.
     missed : frames of a live source that a newer one replaced before they were read.
+    stamped : whether the frames already passed through `capture`, which then uses their seq, reference,
+    epoch and paced, as in `Arrival`, unchanged; `_frames` yields these too.
 
     name : for messages.
     """
@@ -78,6 +77,7 @@ class FrameReader:
     description = ""
     state = "running"
     missed = 0
+    stamped = False
     parser_errors: tuple[type[Exception], ...] = (OSError,)
     """Exceptions of `_frames` on damaged data, which are converted to SourceError."""
 
@@ -169,13 +169,6 @@ class FrameReader:
             raise damaged(self.name, error) from error
 
 
-class StampedReader(FrameReader):
-    """A source whose frames already passed through `capture`.
-
-    `_frames` also yields seq, reference, epoch and paced, as in `Arrival`, which capture uses unchanged.
-    """
-
-
 class CaptureReader(FrameReader):
     """A source opened by OpenCV: a video, a camera, a stream.
 
@@ -233,25 +226,16 @@ def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> BgrImage:
             raise SourceError(f"{name}: required 8- or 16-bit unsigned pixels, got {image.dtype}")
         image = image.astype(np.uint16, copy=False)
         if note:
-            _note_16_bits(image, name)
+            log.info("%s: 16-bit values are scaled to 8 bit (divided by 257)", name)
+            if 0 < (peak := int(image.max(initial=0))) < SPARSE_PEAK:
+                text = "%s: no value above %d: a sensor with fewer bits? It will be dark; scale it to 16 bits"
+                log.warning(text, name, peak)
         image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
     if channels == 3:
         return np.ascontiguousarray(image)
     if channels == 4 and note:
         log.info("%s: the fourth channel (alpha) is ignored", name)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if channels == 1 else cv2.COLOR_BGRA2BGR))
-
-
-def _note_16_bits(image: NDArray[np.uint16], name: str) -> None:
-    log.info("%s: 16-bit values are scaled to 8 bit (divided by 257)", name)
-    peak = int(image.max(initial=0))
-    if 0 < peak < SPARSE_PEAK:
-        bits = max(peak.bit_length(), FEWEST_BITS)
-        log.warning(
-            "%s: no value above %d: a sensor with %d bits in a 16-bit file? It will be dark; "
-            "multiply the values by %d beforehand",
-            *(name, peak, bits, 1 << (16 - bits)),
-        )
 
 
 def check_array(array: Any, name: str) -> None:

@@ -43,10 +43,8 @@ ZIP_MAGIC = r"got b'PK\x03\x04"
 """Part of NumPy's message for a .npz file, which is a ZIP file."""
 PLAYLISTS = (b"#EXTM3U", b"ffconcat")
 """First bytes of playlists, whose files FFmpeg would open."""
-PNG = b"\x89PNG\r\n\x1a\n"
-"""First bytes of a PNG file."""
-CHUNK_FRAME = 12
-"""Bytes of a PNG chunk besides its data: length, type, checksum."""
+PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+"""First bytes of a PNG file, and its last chunk, whose checksum is always the same."""
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -107,18 +105,7 @@ def _is_cut_off(data: bytes) -> bool:
         # An end-of-image marker must follow the last start-of-scan marker. Neither can occur inside
         # compressed data, and an embedded thumbnail has both.
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    return data.startswith(PNG) and not _has_whole_chunks(data)
-
-
-def _has_whole_chunks(png: bytes) -> bool:
-    """Whether all chunks of a PNG are complete; OpenCV would allocate their stated length."""
-    at = len(PNG)
-    while at + CHUNK_FRAME <= len(png):
-        at += CHUNK_FRAME + int.from_bytes(png[at : at + 4], "big")
-        # The last chunk is empty, so that its type starts eight bytes before its end.
-        if at <= len(png) and png[at - 8 : at - 4] == b"IEND":
-            return True
-    return False
+    return data.startswith(PNG) and PNG_END not in data
 
 
 class ImageFiles(FrameReader):
@@ -136,12 +123,6 @@ class ImageFiles(FrameReader):
         self.first = files[0].name
         self.files = files
         self._read_first()
-        pages = cv2.imcount(str(files[0])) if files[0].suffix.lower() in (".tif", ".tiff") else 1
-        if pages > 1:
-            log.warning(
-                "%s: holds %d pictures, of which only the first is read; save each as a file of its own",
-                *(files[0], pages),
-            )
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         for index, path in enumerate(self.files):

@@ -10,16 +10,15 @@ from tactflow.engine.errors import SourceError
 from tactflow.recording.frames import RawFrame, decode_pixels, nanoseconds, parse_frame
 from tactflow.recording.reader import look_into, messages
 from tactflow.recording.records import DAMAGE, NotARecordingError
-from tactflow.sources.base import BgrImage, StampedReader, damaged, log
+from tactflow.sources.base import BgrImage, FrameReader, damaged, log
 from tactflow.sources.paths import describe_settings, find_path, split_query
 
 SETTINGS = {"start": "SECONDS (from the beginning)"}
-
 LATEST_START = 1e9
-"""Maximum start, s: 30 years, longer than any recording. Chosen by hand."""
+"""Maximum start, s: 30 years, longer than any recording."""
 
 
-class Recording(StampedReader):
+class Recording(FrameReader):
     """An .mcap file recorded by tactflow.
 
     A recording includes its references, so that capture's parameters `reference` and `skip` do not apply.
@@ -28,6 +27,8 @@ class Recording(StampedReader):
     spec : `file.mcap`, or `file.mcap?start=2.5`. directory : as for `open_source`. Raises SourceError if it
     does not exist, is not a recording of tactflow, or an option is invalid.
     """
+
+    stamped = True
 
     def __init__(self, spec: str, directory: Path | None = None) -> None:
         name, start = _parse(spec, directory)

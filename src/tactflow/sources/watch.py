@@ -25,10 +25,6 @@ BLACK_STEP = 8
 """Sampling step for that mean, px. Chosen by hand."""
 FIRST_FRAME_SECONDS = 3.0
 """Stall timeout for the first frame, s. Chosen by hand."""
-SILENT_INTERVALS = 3.0
-"""Minimum length of a stall, in usual times between frames. Chosen by hand."""
-INTERVAL_DECAY = 0.9
-"""Decay of the usual time between frames per frame after a long gap. Chosen by hand."""
 CLOSE_SECONDS = 3.0
 """Longest time that `close` waits for a pending read, s. Chosen by hand."""
 POLL_SECONDS = 0.1
@@ -44,17 +40,16 @@ class Watch:
     no_frame_timeout : time without a good frame after which reading fails; None or 0: never.
     frozen_after : time with identical pictures that is a fault; None: never.
     black_after : time with black pictures that is a fault; None: never.
-    silent_after : stall timeout: time without a picture that is a fault, if it exceeds three usual intervals.
-    first_retry, last_retry : back-off between attempts, which doubles from the first to the last.
+    silent_after : stall timeout: time without a picture that is a fault.
+    retry : time between attempts to reopen the source.
     """
 
     reconnect: bool = True
     no_frame_timeout: float | None = 30.0
     frozen_after: float | None = 3.0
     black_after: float | None = 1.0
-    silent_after: float = 0.8
-    first_retry: float = 0.25
-    last_retry: float = 2.0
+    silent_after: float = 1.5
+    retry: float = 0.5
 
 
 @dataclass(slots=True)
@@ -108,7 +103,6 @@ class Watched(FrameReader):
         self._newest: Arrival | None = None
         self._seq, self._t, self._connection = -1, -math.inf, 0
         self._fault: _Fault | None = None
-        self._interval = 1.0 / source.fps if source.fps else 0.0
         self._arrived_at = self._good_at = self._lit_at = self._changed_at = clock.now()
         self._lit = False
         self._previous: BgrImage | None = None
@@ -164,8 +158,8 @@ class Watched(FrameReader):
     def _check_time(self, now: float) -> None:
         """Detect stalls and timeouts."""
         watch = self._watch
-        usual = FIRST_FRAME_SECONDS if self._seq < 0 else watch.silent_after
-        if self._fault is None and now - self._arrived_at >= max(usual, SILENT_INTERVALS * self._interval):
+        longest = max(FIRST_FRAME_SECONDS if self._seq < 0 else 0.0, watch.silent_after)
+        if self._fault is None and now - self._arrived_at >= longest:
             self._report("no frames", self._arrived_at, now)
         if watch.no_frame_timeout and now - self._good_at >= watch.no_frame_timeout:
             self._failure = self._timeout_error(now)
@@ -182,7 +176,7 @@ class Watched(FrameReader):
 
     def _report(self, kind: str, since: float, now: float, detail: str = "") -> None:
         hour = time.strftime("%H:%M:%S", time.localtime(self._clock.unix() - (now - since)))
-        retry_at = now + self._watch.first_retry if kind == "gone" else now
+        retry_at = now + self._watch.retry if kind == "gone" else now
         self._fault = _Fault(kind, since, hour, retry_at, detail)
         then = "" if not self._watch.reconnect else "; waiting" if kind == "no frames" else "; reconnecting"
         words = f"is {kind}" if kind == "gone" else kind
@@ -235,14 +229,13 @@ class Watched(FrameReader):
         return not self._ended and self._failure is None and not self._stopped.is_set()
 
     def _wait_to_retry(self) -> bool:
-        """Wait for the next attempt to open the source (exponential back-off); False at the end."""
-        fault, watch = self._fault, self._watch
+        """Wait for the next attempt to open the source; False at the end."""
+        fault = self._fault
         if fault is None or not self._is_running():
             return False
         self._clock.sleep(fault.retry_at - self._clock.now(), self._stopped)
         fault.attempts += 1
-        delay = min(watch.first_retry * 2.0 ** min(fault.attempts, 30), watch.last_retry)
-        fault.retry_at = self._clock.now() + delay
+        fault.retry_at = self._clock.now() + self._watch.retry
         return self._is_running()
 
     def _reopen(self) -> FrameReader:
@@ -257,7 +250,7 @@ class Watched(FrameReader):
         """Handle a new frame; returns whether to reopen the source."""
         now = self._clock.now()
         with self._changed:
-            gap, self._arrived_at = now - self._arrived_at, now
+            self._arrived_at = now
             size, first = (image.shape[1], image.shape[0]), self.size
             if first is None or self._seq < 0:
                 # The driver may have stated another size.
@@ -267,8 +260,6 @@ class Watched(FrameReader):
                     f"it came back with {size[0]} x {size[1]} pixels instead of {first[0]} x {first[1]}"
                 )
             self._seq += 1
-            if self._seq and not (self._fault and self._fault.attempts):
-                self._interval = max(gap, INTERVAL_DECAY * self._interval)
             problem = self._picture_problem(image, now)
             if problem is not None:
                 kind, since, reportable = problem
