@@ -184,7 +184,6 @@ def test_numbers_are_read_as_people_write_them(text: str, value: float, load: Lo
     [
         (["stages.prepare.gamma=3"], "prepare", {"gamma": 3}),
         (["stages.prepare.gamma=3", "stages.prepare.gamma=4"], "prepare", {"gamma": 4}),
-        (["stages.prepare.corners.1.0=9"], "prepare", {"corners": [(1, 2), (9, 4)]}),
         (["stages.prepare.corners=[[5, 6]]"], "prepare", {"corners": [(5, 6)]}),
         (["stages.prepare.rotate=90"], "prepare", {"rotate": 90}),
         (["sinks.out.path=2026-11-21"], "out", {"path": "2026-11-21"}),
@@ -222,7 +221,7 @@ def test_a_run_knows_how_many_others_run_beside_it(load: Load) -> None:
         ("stages.outlin=null", "there is no stage 'outlin' to remove; did you mean outline?"),
         ("sink.out.path=a", "sink: unknown key; did you mean sinks?"),
         ("stages.prepare.gamma.x=3", "stages.prepare.gamma is 2, so it has no x"),
-        ("stages.prepare.corners.7=3", "stages.prepare.corners is a list with 2 items"),
+        ("stages.prepare.corners.1=3", "stages.prepare.corners is a list, so it has no 1; replace it as a"),
         ("stages.prepare.gamma", "expected a.b.c=VALUE"),
         ("stages.prepare.gamma={", "not valid YAML"),
     ],
@@ -299,13 +298,13 @@ def with_sinks(first: str, second: str = "") -> str:
 def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Load) -> None:
     text = with_sinks(first="lines: {use: jsonl, path: out/a.jsonl}", second=second)
     if clash:
-        with pytest.raises(ConfigError, match=r"lines \(.*p.yaml:11:3\) writes .*/out/a.jsonl already"):
+        with pytest.raises(ConfigError, match=r"/out/a.jsonl is written by lines \(.*p.yaml:11:3\)"):
             load(text)
     else:
         assert len(load(text).sinks) == 2
 
 
-@pytest.mark.parametrize("link", [None, os.symlink, os.link])
+@pytest.mark.parametrize("link", [None, os.symlink])
 @pytest.mark.parametrize(
     ("read", "what"),
     [

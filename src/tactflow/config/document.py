@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,11 @@ def described(value: Any) -> str:
     return "a mapping" if isinstance(value, dict) else "a list" if isinstance(value, list) else shown(value)
 
 
-def dotted(keys: Keys) -> str:
+def dotted(keys: Sequence[str | int]) -> str:
     """A path as shown in messages.
 
-    >>> dotted(("stages", "hull", "when", 0))
-    'stages.hull.when.0'
+    >>> dotted(("stages", "preprocess", "corners", 0))
+    'stages.preprocess.corners.0'
     """
     return ".".join(map(str, keys))
 
@@ -58,11 +59,9 @@ class Document:
         """The value at a path, or None."""
         value = self.root
         for key in keys:
-            if isinstance(value, dict):
-                value = value.get(key)
-            elif isinstance(value, list) and isinstance(key, int) and key < len(value):
+            try:
                 value = value[key]
-            else:
+            except (LookupError, TypeError):
                 return None
         return value
 
@@ -86,27 +85,25 @@ class Document:
     def _marks(self, keys: Keys) -> tuple[Mark, Mark]:
         return self.marks.get(keys) or (self.mark(*keys[:-1]),) * 2
 
-    def set(self, keys: Keys, value: Any, mark: Mark, key_mark: Mark | None = None) -> None:
+    def set(self, keys: Sequence[str], value: Any, mark: Mark, key_mark: Mark | None = None) -> None:
         """Set a value, and create the mappings around it if needed.
 
         mark : location of the value. key_mark : location of a new key, if different.
 
         Raises
         ------
-        ConfigError : the path leads through a value that is neither a mapping nor a list.
+        ConfigError : the path leads through a value that is not a mapping.
         """
-        parent: Any = self.root
-        place: Keys = ()
-        created: Keys | None = None
-        for key in keys[:-1]:
-            place = (*place, _index(parent, key, place))
-            if isinstance(parent, dict) and parent.get(key) is None:
+        parent, place = self.root, tuple(keys)
+        for depth, key in enumerate(keys[:-1], start=1):
+            if parent.get(key) is None:
                 parent[key] = {}
-                created = created or place
-            parent = parent[place[-1]]
-        place = (*place, _index(parent, keys[-1], place))
-        parent[place[-1]] = value
-        place = created or place
+                place = place[:depth]
+            parent = parent[key]
+            if not isinstance(parent, dict):
+                problem = f"{dotted(keys[:depth])} is {described(parent)}"
+                raise ConfigError(f"{problem}, so it has no {keys[depth]}; replace it as a whole")
+        parent[keys[-1]] = value
         known, _ = self.marks.get(place, (key_mark or mark, mark))
         # Discard the locations inside the old value.
         self.marks = {keys: marks for keys, marks in self.marks.items() if keys[: len(place)] != place}
@@ -136,17 +133,6 @@ class Document:
         return f"{head}\n    {_printable(self.lines[mark.line - 1])}\n    {' ' * (mark.column - 1)}^"
 
 
-def _index(parent: Any, key: str | int, place: Keys) -> str | int:
-    """The key in a mapping, or the index in a list. place : path of `parent`."""
-    if isinstance(parent, dict):
-        return key
-    if not isinstance(parent, list):
-        raise ConfigError(f"{dotted(place)} is {described(parent)}, so it has no {key}")
-    if not str(key).isdecimal() or int(key) >= len(parent):
-        raise ConfigError(f"{dotted(place)} is a list with {len(parent)} items, counted from 0")
-    return int(key)
-
-
 def _printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
@@ -169,14 +155,9 @@ def read_document(path: Path) -> Document:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"cannot read {path}: {reason}{hint}") from None
     document = Document(str(path), line=1)
-    text = data.decode("utf-8-sig", "replace")
+    # YAML does not allow the characters that bytes other than UTF-8 become.
+    text = data.decode("utf-8-sig", "surrogateescape")
     document.lines = text.splitlines()
-    try:
-        data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        mark = _end(str(path), data[: error.start].decode("utf-8-sig"))
-        document.report_at(mark, f"byte 0x{data[error.start]:02x} is not UTF-8 text; save the file as UTF-8")
-        document.raise_if_mistaken()
     if not _parse(text, document):
         document.raise_if_mistaken()
     return document
@@ -225,8 +206,10 @@ def _parse(text: str, document: Document) -> bool:
             document.root = _Values(loader, document).value(node, ())
         return True
     except yaml.reader.ReaderError as error:
-        mark = _end(file, text[: error.position])
-        document.report_at(mark, f"the character #x{error.character:04x} is not allowed in YAML")
+        before = text[: error.position]
+        mark = Mark(file, before.count("\n") + 1, len(before) - before.rfind("\n"))
+        what = f"the character #x{error.character:04x} is not allowed in YAML"
+        document.report_at(mark, f"{what}; save the file as UTF-8 text")
     except yaml.MarkedYAMLError as error:
         where = error.problem_mark or error.context_mark
         mark = Mark(file, where.line + 1, where.column + 1) if where else Mark(file, 1, 1)
@@ -236,22 +219,16 @@ def _parse(text: str, document: Document) -> bool:
     return False
 
 
-def _end(file: str, before: str) -> Mark:
-    """The location after some text of a file."""
-    return Mark(file, before.count("\n") + 1, len(before) - before.rfind("\n"))
-
-
 def _yaml_message(error: yaml.MarkedYAMLError, text: str) -> str:
     """PyYAML's message, with advice for common mistakes."""
     where = error.problem_mark
     if where is not None and "\t" in [*text.splitlines(), ""][where.line][: where.column + 1]:
         return "a tab character; YAML is indented with blanks"
-    if "expected a single document" in str(error.context):
-        return "a second document starts here; a pipeline file holds one"
-    message = " ".join(f"not valid YAML: {error.problem} {error.context or ''}".split())
-    if error.context_mark is not None and error.context:
-        message += f" that starts in line {error.context_mark.line + 1}"
-    return message + ("; text with ': ' in it needs quotes" if "mapping values are not" in message else "")
+    around = ""
+    if error.context and error.context_mark:
+        around = f"{error.context} that starts in line {error.context_mark.line + 1}: "
+    hint = "; text with ': ' in it needs quotes" if "mapping values are not" in str(error.problem) else ""
+    return f"not valid YAML: {around}{error.problem}{hint}"
 
 
 class _Values:

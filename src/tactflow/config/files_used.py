@@ -12,27 +12,16 @@ from pydantic import BaseModel
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.system.files import expanded, is_device
 
-FileId = tuple[int, int]
-"""Device and inode: the same for all names of a file, including links."""
-
-
-def file_id(path: str | Path) -> FileId | None:
-    """The identity of a file or folder; None for devices and missing files."""
-    try:
-        status = os.stat(path)
-    except (OSError, ValueError):
-        return None
-    return None if is_device(str(path)) else (status.st_dev, status.st_ino)
-
 
 def files_named(params: BaseModel, directory: Path) -> Iterator[Path]:
-    """Every text in the parameters as a path, also without options after a `?`.
+    """The existing files and folders that texts in the parameters name, also with options after a `?`.
 
     directory : for relative paths, besides the current directory.
     """
     for text in _texts(params.model_dump()):
         for name in {text, text.partition("?")[0]} - {""}:
-            yield from (expanded(name), directory / expanded(name))
+            paths = (expanded(name), directory / expanded(name))
+            yield from (path for path in paths if os.path.exists(path) and not is_device(str(path)))
 
 
 def files_written(cls: type, params: StageParams) -> list[str]:

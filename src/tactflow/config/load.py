@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -10,7 +11,7 @@ from typing import Any, get_args
 from tactflow.calibration import KINDS, kinds
 from tactflow.config import sensors, wiring
 from tactflow.config.document import Document, described, dotted, read_document
-from tactflow.config.files_used import file_id, files_named, files_written
+from tactflow.config.files_used import files_named, files_written
 from tactflow.config.models import RESERVED, Entry, PipelineFile, SinkEntry, is_word
 from tactflow.config.overrides import Override, add_sinks, apply
 from tactflow.config.registry import Section, code_place, resolve
@@ -182,26 +183,20 @@ def _check_files(
     drafts: Sequence[Draft], pipeline: Path, calibration: Path | None, document: Document
 ) -> None:
     """Report sinks that write the same file, or a file that the run reads."""
-    readers = {file_id(pipeline): "the pipeline file"}
+    users = {os.path.realpath(pipeline): "is the pipeline file"}
     if calibration:
-        readers[file_id(calibration)] = "the calibration"
+        users[os.path.realpath(calibration)] = "is the calibration"
     for draft in drafts:
         if draft.section == "stages" and draft.params is not None:
-            reader = f"what {dotted(draft.keys)} reads"
-            readers |= {file_id(path): reader for path in files_named(draft.params, pipeline.parent)}
-    writers: dict[str, Draft] = {}
+            reads = f"is what {dotted(draft.keys)} reads"
+            users |= {os.path.realpath(path): reads for path in files_named(draft.params, pipeline.parent)}
     for draft in drafts:
-        if draft.component is None or draft.params is None:
-            continue
-        for path in files_written(draft.component.cls, draft.params):
-            writer = writers.setdefault(path, draft)
-            identity = file_id(path)
-            if writer is not draft:
-                message = f"{writer.id} ({writer.mark}) writes {path} already; choose another path"
-                document.report(draft.keys, message, at_key=True)
-            elif identity is not None and identity in readers:
-                message = f"{path} is {readers[identity]}; choose another path"
-                document.report(draft.keys, message, at_key=True)
+        if draft.component is not None and draft.params is not None:
+            for path in files_written(draft.component.cls, draft.params):
+                if path in users:
+                    message = f"{path} {users[path]}; choose another path"
+                    document.report(draft.keys, message, at_key=True)
+                users[path] = f"is written by {draft.id} ({draft.mark})"
 
 
 def _calibration(document: Document, directory: Path) -> Path | None:

@@ -7,7 +7,7 @@ are checked elsewhere in this package.
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
@@ -17,10 +17,6 @@ STATISTICS = "stats"
 """Reserved name of a sensor: the topic of statistics."""
 
 WORD = "^[A-Za-z0-9_-]+$"
-
-MAX_THREADS: Final = 1024
-"""Maximum number of OpenCV's threads; the system refuses some ten thousand. Chosen by hand: more than a
-computer has processors."""
 
 
 def is_word(text: str) -> bool:
@@ -135,7 +131,8 @@ class PipelineFile(Part):
     opencv_threads: int | None = Field(
         None,
         ge=0,
-        le=MAX_THREADS,
+        # The system refuses some ten thousand.
+        le=1024,
         description="threads of OpenCV; 1: none beside the caller's; null: OpenCV's choice",
     )
     stages: Annotated[dict[Word, Annotated[StageEntry, _EMPTY]], _EMPTY] = Field(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
+import os
 import pkgutil
 import re
 import sys
@@ -12,7 +13,7 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType, TracebackType
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Literal, get_args
 
 from tactflow.config.models import RESERVED
 from tactflow.engine.conformance import component, kind_of
@@ -21,9 +22,6 @@ from tactflow.engine.graph import Component
 from tactflow.system.files import read_limited
 from tactflow.system.plugins import plugins
 from tactflow.system.spelling import closest, did_you_mean
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
 
 Section = Literal["stages", "sinks"]
 
@@ -44,9 +42,9 @@ def resolve(use: str, section: Section, *folders: Path) -> Component:
     if not separator and _is_file(use):
         file, name = use, ""
     if _is_file(file):
-        resolved = component(_find_class(_load_file(folders, file), name, section), use, file, RESERVED)
+        resolved = _component(_load_file(folders, file), name, section, use, file)
     elif separator:
-        resolved = component(_find_class(_load_module(file), name, section), use, f"module {file}", RESERVED)
+        resolved = _component(_load_module(file), name, section, use, f"module {file}")
     else:
         resolved = _named(use, section)
     if (resolved.kind == "sink") != (section == "sinks"):
@@ -67,12 +65,6 @@ def catalogue() -> tuple[list[Component], list[str]]:
                 components.append(_named(name, section))
             except ConfigError as error:
                 problems.append(str(error))
-        problems += [
-            f"{entry.name} of {_plugin_origin(entry)} is not used, as a built-in has that name; name its "
-            f"class instead (use: {entry.value})"
-            for entry in plugins(f"tactflow.{section}")
-            if entry.name in _builtins(section)
-        ]
     return components, problems
 
 
@@ -93,19 +85,18 @@ def _builtins(section: Section) -> list[str]:
 def _named(name: str, section: Section) -> Component:
     # Built-ins first, because searching for plug-ins takes some milliseconds.
     if name in _builtins(section):
-        module = f"tactflow.{section}.{name}"
-        return component(_find_class(_load_module(module), "", section), name, "built-in", RESERVED)
+        module = _load_module(f"tactflow.{section}.{name}")
+        return _component(module, "", section, name, "built-in")
     entries = [entry for entry in plugins(f"tactflow.{section}") if entry.name == name]
+    origins = [f"plug-in {entry.dist.name} {entry.dist.version}" for entry in entries if entry.dist]
     if len(entries) > 1:
         raise ConfigError(
-            f"{name} is claimed by {' and by '.join(map(_plugin_origin, entries))}; name the class instead "
+            f"{name} is claimed by {' and by '.join(origins)}; name the class instead "
             f"(use: {' or '.join(entry.value for entry in entries)}) or uninstall one of them"
         )
     if entries:
-        module, _, attribute = entries[0].value.partition(":")
-        origin = _plugin_origin(entries[0])
-        cls = _find_class(_load_module(module.strip(), origin), attribute.strip(), section)
-        return component(cls, name, origin, RESERVED)
+        module = _load_module(entries[0].module, origins[0])
+        return _component(module, entries[0].attr, section, name, origins[0])
     opposite: Section = "sinks" if section == "stages" else "stages"
     if name in names(opposite):
         raise ConfigError(f"{name} is under {section}: but belongs under {opposite}:")
@@ -115,10 +106,8 @@ def _named(name: str, section: Section) -> Component:
     )
 
 
-def _plugin_origin(entry: EntryPoint) -> str:
-    if entry.dist is None:
-        return f"plug-in {entry.value}"
-    return f"plug-in {entry.dist.name} {entry.dist.version}"
+def _component(module: ModuleType, name: str, section: Section, use: str, origin: str) -> Component:
+    return component(_find_class(module, name, section), use, origin, RESERVED)
 
 
 def _load_module(name: str, owner: str = "") -> ModuleType:
@@ -129,7 +118,7 @@ def _load_module(name: str, owner: str = "") -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name is not None and (name == error.name or name.startswith(error.name + ".")):
             raise ConfigError(
-                f"{owner + ': ' if owner else ''}there is no module {error.name}; "
+                f"{owner and owner + ': '}there is no module {error.name}; "
                 "is it installed in this environment? A loose file is named as ./file.py:Class"
             ) from None
         raise ConfigError(_failure(name, error)) from None
@@ -139,18 +128,14 @@ def _load_module(name: str, owner: str = "") -> ModuleType:
 
 def _load_file(folders: Sequence[Path], file: str) -> ModuleType:
     """Run a Python file as a module, once for each version of the file."""
+    # Both folders may be the same.
+    paths = list(dict.fromkeys(Path(os.path.abspath(folder / file)) for folder in folders))
+    path = next(filter(os.path.exists, paths), paths[0])
     try:
-        # Both folders may be the same.
-        paths = list(dict.fromkeys((folder / file).resolve() for folder in folders))
-        path = next((path for path in paths if path.exists()), paths[0])
         source = read_limited(path)
-    except FileNotFoundError as error:
-        places = " or ".join(map(str, paths))
-        raise ConfigError(f"cannot read {file}: {error.strerror} ({places})") from None
-    except OSError as error:
-        raise ConfigError(f"cannot read {file}: {error.strerror} ({path})") from None
-    except ValueError as error:
-        raise ConfigError(f"cannot read {file!r}: {error}") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"cannot read {file}: {reason} ({' or '.join(map(str, paths))})") from None
     digest = hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:16]
     name = f"tactflow_file_{path.stem}_{digest}"
     if name in sys.modules:
@@ -195,11 +180,9 @@ def _find_class(module: ModuleType, name: str, section: Section) -> type:
     }
     usable = {key: value for key, value in public.items() if kind_of(value)}
     if name:
-        attribute: Any = module
-        for part in name.split("."):
-            attribute = getattr(attribute, part, None)
-        if inspect.isclass(attribute):
-            return attribute
+        cls = getattr(module, name, None)
+        if inspect.isclass(cls):
+            return cls
         raise ConfigError(f"{where} has no class {name}{did_you_mean(name, usable or public, 'it has ')}")
     if len(set(usable.values())) == 1:
         return next(iter(usable.values()))

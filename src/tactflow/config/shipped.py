@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tactflow.config.document import SOURCE_OPTION
 from tactflow.engine.errors import ConfigError
-from tactflow.system.spelling import closest
+from tactflow.system.spelling import did_you_mean
 
 
 def packaged_pipelines() -> list[str]:
@@ -44,12 +44,9 @@ def find_pipeline(name: str | None) -> Path:
     if not path.exists() and stem in packaged_pipelines() and path.parent in (Path(), Path("pipelines")):
         return _packaged(stem)
     if not path.exists() and name == stem and path.parent == Path():
-        known = packaged_pipelines()
-        close = closest(name, known)
-        advice = f"; did you mean {close}?" if close else "."
         raise ConfigError(
-            f"there is no file {name}, and no pipeline of that name comes with tactflow{advice} "
-            f"Those that do: {', '.join(known)} (tactflow pipelines); {SOURCE_OPTION}"
+            f"there is no file {name}, and tactflow has no pipeline of that name"
+            f"{did_you_mean(name, packaged_pipelines(), 'it has ')} (tactflow pipelines); {SOURCE_OPTION}"
         )
     return path
 

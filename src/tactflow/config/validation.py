@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from tactflow.config.document import Document, Keys, described, dotted, shown
@@ -83,23 +82,21 @@ def report(
 
     keys : path of the validated mapping. also : its valid keys besides those of the model.
     """
+    named = {field.alias or name: field for name, field in model.model_fields.items()}
     groups: dict[Keys, list[tuple[ErrorDetails, Keys]]] = {}
     for detail in error.errors(include_url=False):
         place, rest = _place(document, keys, detail)
-        kind, inside = detail["type"], place[len(keys) : -1]
-        if kind == "json_invalid":
-            document.report(keys, "a text is not UTF-8; rename the file", at_key=True)
-        elif kind == "missing" and not rest:
-            field = _fields(model, inside).get(str(place[-1]))
-            about = f" ({field.description})" if field and field.description else ""
-            message = f"{dotted(place)}: {_message(detail)}{about}"
-            document.report_at(document.key_mark(*place[:-1]), message)
+        kind, name = detail["type"], str(place[-1]) if place else ""
+        is_own = len(place) == len(keys) + 1
+        if kind == "missing" and not rest:
+            about = named[name].description if is_own else None
+            message = _message(detail) + (f" ({about})" if about else "")
+            document.report_at(document.key_mark(*place[:-1]), f"{dotted(place)}: {message}")
         elif kind == "extra_forbidden" and not rest:
-            known = [*_fields(model, inside), *(() if inside else sorted(also))]
-            hint = did_you_mean(str(place[-1]), known, "there are ")
+            hint = did_you_mean(name, [*named, *sorted(also)], "there are ") if is_own else ""
             document.report(place, f"unknown {noun}{hint}", at_key=True)
         elif rest == ("[key]",):
-            document.report(place, f"{_message(detail)}, got {shown(place[-1])}", at_key=True)
+            document.report(place, f"{_message(detail)}, got {shown(name)}", at_key=True)
         else:
             groups.setdefault(place, []).append((detail, rest))
     for place, members in groups.items():
@@ -111,9 +108,8 @@ def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, 
     part of it."""
     place, rest = keys, list(detail["loc"])
     while rest:
-        value, step = document.get(*place), rest[0]
-        is_index = isinstance(value, list) and isinstance(step, int) and step < len(value)
-        if not (is_index or (isinstance(value, dict) and step in value)):
+        value = document.get(*place)
+        if rest[0] not in (range(len(value)) if isinstance(value, list) else document.mapping(*place)):
             break
         place = (*place, rest.pop(0))
     if detail["type"] == "missing" and len(rest) == 1:
@@ -139,8 +135,7 @@ def _words(members: Sequence[tuple[ErrorDetails, Keys]], value: Any) -> str:
 def _message(detail: ErrorDetails) -> str:
     """Pydantic's message in the terms of YAML."""
     if detail["type"] == "missing":
-        item = isinstance(detail["loc"][-1], int)
-        return "this item of the list is missing" if item else "required, but not given"
+        return "required, but not given"
     if detail["type"] == "extra_forbidden":
         return "unknown key"
     if detail["type"] in ("value_error", "assertion_error"):
@@ -149,23 +144,3 @@ def _message(detail: ErrorDetails) -> str:
     for pattern, words in _YAML_TERMS.items():
         text = re.sub(pattern, words, text)
     return text[0].lower() + text[1:]
-
-
-def _fields(model: type[BaseModel], location: Keys) -> dict[str, FieldInfo]:
-    """The fields of the (nested) model at a location, by their names in a file."""
-    models: list[type[BaseModel]] = [model]
-    for part in location:
-        field = _named(models).get(str(part))
-        # Items of lists and values of mappings are of the models in the annotation around them.
-        models = _models_in(field.annotation) if field else models
-    return _named(models)
-
-
-def _named(models: Sequence[type[BaseModel]]) -> dict[str, FieldInfo]:
-    return {field.alias or name: field for model in models for name, field in model.model_fields.items()}
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for part in get_args(annotation) for model in _models_in(part)]

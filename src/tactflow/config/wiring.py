@@ -70,7 +70,11 @@ def ordered(drafts: Sequence[Draft], document: Document) -> list[Draft]:
         if draft.id in done:
             return
         if draft.id in chain:
-            _report_cycle([by_id[name] for name in chain[chain.index(draft.id) :]], document)
+            # Each takes an output of the next.
+            cycle = [*chain[chain.index(draft.id) :], draft.id]
+            mark = next(mark for ref, mark in draft.edges if ref.node == cycle[1])
+            ring = " -> ".join(cycle[::-1])
+            document.report_at(mark, f"{dotted(draft.keys)}: the stages form a cycle, {ring}")
             return
         chain.append(draft.id)
         for ref, _ in draft.edges:
@@ -81,19 +85,6 @@ def ordered(drafts: Sequence[Draft], document: Document) -> list[Draft]:
     for draft in drafts:
         visit(draft)
     return list(done.values())
-
-
-def _report_cycle(members: Sequence[Draft], document: Document) -> None:
-    steps = []
-    for user, producer in zip(members, [*members[1:], members[0]], strict=True):
-        steps.append(next((user, ref, mark) for ref, mark in user.edges if ref.node == producer.id))
-    steps.reverse()
-    start = min(range(len(steps)), key=lambda index: (steps[index][2].line, steps[index][2].column))
-    steps = steps[start:] + steps[:start]
-    ring = " -> ".join([steps[0][1].node, *(user.id for user, _, _ in steps)])
-    takes = "; ".join(f"{user.id} takes {ref} ({mark})" for user, ref, mark in steps)
-    user, _, mark = steps[0]
-    document.report_at(mark, f"{dotted(user.keys)}: the stages form a cycle, {ring}: {takes}")
 
 
 class _Wiring:
@@ -176,10 +167,9 @@ class _Wiring:
         stage, dot, _ = text.partition(".")
         ids = [draft.id for draft in self._stages if draft is not user]
         ports = {name: Ref(draft.id, name) for draft in self._stages for name in draft.outputs}
-        if text in ports and by_port:
-            return f"no stage above gives {text}; {ports[text].node} stands below: write {ports[text]}"
         if text in ports:
-            return f"{text!r} is a port, not a stage; write {ports[text]}"
+            where = "of no stage above" if by_port else "not a stage"
+            return f"{text!r} is a port, {where}; write {ports[text]}"
         if by_port and not dot:
             signals = [name for name, ref in ports.items() if self._signal(ref) is not None]
             return f"there is no signal {text!r}{did_you_mean(text, signals, 'signals: ')}"
@@ -216,11 +206,9 @@ class _Wiring:
         if below is not None and below is not user:
             text += f"; {below.id} gives it but stands below: move it up, or write in: "
             return text + f"{{{port.name}: {below.id}.{port.name}}}"
-        text += f"; there are {', '.join(outputs)}" if outputs else "; there are none"
         makers = [c.name for c in catalogue()[0] if port.name in (output.name for output in c.ports.outputs)]
-        if makers:
-            return text + f"; it comes from the stage {' or '.join(makers)}"
-        return text
+        known = f"there are {', '.join(outputs)}" if outputs else "there are none"
+        return f"{text}; {known}" + (f"; it comes from the stage {' or '.join(makers)}" if makers else "")
 
     def _gate(self, text: Any, place: Keys, draft: Draft) -> None:
         ref = self._reference(text, place, draft, by_port=True)
