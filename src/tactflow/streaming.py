@@ -60,9 +60,7 @@ def stream(
             link.when_full = "latest"
         link.put(result.kept(pictures=images))
 
-    collecting = with_collector(
-        pipeline, Result, hand_over, name=link.name, sinks=sinks, background=True, pictures=images
-    )
+    collecting = with_collector(pipeline, Result, hand_over, name=link.name, sinks=sinks, background=True)
     runner = make_runner(collecting, max_frames=max_frames)
     return _results(runner, link)
 

@@ -130,7 +130,7 @@ CASES = [
     (
         "compare",
         "  o: {use: @Outline, in: {contact_mask: §prepare.image}}",
-        "takes (H, W) uint8 .. prepare.image .. bad.yaml:3:3 .. gives (H, W, 3) uint8 .. 3 axes",
+        "takes (H, W) uint8 .. prepare.image .. bad.yaml:3:3 .. gives (H, W, 3) uint8",
     ),
     (
         "compare",
@@ -155,13 +155,7 @@ CASES = [
         "prepare",
         "  compare: {use: @Compare, segment: §a}\n  outline: {use: @Outline, segment: b}\n"
         "  refine: {use: @Refine, segment: a}",
-        "compare: segments .. circle",
-    ),
-    (
-        "source",
-        "  prepare: {use: @Prepare, queue: {capacity: 2}}\n"
-        "  compare: {use: @Compare, queue: §{capacity: 3}}\n  outline: {use: @Outline}",
-        "compare.queue: its segment has a queue already .. by prepare",
+        "compare: the segments a (compare, refine) and b (outline) form a cycle",
     ),
 ]
 """Base, lines with the mark where the mistake is, and what the message says, in parts."""

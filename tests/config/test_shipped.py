@@ -58,6 +58,6 @@ def test_a_calibration_that_is_missing_is_told_with_both_places_where_it_may_lie
 
 
 def test_an_unknown_name_is_reported_with_the_closest_one() -> None:
-    with pytest.raises(ConfigError, match=r"no pipeline of that name; did you mean tactip\?"):
+    with pytest.raises(ConfigError, match=r"no pipeline of that name in tactflow; did you mean tactip\?"):
         find_pipeline("tactipp")
     assert find_pipeline("no_such.yaml") == Path("no_such.yaml"), "a file, which the reader reports"

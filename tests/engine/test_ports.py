@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from tactflow.engine.ports import (
     Port,
     ResultParameter,
     SignalPort,
-    mismatch,
+    fits,
     port_type,
     read_ports,
 )
@@ -133,12 +133,10 @@ def test_a_sink_may_take_a_result_with_the_ports_that_its_class_names() -> None:
     assert ports.outputs == ()
 
 
-@pytest.mark.parametrize("annotation", [Iterator[Frame], Generator[Frame, None, None]])
-def test_a_source_gives_the_port_frame(annotation: Any) -> None:
+def test_a_source_gives_the_port_frame() -> None:
     class Source:
-        def frames(self) -> Any: ...
+        def frames(self) -> Iterator[Frame]: ...
 
-    Source.frames.__annotations__["return"] = annotation
     ports = read_ports(Source, "frames")
     assert (ports.inputs, ports.outputs) == ((), (Port("frame", Frame),))
 
@@ -146,13 +144,9 @@ def test_a_source_gives_the_port_frame(annotation: Any) -> None:
 class Broken:
     """Methods whose annotations break the contract."""
 
-    def numbers(self) -> Iterator[int]: ...
-
     def tick(self, tick: Tick) -> Contact: ...
 
     def bare_result(self, result): ...  # type: ignore[no-untyped-def]
-
-    def by_name(self, *, gain: Flow) -> Contact: ...
 
     def no_input(self) -> Contact: ...
 
@@ -170,10 +164,8 @@ class Broken:
 @pytest.mark.parametrize(
     ("function", "method", "words"),
     [
-        (Broken.numbers, "frames", r"must be Iterator\[Frame\]"),
         (Broken.tick, "process", "only a sink may take a result"),
         (Broken.bare_result, "write", "result has no annotation; .* is annotated result: Result"),
-        (Broken.by_name, "process", "gain: an input is passed by position"),
         (Broken.no_input, "process", "needs at least one input"),
         (Broken.no_return, "process", "no return annotation"),
         (Broken.default, "process", "gain has a default"),
@@ -191,28 +183,28 @@ def test_annotations_that_break_the_contract_are_reported_with_their_line(
 
 
 @pytest.mark.parametrize(
-    ("given", "wanted", "reason"),
+    ("given", "wanted", "expected"),
     [
-        (Image, Image, None),
-        (Image, AnyChannels, None),
-        (AnyChannels, Image, "axis of size C where 3 is wanted"),
-        (Image, ContactMask, "3 axes where 2 are wanted"),
-        (Grey, ContactMask, "unit 'grey levels' where '0 or 255' is wanted"),
-        (FloatMask, ContactMask, "dtype float32 where uint8 is wanted"),
-        (Touching, Moving, None),
-        (Touching, bool, None),
-        (bool, Touching, "the types differ"),
-        (Contact, Contact, None),
-        (Contact, Flow, "the types differ"),
-        (bool, int, None),
-        (int, bool, "the types differ"),
-        (Contact, object, None),
-        (Image, Any, None),
-        (Image, Contact, "the types differ"),
-        (Contact, Image, "the types differ"),
-        (list[int], list[int], None),
-        (list[int], list[str], "the types differ"),
+        (Image, Image, True),
+        (Image, AnyChannels, True),
+        (AnyChannels, Image, False),
+        (Image, ContactMask, False),
+        (Grey, ContactMask, False),
+        (FloatMask, ContactMask, False),
+        (Touching, Moving, True),
+        (Touching, bool, True),
+        (bool, Touching, False),
+        (Contact, Contact, True),
+        (Contact, Flow, False),
+        (bool, int, True),
+        (int, bool, False),
+        (Contact, object, True),
+        (Image, Any, True),
+        (Image, Contact, False),
+        (Contact, Image, False),
+        (list[int], list[int], True),
+        (list[int], list[str], False),
     ],
 )
-def test_an_output_fits_an_input_or_says_why_not(given: Any, wanted: Any, reason: str | None) -> None:
-    assert mismatch(Port("given", given), Port("wanted", wanted)) == reason
+def test_an_output_fits_an_input_of_its_type(given: Any, wanted: Any, expected: bool) -> None:
+    assert fits(Port("given", given), Port("wanted", wanted)) == expected

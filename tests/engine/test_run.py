@@ -579,8 +579,8 @@ def test_an_interrupt_while_one_part_is_closed_reaches_the_caller_when_the_other
 # -- the graph --------------------------------------------------------------------------------------------
 
 
-def test_segments_that_feed_each_other_in_a_circle_are_refused(toy_runner: MakeRunner) -> None:
-    with pytest.raises(Exception, match="circle") as caught:
+def test_segments_that_form_a_cycle_are_refused(toy_runner: MakeRunner) -> None:
+    with pytest.raises(Exception, match="form a cycle") as caught:
         toy_runner({"level": {"segment": "a"}, "heavy": {"segment": "b"}, "gated": {"segment": "a"}})
     assert "toy.yaml:" in str(caught.value)
     assert type(caught.value).__name__ == "ConfigError"

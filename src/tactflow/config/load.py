@@ -22,7 +22,7 @@ from tactflow.engine.conformance import configured, declares
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, OnError, Pipeline
-from tactflow.engine.plan import plan_problems
+from tactflow.engine.plan import plan_problem
 from tactflow.system.files import expanded
 
 _SECTIONS: tuple[Section, ...] = get_args(Section)
@@ -80,8 +80,9 @@ def load_pipeline(
         warnings=_warnings(document, drafts),
         settings=_settings(document, name, drafts),
     )
-    for mark, message in plan_problems(pipeline):
-        document.report_at(mark, message)
+    problem = plan_problem(pipeline)
+    if problem is not None:
+        document.report_at(*problem)
     document.raise_if_mistaken()
     return pipeline
 

@@ -45,8 +45,8 @@ def find_pipeline(name: str | None) -> Path:
         return _packaged(stem)
     if not path.exists() and name == stem and path.parent == Path():
         raise ConfigError(
-            f"there is no file {name}, and tactflow has no pipeline of that name"
-            f"{did_you_mean(name, packaged_pipelines(), 'it has ')} (tactflow pipelines); {SOURCE_OPTION}"
+            f"there is no file {name}, and no pipeline of that name in tactflow"
+            f"{did_you_mean(name, packaged_pipelines(), 'it has ')}; {SOURCE_OPTION}"
         )
     return path
 

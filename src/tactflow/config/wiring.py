@@ -10,7 +10,7 @@ from tactflow.config.document import Document, Keys, dotted
 from tactflow.config.registry import Section, catalogue
 from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Component, Mark, Ref
-from tactflow.engine.ports import Port, SignalPort, describe_type, mismatch, port_type
+from tactflow.engine.ports import Port, SignalPort, describe_type, fits, port_type
 from tactflow.system.spelling import did_you_mean
 
 
@@ -190,12 +190,11 @@ class _Wiring:
     def _check_type(self, ref: Ref, port: Port, mark: Mark, place: Keys) -> None:
         producer = self._by_id[ref.node]
         output = producer.outputs[ref.port]
-        reason = mismatch(output, port)
-        if reason is not None:
+        if not fits(output, port):
             self._document.report_at(
                 mark,
                 f"{dotted(place)}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} "
-                f"({producer.mark}) gives {describe_type(output.annotation)}: {reason}",
+                f"({producer.mark}) gives {describe_type(output.annotation)}",
             )
 
     def _dangling(self, port: Port, user: Draft) -> str:

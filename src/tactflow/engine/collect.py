@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -9,7 +10,7 @@ from typing import Any, TypeVar
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
 from tactflow.engine.graph import Component, Mark, Node, Pipeline, Ref
-from tactflow.engine.ports import ArrayPort, Port, Ports, ResultParameter, port_type, ports_of
+from tactflow.engine.ports import Port, Ports, ResultParameter, ports_of
 
 T = TypeVar("T", bound=Tick)
 
@@ -37,7 +38,6 @@ def with_collector(
     name: str,
     sinks: bool = False,
     background: bool = False,
-    pictures: bool = True,
     references: bool = False,
 ) -> Pipeline:
     """Add a sink that passes every result to a function.
@@ -52,18 +52,13 @@ def with_collector(
     name : id of the sink; a dot in it keeps it distinct from the ids of pipeline files.
     sinks : keep the pipeline's own sinks.
     background : call `take` in its own thread, where it may block.
-    pictures : also collect (H, W, 3) uint8 outputs that `kind` does not name.
     references : also collect a reference image that is not part of the source.
     """
     nodes = {id_: node for id_, node in pipeline.nodes.items() if sinks or node.component.kind != "sink"}
     known = {port.name for port in ports_of(kind)}
     stages = [node for node in pipeline.nodes.values() if node.component.kind == "stage"]
     stages = [node for node in stages if not node.component.cls.on_demand]
-    outputs = {
-        name: ref
-        for name, (ref, port) in _named_outputs(stages).items()
-        if pictures or name in known or not _is_picture(port)
-    }
+    outputs = _named_outputs(stages)
     read = {ref for node in stages for ref in [*node.inputs.values(), *(gate.signal for gate in node.gates)]}
     inputs = {port: ref for port, ref in outputs.items() if port in known or ref not in read}
     passive = {port: ref for port, ref in outputs.items() if port not in inputs}
@@ -78,17 +73,9 @@ def with_collector(
     return replace(pipeline, nodes=nodes)
 
 
-def _named_outputs(stages: Sequence[Node]) -> dict[str, tuple[Ref, Port]]:
+def _named_outputs(stages: Sequence[Node]) -> dict[str, Ref]:
     """Name in a result -> output. If several stages have the port, its plain name refers to the last one."""
-    by_name: dict[str, list[tuple[Ref, Port]]] = {}
-    for node in stages:
-        for port in node.component.ports.outputs:
-            by_name.setdefault(port.name, []).append((Ref(node.id, port.name), port))
-    ambiguous = [output for outputs in by_name.values() if len(outputs) > 1 for output in outputs]
-    plain = {name: outputs[-1] for name, outputs in by_name.items()}
-    return {str(ref): (ref, port) for ref, port in ambiguous} | plain
-
-
-def _is_picture(port: Port) -> bool:
-    spec = port_type(port.annotation)
-    return isinstance(spec, ArrayPort) and spec.dtype == "uint8" and spec.shape[2:] == (3,)
+    refs = [Ref(node.id, port.name) for node in stages for port in node.component.ports.outputs]
+    plain = {ref.port: ref for ref in refs}
+    count = Counter(ref.port for ref in refs)
+    return {str(ref): ref for ref in refs if count[ref.port] > 1} | plain

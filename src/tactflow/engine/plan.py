@@ -10,7 +10,7 @@ segment after it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tactflow.engine.contract import Sink
@@ -108,7 +108,7 @@ def _union(first: Demand, second: Demand) -> Demand:
 def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
     """Prune unneeded stages, divide the rest into segments, and choose the links between them.
 
-    pipeline : without `plan_problems`. live : whether frames are dropped rather than delayed.
+    pipeline : without a `plan_problem`. live : whether frames are dropped rather than delayed.
     """
     pruned, members, before = _cut(pipeline)
     links: list[LinkPlan] = []
@@ -121,10 +121,18 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
     return Plan(pipeline, members, links, pruned)
 
 
-def plan_problems(pipeline: Pipeline) -> list[tuple[Mark, str]]:
-    """The errors that prevent a plan, each with the location of the cause."""
+def plan_problem(pipeline: Pipeline) -> tuple[Mark, str] | None:
+    """The error that prevents a plan, with the location of its cause: segments that form a cycle."""
     _, members, before = _cut(pipeline)
-    return [*_circles(pipeline, before, members), *_idle_queues(pipeline, members)]
+    cycle = [name for name in before if name in _ancestors(name, before)]
+    placed = [pipeline.nodes[id_] for name in cycle for id_ in members[name] if pipeline.nodes[id_].segment]
+    if not placed:
+        return None
+    contents = " and ".join(f"{name} ({', '.join(members[name])})" for name in cycle)
+    return (
+        placed[0].marks.get("segment", placed[0].mark),
+        f"{placed[0].id}: the segments {contents} form a cycle, so none could start; move a stage to another",
+    )
 
 
 def _cut(pipeline: Pipeline) -> tuple[list[Node], dict[str, list[str]], dict[str, set[str]]]:
@@ -176,27 +184,6 @@ def _ancestors(name: str, before: Mapping[str, Iterable[str]]) -> set[str]:
     return ancestors
 
 
-def _circles(
-    pipeline: Pipeline, before: Mapping[str, set[str]], members: Mapping[str, list[str]]
-) -> Iterator[tuple[Mark, str]]:
-    """Each cycle of segments, reported at a node that the file assigns to one of them."""
-    reported: set[str] = set()
-    for name in before:
-        ancestors = _ancestors(name, before)
-        if name in reported or name not in ancestors:
-            continue
-        cycle = [s for s in before if s in ancestors and name in _ancestors(s, before)]
-        reported.update(cycle)
-        nodes = [pipeline.nodes[id_] for segment in cycle for id_ in members[segment]]
-        placed = [node for node in nodes if node.segment] or nodes
-        contents = "; ".join(f"{segment} holds {', '.join(members[segment])}" for segment in cycle)
-        yield (
-            placed[0].marks.get("segment", placed[0].mark),
-            f"{placed[0].id}: segments {', '.join(cycle)} feed each other in a circle, so none could start; "
-            f"{contents}: move one of them to another segment",
-        )
-
-
 def _link(
     pipeline: Pipeline, producer: str, consumer: str, members: Mapping[str, Sequence[str]], *, live: bool
 ) -> LinkPlan:
@@ -211,19 +198,3 @@ def _link(
         newest = pipeline.source.id in members[producer]
     policy: FullPolicy = "latest" if live and newest else "block"
     return LinkPlan(producer, consumer, queue.capacity or capacity, queue.when_full or policy)
-
-
-def _idle_queues(pipeline: Pipeline, members: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mark, str]]:
-    """Queue settings that have no effect."""
-    for ids in members.values():
-        queued = [pipeline.nodes[id_] for id_ in ids if pipeline.nodes[id_].queue != Queue()]
-        for node in queued:
-            place = node.marks.get("queue", node.mark)
-            if node is not queued[0]:
-                yield (
-                    place,
-                    f"{node.id}.queue: its segment has a queue already, given at {queued[0].mark} by "
-                    f"{queued[0].id}; a segment has one queue in front of it",
-                )
-            if node.component.kind == "source":
-                yield place, f"{node.id}.queue: nothing comes before the source"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -104,24 +104,27 @@ def ports_of(kind: type[Tick]) -> list[Port]:
     return [_input(name, annotation) for name, annotation in kind.port_types().items()]
 
 
-def mismatch(output: Port, input_: Port) -> str | None:
-    """Why `output` cannot be connected to `input_`, or None if it can.
+def fits(output: Port, input_: Port) -> bool:
+    """Whether `output` can be connected to `input_`.
 
     A class must be the same or a subclass. Arrays must agree in rank, in each dimension (an exact size
     matches a named one), in dtype and in unit. A signal matches any signal and bool.
     """
     offered, wanted = port_type(output.annotation), port_type(input_.annotation)
     if wanted is Any or wanted is object:
-        return None
+        return True
     if isinstance(offered, ArrayPort) and isinstance(wanted, ArrayPort):
-        return _array_misfit(offered, wanted)
+        axes = [
+            have == want or (isinstance(have, int) and isinstance(want, str))
+            for have, want in zip(offered.shape, wanted.shape, strict=False)
+        ]
+        same_values = (offered.dtype, offered.unit) == (wanted.dtype, wanted.unit)
+        return same_values and len(offered.shape) == len(wanted.shape) and all(axes)
     if isinstance(offered, SignalPort):
-        fits = isinstance(wanted, SignalPort) or wanted is bool
-    elif inspect.isclass(offered) and inspect.isclass(wanted):
-        fits = issubclass(offered, wanted)
-    else:
-        fits = offered == wanted
-    return None if fits else "the types differ"
+        return isinstance(wanted, SignalPort) or wanted is bool
+    if inspect.isclass(offered) and inspect.isclass(wanted):
+        return issubclass(offered, wanted)
+    return bool(offered == wanted)
 
 
 def port_type(annotation: Any) -> Any:
@@ -147,10 +150,10 @@ class _PortError(Exception):
 
 
 def _ports(function: Callable[..., Any], method: str) -> Ports:
+    if method == "frames":
+        return Ports((), (Port("frame", Frame),))
     hints = _hints(function)
     parameters = list(inspect.signature(function).parameters.values())[1:]
-    if method == "frames":
-        return Ports((), (_source_port(hints.get("return")),))
     inputs: list[Port] = []
     result: ResultParameter | None = None
     named = {parameter.name for parameter in parameters}
@@ -184,14 +187,6 @@ def _hints(annotated: Any) -> dict[str, Any]:
         raise _PortError(f"the annotations cannot be evaluated ({type(error).__name__}: {error})") from None
 
 
-def _source_port(annotation: Any) -> Port:
-    origin, args = get_origin(annotation), get_args(annotation)
-    iterates = inspect.isclass(origin) and issubclass(origin, Iterable)
-    if not (iterates and inspect.isclass(args[0]) and issubclass(args[0], Frame)):
-        raise _PortError("the return annotation must be Iterator[Frame]")
-    return Port("frame", args[0])
-
-
 def _parameter(parameter: inspect.Parameter, annotation: Any) -> Port:
     name = parameter.name
     if annotation is None:
@@ -201,8 +196,6 @@ def _parameter(parameter: inspect.Parameter, annotation: Any) -> Port:
         )
     if parameter.default not in (parameter.empty, None):
         raise _PortError(f"parameter {name} has a default, but ports have none; settings belong in Params")
-    if parameter.kind is not parameter.POSITIONAL_OR_KEYWORD:
-        raise _PortError(f"parameter {name}: an input is passed by position; leave out * and /")
     port = _input(name, annotation)
     return Port(name, port.annotation, port.optional or parameter.default is None)
 
@@ -258,17 +251,3 @@ def _single_type(annotation: Any, place: str) -> tuple[Any, bool]:
 def _members(annotation: Any) -> tuple[Any, ...]:
     is_union = get_origin(annotation) in (Union, types.UnionType)
     return get_args(annotation) if is_union else (annotation,)
-
-
-def _array_misfit(offered: ArrayPort, wanted: ArrayPort) -> str | None:
-    if len(offered.shape) != len(wanted.shape):
-        return f"{len(offered.shape)} axes where {len(wanted.shape)} are wanted"
-    for have, want in zip(offered.shape, wanted.shape, strict=True):
-        # An exact size matches a named one, but not conversely.
-        if have != want and not (isinstance(want, str) and isinstance(have, int)):
-            return f"axis of size {have} where {want} is wanted"
-    if offered.dtype != wanted.dtype:
-        return f"dtype {offered.dtype} where {wanted.dtype} is wanted"
-    if offered.unit != wanted.unit:
-        return f"unit '{offered.unit}' where '{wanted.unit}' is wanted"
-    return None

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tactflow.engine.conformance import OFFERED, build
+from tactflow.engine.conformance import build
 from tactflow.engine.contract import Part, Recorder, Source
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
 from tactflow.engine.frame import Frame
@@ -98,12 +98,12 @@ class Runner:
         self._source_slot = self.slots[source.id, source.component.ports.outputs[0].name]
         self._source_stats = NodeStats()
         self._stopping = threading.Event()
-        self._hurried = False
+        self.hurried = False
         self._interrupted = False
         self._turn = threading.Condition()
-        self._paused = False
+        self.paused = False
         self._steps = 0
-        self._source: Source | None = None
+        self.source: Source | None = None
 
     # -- life cycle ---------------------------------------------------------------------------------------
 
@@ -149,12 +149,12 @@ class Runner:
     def stop(self, reason: str = "signal") -> None:
         with self._lock:
             self._end = self._end or reason
-            self._hurried = self._hurried or reason != "max_frames"
+            self.hurried = self.hurried or reason != "max_frames"
         self._stopping.set()
         with self._turn:
             self._turn.notify_all()
-        if self._source is not None:
-            self._source.stop()
+        if self.source is not None:
+            self.source.stop()
 
     def fail(self, error: TactflowError, cause: BaseException | None = None) -> None:
         """Stop the run because of an error; the first one is reported."""
@@ -168,32 +168,20 @@ class Runner:
         self.stop(f"error: {error}")
 
     def retake_reference(self) -> None:
-        if self._source is not None:
-            self._source.retake()
+        if self.source is not None:
+            self.source.retake()
 
     def pause(self, paused: bool) -> None:
         with self._turn:
-            self._paused = paused
+            self.paused = paused
             self._steps = 0
             self._turn.notify_all()
-
-    @property
-    def paused(self) -> bool:
-        return self._paused
-
-    @property
-    def hurried(self) -> bool:
-        return self._hurried
 
     def step(self) -> None:
         # Pending steps are discarded on resuming.
         with self._turn:
-            self._steps += self._paused
+            self._steps += self.paused
             self._turn.notify_all()
-
-    @property
-    def source(self) -> Source | None:
-        return self._source
 
     def recorder(self) -> Recorder | None:
         sinks = [node.sink for node in list(self.nodes.values())]
@@ -211,7 +199,7 @@ class Runner:
         pipeline = self.pipeline
         source = self._build(pipeline.source, SourceError)
         assert isinstance(source, Source)
-        self._source = source
+        self.source = source
         self.plan = make_plan(pipeline, live=source.live)
         pruned = {node.id for node in self.plan.pruned}
         for node in pipeline.nodes.values():
@@ -228,9 +216,15 @@ class Runner:
     def _build(self, node: Node, kind: type[TactflowError]) -> Part:
         """Construct and open the part of a node."""
         pipeline = self.pipeline
-        values = (pipeline.sensor, pipeline.directory, pipeline.skipping, self, pipeline.calibration)
+        offered = {
+            "sensor": pipeline.sensor,
+            "directory": pipeline.directory,
+            "skipping": pipeline.skipping,
+            "control": self,
+            "calibration": pipeline.calibration,
+        }
         try:
-            instance = build(node.component.cls, node.params, dict(zip(OFFERED, values, strict=True)))
+            instance = build(node.component.cls, node.params, offered)
             self._opened.append((node.id, instance))
             instance.open()
         except kind as error:
@@ -277,7 +271,7 @@ class Runner:
 
     @property
     def _is_live(self) -> bool:
-        return self._source is not None and self._source.live
+        return self.source is not None and self.source.live
 
     def _wait(self, on_progress: Callable[[Progress], None] | None, interval_s: float) -> None:
         """Wait for the threads: without limit for the end of the source, with a limit after a stop."""
@@ -290,7 +284,7 @@ class Runner:
             before, done = done, sum(s.calls for s in self._segments.values())
             done += sum(link.delivered for link in self._links)
             now = time.perf_counter()
-            if done != before or not self._hurried:
+            if done != before or not self.hurried:
                 since = now
             elif now - since > CLOSE_SECONDS:
                 places = [f"{name} (in {self._segments[name].current or 'its source'})" for name in alive]
@@ -342,10 +336,10 @@ class Runner:
                 link.close()
 
     def _capture_frames(self, segment: Segment) -> None:
-        assert self._source is not None
+        assert self.source is not None
         name, slots = self.pipeline.source.id, UNCONNECTED + 1 + len(self.slots)
         sinks = [node for node in self.nodes.values() if node.sink is not None]
-        frames = iter(self._source.frames())
+        frames = iter(self.source.frames())
         index = 0
         while not self._stopping.is_set():
             segment.current = name
@@ -356,7 +350,7 @@ class Runner:
                 segment.current = None
             if frame is None:
                 return
-            if self._paused and not self._may_go_on():
+            if self.paused and not self._may_go_on():
                 continue
             ended = time.perf_counter()
             if not frame.captured:
@@ -375,8 +369,8 @@ class Runner:
         """While paused, whether to process the captured frame; a recording waits for that."""
         with self._turn:
             if not self._is_live:
-                self._turn.wait_for(lambda: not self._paused or self._steps or self._stopping.is_set())
-            go = not self._paused or self._steps > 0
+                self._turn.wait_for(lambda: not self.paused or self._steps or self._stopping.is_set())
+            go = not self.paused or self._steps > 0
             self._steps = max(0, self._steps - 1)
             return go and not self._stopping.is_set()
 
@@ -386,7 +380,7 @@ class Runner:
         """Frames dropped before the first segment of stages, and replaced within the source."""
         source = self._segments.get(self._source_segment)
         links = [link for link, only_sinks in source.outputs if only_sinks is None] if source else []
-        missed = 0 if self._source is None else self._source.missed
+        missed = 0 if self.source is None else self.source.missed
         return max((link.drops for link in links), default=0), missed
 
     def snapshot(self) -> dict[str, Any]:

@@ -8,15 +8,18 @@ pulled first, its inputs only if the gates are open, so that a closed gate spare
 from __future__ import annotations
 
 import logging
+import os
+import traceback
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from tactflow.engine.conformance import METHODS
 from tactflow.engine.contract import Stage
-from tactflow.engine.errors import StageError
-from tactflow.engine.failure import describe_failure
+from tactflow.engine.errors import StageError, TactflowError
 from tactflow.engine.frame import Absent, Frame
+from tactflow.engine.graph import Node
 from tactflow.engine.link import Link
 from tactflow.engine.node import RunningNode, TickState
 
@@ -194,7 +197,7 @@ class Segment:
     def _failed(self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception) -> None:
         node.stats.errors += 1
         policy = node.node.on_error
-        failure = describe_failure(node.node, tick.frame, inputs, error)
+        failure = _failure(node.node, tick.frame, inputs, error)
         if policy.action == "disable":
             node.disabled = True
             logger.warning("%s\n  %s is disabled for the rest of the run", failure, node.id)
@@ -262,3 +265,37 @@ def _last_with(port: str | None, nodes: Iterable[RunningNode]) -> list[tuple[Run
     if port is None:
         return []
     return [(node, node.signals[port][0]) for node in nodes if port in node.signals][-1:]
+
+
+def _failure(node: Node, frame: Frame, values: Sequence[Any], error: Exception) -> StageError:
+    """Describe which node failed in which frame, where in its code, and with which inputs.
+
+    values : of its inputs, in the order of its ports.
+    """
+    if isinstance(error, TactflowError):
+        return StageError(f"{node.id}, frame {frame.seq} ({node.mark}): {error}")
+    engine = os.path.dirname(__file__)
+    entries = traceback.extract_tb(error.__traceback__)
+    # The calls of the engine come first, then the code of the node.
+    own = next((entry for entry in entries if os.path.dirname(entry.filename) != engine), None)
+    if own is None:
+        # The engine rejected the returned value.
+        code = getattr(node.component.cls, METHODS[node.component.kind]).__code__
+        where = f"{code.co_filename}:{code.co_firstlineno}"
+    else:
+        where = f"{own.filename}:{own.lineno}"
+        if entries[-1] is not own:
+            where += f" (raised at {entries[-1].filename}:{entries[-1].lineno})"
+    ports = node.component.ports.inputs
+    inputs = [f"{port.name}: {_describe(value)}" for port, value in zip(ports, values, strict=True)]
+    return StageError(
+        f"{node.id} failed at frame {frame.seq}: {type(error).__name__}: {error}\n"
+        f"  in {where}\n  set up at {node.mark}\n  inputs: {', '.join(inputs) or 'none'}"
+    )
+
+
+def _describe(value: Any) -> str:
+    """Shape and dtype of an array, else the type's name."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{tuple(value.shape)} {value.dtype}"
+    return "absent" if value is None else type(value).__name__
