@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -143,23 +141,6 @@ def test_a_calibration_that_cannot_be_written_leaves_the_one_before(
         CALIBRATION.model_copy(update={"sensor": "right"}).save(path)
     assert Calibration.load(path).sensor == "left"
     assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_a_ctrl_c_leaves_the_calibration_before_or_the_new_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "left.yaml"
-    CALIBRATION.save(path)
-    move = os.replace
-
-    def interrupted(here: str, there: str) -> None:
-        move(here, there)
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr("os.replace", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        CALIBRATION.model_copy(update={"sensor": "right"}).save(path)
-    assert Calibration.load(path).sensor == "right"
 
 
 def test_the_password_of_a_camera_is_not_kept(tmp_path: Path) -> None:

@@ -6,36 +6,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from threading import Thread
 
 import pytest
 
-from tactflow.system.signals import ENDING, ending_handled, ending_held_back, interrupt
+from tactflow.system.signals import ENDING, ending_handled, interrupt
 from tests.clock import PATIENCE, until
 
 ENDS = [number for number in ENDING if sys.platform != "win32"]
 """Windows ends another process at once instead of sending it one of them."""
-
-
-def test_a_ctrl_c_waits_for_the_end_of_a_block_that_is_to_be_completed() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    done: list[bool] = []
-
-    def work() -> None:
-        with ending_held_back():
-            signal.raise_signal(signal.SIGINT)
-            done.append(True)
-            raise OSError("also where the block fails")
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-    assert done == [True]
-    assert signal.getsignal(signal.SIGINT) is before
-    # Another thread has no signals to hold back.
-    thread = Thread(target=lambda: ending_held_back().__enter__() or done.append(True))  # type: ignore[func-returns-value]
-    thread.start()
-    thread.join()
-    assert len(done) == 2
 
 
 def interrupted(folder: Path, words: list[str], *numbers: int) -> tuple[int, str]:

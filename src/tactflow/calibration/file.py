@@ -25,7 +25,6 @@ from tactflow.engine.errors import ConfigError
 from tactflow.recording.calibration import MAX_ARRAYS, stored_arrays, stored_text
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
-from tactflow.system.signals import ending_held_back
 from tactflow.vision.depth.darkness import DarknessModel
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
@@ -251,12 +250,8 @@ class Calibration(_Entry):
             # It is symmetric.
             arrays["information"] = self.information[np.tril_indices(TERMS)].astype(np.float32)
         try:
-            # Both are complete before either replaces an earlier calibration, and then both do.
-            with (
-                ending_held_back(),
-                completed(path) as unfinished,
-                completed(path.with_suffix(".npz")) as unfinished_arrays,
-            ):
+            # Both are complete before either replaces an earlier calibration.
+            with completed(path) as unfinished, completed(path.with_suffix(".npz")) as unfinished_arrays:
                 np.savez(unfinished_arrays, **arrays)
                 unfinished.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
         except OSError as error:

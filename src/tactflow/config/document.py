@@ -85,7 +85,7 @@ class Document:
     def _marks(self, keys: Keys) -> tuple[Mark, Mark]:
         return self.marks.get(keys) or (self.mark(*keys[:-1]),) * 2
 
-    def set(self, keys: Sequence[str], value: Any, mark: Mark, key_mark: Mark | None = None) -> None:
+    def set(self, keys: Keys, value: Any, mark: Mark, key_mark: Mark | None = None) -> None:
         """Set a value, and create the mappings around it if needed.
 
         mark : location of the value. key_mark : location of a new key, if different.
@@ -94,7 +94,7 @@ class Document:
         ------
         ConfigError : the path leads through a value that is not a mapping.
         """
-        parent, place = self.root, tuple(keys)
+        parent, place = self.root, keys
         for depth, key in enumerate(keys[:-1], start=1):
             if parent.get(key) is None:
                 parent[key] = {}

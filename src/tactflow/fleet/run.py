@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -18,7 +19,6 @@ from tactflow.fleet.sinks import (
     shared_addresses,
 )
 from tactflow.fleet.supervisor import Member, Supervisor
-from tactflow.system.children import python_command
 from tactflow.system.signals import ending_handled
 
 
@@ -50,7 +50,8 @@ def run_fleet(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequenc
             stack.enter_context(relay(publication, upstream))
         members = []
         for sensor, pipeline in pipelines.items():
-            command = python_command("-m", "tactflow", *arguments[sensor])
+            # Without -P, Python would search the current folder first for every module.
+            command = [sys.executable, "-P", "-m", "tactflow", *arguments[sensor]]
             for text in _side_by_side(sensor, pipeline, shared, scratch):
                 command += ["--set", text]
             members.append(Member(sensor, command, [WatchedSink(node) for node in pipeline.sinks]))

@@ -37,11 +37,6 @@ positive = number(int, 1, math.inf, "a whole number from 1")
 def seconds(text: str) -> float:
     """A type of argparse: a length of time above 0, s.
 
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        If the text is not a length of time.
-
     >>> seconds("90s"), seconds("1.5min"), seconds("1h")
     (90.0, 90.0, 3600.0)
     """

@@ -9,17 +9,6 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 
-def python_command(*arguments: str) -> list[str]:
-    """The command line of a Python child, for `subprocess`.
-
-    Without `-P`, Python would search the current folder first for every module, and run a `random.py` there.
-
-    >>> python_command("-m", "tactflow", "check")[1:]
-    ['-P', '-m', 'tactflow', 'check']
-    """
-    return [sys.executable, "-P", *arguments]
-
-
 @contextmanager
 def starting_children(blocked: Collection[int] = ()) -> Iterator[None]:
     """Context in which multiprocessing, or Dask, may start processes.

@@ -1,12 +1,4 @@
-"""The clock for waiting and measuring time; tests pass one that they advance.
-
->>> from tactflow.system.clock import SYSTEM
->>> began = SYSTEM.now()
->>> SYSTEM.sleep(0.001, threading.Event())
-False
->>> SYSTEM.now() > began
-True
-"""
+"""The clock for waiting and measuring time; tests pass one that they advance."""
 
 from __future__ import annotations
 

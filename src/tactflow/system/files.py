@@ -26,11 +26,7 @@ def expanded(text: str) -> Path:
 
 
 def is_utf8(text: str) -> bool:
-    """Whether a text, such as a file name, can be encoded in UTF-8.
-
-    >>> is_utf8("left-ü"), is_utf8("left-\\udcff")
-    (True, False)
-    """
+    """Whether a text, such as a file name, can be encoded in UTF-8."""
     return text.encode(errors="replace").decode() == text
 
 
@@ -132,12 +128,7 @@ def _remove(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents, unless it exists.
-
-    Raises
-    ------
-    OSError : it cannot be created; if a file is in its place, `strerror` names it.
-    """
+    """Create a folder and its parents, unless it exists. OSError names a file in its place."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -50,19 +49,3 @@ def ending_handled(handler: Handler) -> Iterator[None]:
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)  # type: ignore[arg-type]
-
-
-@contextmanager
-def ending_held_back() -> Iterator[None]:
-    """Delay the handling of signals until after a block, so that the block completes."""
-    if threading.current_thread() is not threading.main_thread():
-        # Only the main thread handles signals.
-        yield
-        return
-    pending: list[int] = []
-    try:
-        with ending_handled(lambda number, _: pending.append(number)):
-            yield
-    finally:
-        for number in pending:
-            signal.raise_signal(number)
