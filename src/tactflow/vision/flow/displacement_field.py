@@ -9,7 +9,6 @@ markers, so that each answer has a standard error in closed form.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Final, NamedTuple
 
@@ -17,7 +16,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Mask, Points, check_mask
-from tactflow.vision.flow.loops import COEFFICIENTS, PRECISION, VARIANCE, sum_region, weigh_markers
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -48,8 +47,12 @@ OVERSHOOT: Final = 0.5
 POOR: Final = 3.0
 """Times the median standard error from which on a marker's own error has its weight. Chosen by hand."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
-SIDE: Final = 4
-"""Of `Samples.place`: the side of the square that counts around a cell, px."""
+LEAST_INFORMATION: Final = 1e-5
+"""Precision of a marker given all others, 1, at least: one that no other is near. Chosen by hand."""
+NOWHERE: Final = 1e-12
+"""Sum of the kernel to all markers, at least, to divide by. Chosen by hand."""
+WHOLE: Final = 1e-3
+"""Cells that are partly in a region, at least, for it to have an outline; rounding makes fewer. Chosen by hand."""
 
 
 class Grid(NamedTuple):
@@ -73,16 +76,23 @@ class Grid(NamedTuple):
         rows, columns = self.shape
         return Grid(((rows + 1) // 2, (columns + 1) // 2), self.first, 2 * self.spacing)
 
+    def block(self, low: Floats, high: Floats) -> tuple[slice, slice]:
+        """Rows and columns, two at least, of the cells between two points (x, y), px, and one beyond."""
+        most = np.array(self.shape[::-1])
+        first = np.clip((low - self.first) // self.spacing, 0, most - 2).astype(int)
+        stop = np.clip((high - self.first) // self.spacing + 2, first + 2, most).astype(int)
+        return slice(first[1], stop[1]), slice(first[0], stop[0])
+
 
 class Samples(NamedTuple):
     """A grid of cells over which the field is summed.
 
-    place : (5,) float64, see `sum_region`. to_markers : (rows, columns, N) float64,
-    the kernel between cells and markers. between : (2 rows - 1, 2 columns - 1) float64, the kernel between
-    two cells, by how many rows and columns they are apart; 0 in the middle."""
+    to_markers : (rows, columns, N) float64, the kernel between cells and markers. between : (2 rows - 1, 2
+    columns - 1) float64, the kernel between two cells, by how many rows and columns they are apart; 0 in the
+    middle.
+    """
 
     grid: Grid
-    place: Floats
     to_markers: Floats
     between: Floats
 
@@ -179,13 +189,12 @@ class FieldModel:
             raise ValueError(f"required a size of at least 1 x 1 px, got {size}")
         self.origin: Points = np.array(origin, np.float64)
         self.pitch = max(pitch_of(self.origin), 1.0)
-        self.rest: Floats = np.ascontiguousarray(self.origin.T)
-        """(2, N), x and y of each marker in the reference, px."""
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)
         self.inverse: Floats = np.asarray(np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64)
         grid = _grid(size, self.pitch)
-        self._margin = OVERSHOOT * self.pitch + grid.spacing
+        self.margin = OVERSHOOT * self.pitch + grid.spacing
+        """How much farther a cell may have moved than any marker that is seen, px."""
         self.fine, self.coarse = self._samples(grid), self._samples(grid.coarser())
         """For small and for large regions. Both are fixed to the frame, so that what is said of a region does
         not depend on where its bounding box begins."""
@@ -194,9 +203,7 @@ class FieldModel:
         rows, columns = grid.shape
         to_markers = self._kernel(grid.points.reshape(-1, 2)).reshape(rows, columns, -1)
         down, across = np.mgrid[1 - rows : rows, 1 - columns : columns] * grid.spacing
-        side = 2 * round((grid.spacing - 1) / 2) + 1
-        place = np.array([*grid.first, grid.spacing, self._margin, side])
-        return Samples(grid, place, to_markers, matern(np.hypot(down, across) / self._length))
+        return Samples(grid, to_markers, matern(np.hypot(down, across) / self._length))
 
     def _kernel(self, points: Points) -> Floats:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
@@ -230,35 +237,58 @@ class DisplacementField:
         self._asked: tuple[Mask, GelMotion | None] | None = None
         self._shared: tuple[Mask, Floats] | None = None
         self._model, self._seen = model, seen
-        position = np.ascontiguousarray(markers.position, np.float64)
-        stderr = np.ascontiguousarray(markers.stderr, np.float64)
-        errors = np.sort(stderr[seen])
-        # What is unknown, infinite or NaN, comes last.
-        known = len(errors) if math.isfinite(errors[-1]) else int(errors.searchsorted(np.inf))
-        self.noise = float(errors[known // 2]) if known else 0.0
-        self._planes, removed = np.empty((6, len(seen))), np.empty_like(model.inverse)
-        largest = POOR * self.noise
-        count = weigh_markers(
-            position, model.rest, seen, stderr, self.noise, largest, model.inverse, self._planes, removed
-        )
-        self._removed: Floats = removed[:count].copy()
+        known = seen & np.isfinite(markers.stderr)
+        errors = np.sort(markers.stderr[known])
+        self.noise = float(errors[len(errors) // 2]) if len(errors) else 0.0
+        self._variance = np.where(known, markers.stderr, self.noise) ** 2
+        self._moved = np.where(seen[:, None], markers.position - model.origin, 0.0)
+        self._removed = np.empty((0, len(seen)))
         """(S, N): the inverse is less by their squares, removed.T @ removed."""
+        poor = seen & (self._variance > (POOR * self.noise) ** 2)
+        doubtful = ~seen | poor
+        if doubtful.any():
+            self._removed = self._without(doubtful, 0.0)
+        if poor.any():
+            # Their variance is compared with that of the field, which all others tell.
+            moved = self._moved[~doubtful]
+            scale = float(np.vdot(moved, self._weights(self._moved.T).T[~doubtful])) / moved.size
+            self._removed = self._without(doubtful, scale)
+        self._coefficients = self._weights(self._moved.T).T
+        information = np.diagonal(model.inverse) - np.square(self._removed).sum(axis=0)
+        self._precision = np.where(seen, 0.5 / np.maximum(information, LEAST_INFORMATION), 0.0)
+
+    def _without(self, doubtful: Flags, scale: float) -> Floats:
+        """(S, N): what `_removed` is without these markers (N,), by Cholesky's factors.
+
+        scale : variance of the field, px^2, for those of them that are seen; 0 leaves them out, too.
+        """
+        chosen = np.flatnonzero(doubtful)
+        rows = self._model.inverse[chosen]
+        share = np.where(self._seen[chosen], scale / np.maximum(self._variance[chosen], 1e-300), 0.0)
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(rows[:, chosen] + np.diag(share)), rows))
+
+    def _weights(self, kernel: Floats) -> Floats:
+        """(M, N): how much each marker counts in what has these kernels (M, N) with the markers."""
+        return np.asarray(kernel @ self._model.inverse - kernel @ self._removed.T @ self._removed)
 
     @cached_property
     def displacement(self) -> Floats:
         """(rows, columns, 2) float64, px."""
-        return np.asarray(self._model.fine.to_markers @ self._planes[COEFFICIENTS].T)
+        return np.asarray(self._model.fine.to_markers @ self._coefficients)
 
     @cached_property
     def stderr(self) -> Floats:
         """(rows, columns) float64, standard error of each component of `displacement`, px."""
         kernel = self._model.fine.to_markers.reshape(-1, len(self._seen))
-        weights = kernel @ self._model.inverse - kernel @ self._removed.T @ self._removed
+        weights = self._weights(kernel)
         unknown = np.maximum(1 - np.einsum("gn,gn->g", weights, kernel), 0)
-        variances = (self._planes[COEFFICIENTS] ** 2).sum(axis=0) * self._planes[PRECISION]
-        scale = kernel @ variances / np.maximum(kernel @ self._seen, 1e-12)
-        squares = scale * unknown + (weights * weights) @ self._planes[VARIANCE]
+        squares = self._scale(kernel) * unknown + (weights * weights) @ self._variance
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
+
+    def _scale(self, kernel: Floats) -> Floats:
+        """(...,): variance of the field, px^2, near what has these kernels (..., N) with the markers."""
+        variances = np.square(self._coefficients).sum(axis=1) * self._precision
+        return np.asarray(kernel @ variances / np.maximum(kernel @ self._seen, NOWHERE))
 
     def at(self, rest: Points) -> Floats:
         """(M, 2) float64, px: displacement of the gel that rests at points (M, 2), px; beyond the grid, that
@@ -274,19 +304,9 @@ class DisplacementField:
         mask : (H, W) uint8, 255 inside, else 0. Raises ValueError if it is not.
         """
         if self._shared is None or self._shared[0] is not mask:
-            self._shared = mask, self._share(mask)
+            check_mask(mask)
+            self._shared = mask, _covered(mask, self.grid.points + self.displacement, self.grid.spacing)
         return self._shared[1]
-
-    def _share(self, mask: Mask) -> Floats:
-        check_mask(mask)
-        side = int(self._model.fine.place[SIDE])
-        left, top, width, height = cv2.boundingRect(mask)
-        left, top = max(left - side, 0), max(top - side, 0)
-        part = mask[top : top + height + 2 * side, left : left + width + 2 * side]
-        covered = cv2.blur(part, (side, side), borderType=cv2.BORDER_CONSTANT)
-        now = (self.grid.points + self.displacement - (left, top)).astype(np.float32)
-        shares = cv2.remap(covered, now, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-        return np.asarray(shares, np.float64) / 255
 
     def motion(self, mask: Mask) -> GelMotion | None:
         """How the gel inside a region has moved, each bit of it counted by its area at rest.
@@ -295,36 +315,127 @@ class DisplacementField:
         Returns None for a region without a cell. Raises ValueError if mask is not (H, W) uint8.
         """
         if self._asked is None or self._asked[0] is not mask:
-            self._asked = mask, self._summed(mask)
+            check_mask(mask)
+            self._asked = mask, self._motion(mask)
         return self._asked[1]
 
-    def _summed(self, mask: Mask) -> GelMotion | None:
-        check_mask(mask)
-        box = cv2.boundingRect(mask)
-        large = box[2] * box[3] >= MANY * self.grid.spacing**2
+    def _motion(self, mask: Mask) -> GelMotion | None:
+        x, y, width, height = cv2.boundingRect(mask)
+        large = width * height >= MANY * self.grid.spacing**2
         samples = self._model.coarse if large else self._model.fine
-        sums = self._sums(mask, box, samples)
-        return _motion(sums.tolist(), samples.grid.spacing) if sums[0] > 0 else None
+        low = np.array([x, y]) - self._moved.max(axis=0) - self._model.margin
+        high = np.array([x + width, y + height]) - self._moved.min(axis=0) + self._model.margin
+        block = samples.grid.block(low, high)
+        points, kernel = samples.grid.points[block], samples.to_markers[block]
+        moved = kernel @ self._coefficients
+        share = _covered(mask, points + moved, samples.grid.spacing)
+        if not share.any():
+            return None
+        weight = share / share.sum()
+        # Mean and gradient are the least-squares fit of 1, x and y, from the middle of the region.
+        terms = np.ones((*share.shape, 3))
+        terms[..., 1:] = points - weight.ravel() @ points.reshape(-1, 2)
+        weighted = weight[..., None] * terms
+        unknown, noise, left = self._covariances(weighted, kernel, samples.between)
+        motion = _fit(terms, weighted, moved, unknown, noise, left, samples.grid.spacing)
+        # A region that is larger by a small part adds as much of its mean slope outwards, times the way from
+        # its middle, to the mean (Gauss's theorem). Where all cells are whole, the picture has none of its
+        # outline.
+        if np.vdot(share, 1 - share) < WHOLE:
+            return motion
+        outline = OUTLINE * np.abs(_outwards(moved, weighted[..., 1:])) / samples.grid.spacing
+        return motion._replace(outline_stderr=(float(outline[0]), float(outline[1])))
 
-    def _sums(self, mask: Mask, box: Sequence[int], samples: Samples) -> Floats:
-        """Sums over a region in a box, see `sum_region`."""
-        left, top, width, height = box
-        sums = np.zeros(27)
-        covered = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
-        model = self._model
-        sum_region(
-            covered,
-            left,
-            top,
-            samples.place,
-            self._planes,
-            samples.to_markers,
-            samples.between,
-            model.inverse,
-            self._removed,
-            sums,
-        )
-        return sums
+    def _covariances(self, weighted: Floats, kernel: Floats, between: Floats) -> tuple[Floats, Floats, float]:
+        """Covariances of weighted sums over cells of the field: (3, 3), of what the markers leave unknown, and
+        (3, 3), of what their own errors add, px^2; share of the first sum's variance that they leave unknown.
+
+        weighted : (r, c, 3), weights of each cell. kernel : (r, c, N), between cells and markers. between : of
+        `Samples`.
+        """
+        to_markers, prior = (weighted.swapaxes(1, 2) @ kernel).sum(axis=0), np.zeros((3, 3))
+        sum_pairs(np.ascontiguousarray(np.moveaxis(weighted, -1, 0)), between, prior)
+        weights = self._weights(to_markers)
+        unknown = prior - weights @ to_markers.T
+        noise = (weights * self._variance) @ weights.T
+        return self._scale(to_markers[0]) * unknown, noise, max(float(unknown[0, 0] / prior[0, 0]), 0.0)
+
+
+@kernel("void(float64[:, :, ::1], float64[:, ::1], float64[:, ::1])")
+def sum_pairs(weights: Floats, between: Floats, sums: Floats) -> None:
+    """Covariance of weighted sums over cells of the field: sums over all pairs of cells.
+
+    weights : (K, r, c). between : of `Samples`. sums : (K, K) of 0, filled. As matrix products or convolutions,
+    this would take several times as long.
+    """
+    count, rows, columns = weights.shape
+    for row in range(rows):
+        for column in range(columns):
+            if weights[0, row, column] == 0:
+                continue
+            for k in range(rows):
+                near = between[between.shape[0] // 2 + row - k, between.shape[1] // 2 - column :]
+                for i in range(count):
+                    total = 0.0
+                    for n in range(columns):
+                        total += weights[i, k, n] * near[n]
+                    for j in range(count):
+                        sums[i, j] += total * weights[j, row, column]
+
+
+def _fit(
+    terms: Floats, weighted: Floats, moved: Floats, unknown: Floats, noise: Floats, left: float, spacing: float
+) -> GelMotion:
+    """The affine motion that is nearest to the motions (r, c, 2) of cells.
+
+    terms : (r, c, 3), 1 and the way from the middle of the region, px. weighted : the same, times the weight of
+    each cell. unknown, noise, left : of `DisplacementField._covariances`. spacing : of the cells, px.
+    """
+    weight, columns = weighted[..., 0].ravel(), weighted.reshape(-1, 3).T
+    moments, sums = columns @ terms.reshape(-1, 3), columns @ moved.reshape(-1, 2)
+    rest = (moved - sums[0]).reshape(-1, 2)
+    mean, squares = (float(sums[0, 0]), float(sums[0, 1])), float(weight @ np.square(rest).sum(axis=1))
+    stderr = math.sqrt(max(float(unknown[0, 0]), 0.0) + float(noise[0, 0]))
+    motion = GelMotion(mean, stderr, (0.0, 0.0), math.sqrt(squares / 2), None, None, left)
+    # A single cell has the second moment spacing^2 / 12 along each axis: too small to have slopes.
+    second = moments[1:, 1:]
+    if np.linalg.det(second) <= np.trace(second) * spacing**2 / 12:
+        return motion
+    inverse = np.linalg.inv(moments)
+    (dx_u, dx_v), (dy_u, dy_v) = (inverse @ sums)[1:].tolist()
+    variances = np.maximum(np.diag(inverse @ unknown @ inverse), 0) + np.diag(inverse @ noise @ inverse)
+    gradient = Gradient((dx_u, dx_v), (dy_u, dy_v), *np.sqrt(variances[1:]).tolist())
+    growth, turn = gradient.growth
+    rest -= terms[..., 1:].reshape(-1, 2) @ [[growth, turn], [-turn, growth]]
+    residual = math.sqrt(float(weight @ np.square(rest).sum(axis=1)))
+    return motion._replace(gradient=gradient, residual=residual)
+
+
+def _outwards(moved: Floats, ways: Floats) -> Floats:
+    """(2,): sum of the changes of motions (r, c, 2) of cells along their ways (r, c, 2), in cells."""
+    step = np.array([[-0.5, 0.0, 0.5]])
+    across, down = (
+        cv2.filter2D(moved, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (step, step.T)
+    )
+    # At the border the neighbours are one cell apart, not two.
+    across[:, [0, -1]] *= 2
+    down[[0, -1]] *= 2
+    return np.asarray((ways[..., :1] * across + ways[..., 1:] * down).sum(axis=(0, 1)))
+
+
+def _covered(mask: Mask, places: Floats, spacing: float) -> Floats:
+    """(r, c), how much of squares around places (r, c, 2), px, lies in a mask, 0 to 1.
+
+    spacing : of the places, px; the sides of the squares are the nearest odd number.
+    """
+    side = 2 * round((spacing - 1) / 2) + 1
+    left, top, width, height = cv2.boundingRect(mask)
+    box = mask[top : top + height, left : left + width]
+    wide = cv2.copyMakeBorder(box, side, side, side, side, cv2.BORDER_CONSTANT, value=0)
+    covered = cv2.boxFilter(wide, cv2.CV_32F, (side, side), borderType=cv2.BORDER_CONSTANT)
+    now = (places - (left - side, top - side)).astype(np.float32)
+    shares = cv2.remap(covered, now, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+    return np.asarray(shares, np.float64) / 255
 
 
 def matern(distance: Floats) -> Floats:
@@ -344,33 +455,3 @@ def _grid(size: tuple[int, int], pitch: float) -> Grid:
     columns, rows = math.ceil(width / spacing), math.ceil(height / spacing)
     first = (width - 1 - spacing * (columns - 1)) / 2, (height - 1 - spacing * (rows - 1)) / 2
     return Grid((rows, columns), first, spacing)
-
-
-def _motion(sums: list[float], spacing: float) -> GelMotion:
-    """The motion of a region. sums : of `sum_region`. spacing : of the cells, px."""
-    _, u, v, xx, xy, yy, xu, xv, yu, yv, squares, outwards_x, outwards_y, partial = sums[:14]
-    prior, scale, known, noise = sums[14:18], sums[18], sums[19:23], sums[23:]
-    left = max(prior[0] - known[0], 0.0)
-    # A region that is larger by a small part adds as much of its mean slope outwards, times the way from its
-    # middle, to the mean (Gauss's theorem). Where all cells are whole, the picture has none of its outline.
-    larger = OUTLINE if partial > 1e-9 else 0.0
-    outline = larger * abs(outwards_x), larger * abs(outwards_y)
-    stderr, spread = math.sqrt(scale * left + noise[0]), math.sqrt(squares / 2)
-    determinant = xx * yy - xy * xy
-    # A single cell has the second moment spacing^2 / 12 along each axis: too small to have slopes.
-    if determinant <= (xx + yy) * spacing * spacing / 12:
-        return GelMotion((u, v), stderr, outline, spread, None, None, left / prior[0])
-    x, y, z = yy / determinant, -xy / determinant, xx / determinant
-    unknown = [before - after for before, after in zip(prior[1:], known[1:], strict=True)]
-    dx_stderr = math.sqrt(scale * max(_square(unknown, x, y), 0.0) + _square(noise[1:], x, y))
-    dy_stderr = math.sqrt(scale * max(_square(unknown, y, z), 0.0) + _square(noise[1:], y, z))
-    dx, dy = (x * xu + y * yu, x * xv + y * yv), (y * xu + z * yu, y * xv + z * yv)
-    gradient = Gradient(dx, dy, dx_stderr, dy_stderr)
-    growth, turn = gradient.growth
-    rest = squares - 2 * (growth * (xu + yv) + turn * (xv - yu)) + (growth**2 + turn**2) * (xx + yy)
-    return GelMotion((u, v), stderr, outline, spread, gradient, math.sqrt(max(rest, 0.0)), left / prior[0])
-
-
-def _square(form: Sequence[float], x: float, y: float) -> float:
-    """The square of a vector by a symmetric form (xx, xy, yy)."""
-    return x * x * form[0] + 2 * x * y * form[1] + y * y * form[2]
