@@ -9,11 +9,13 @@ markers, so that each answer has a standard error in closed form.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Mask, Points, check_mask
 from tactflow.vision.compiled import kernel
@@ -75,13 +77,6 @@ class Grid(NamedTuple):
         """Every other row and column, from the first on. It may reach half a cell less far."""
         rows, columns = self.shape
         return Grid(((rows + 1) // 2, (columns + 1) // 2), self.first, 2 * self.spacing)
-
-    def block(self, low: Floats, high: Floats) -> tuple[slice, slice]:
-        """Rows and columns, two at least, of the cells between two points (x, y), px, and one beyond."""
-        most = np.array(self.shape[::-1])
-        first = np.clip((low - self.first) // self.spacing, 0, most - 2).astype(int)
-        stop = np.clip((high - self.first) // self.spacing + 2, first + 2, most).astype(int)
-        return slice(first[1], stop[1]), slice(first[0], stop[0])
 
 
 class Samples(NamedTuple):
@@ -305,7 +300,8 @@ class DisplacementField:
         """
         if self._shared is None or self._shared[0] is not mask:
             check_mask(mask)
-            self._shared = mask, _covered(mask, self.grid.points + self.displacement, self.grid.spacing)
+            places, box = self.grid.points + self.displacement, cv2.boundingRect(mask)
+            self._shared = mask, _covered(mask, box, places, self.grid.spacing)
         return self._shared[1]
 
     def motion(self, mask: Mask) -> GelMotion | None:
@@ -320,122 +316,194 @@ class DisplacementField:
         return self._asked[1]
 
     def _motion(self, mask: Mask) -> GelMotion | None:
-        x, y, width, height = cv2.boundingRect(mask)
-        large = width * height >= MANY * self.grid.spacing**2
+        box = cv2.boundingRect(mask)
+        large = box[2] * box[3] >= MANY * self.grid.spacing**2
         samples = self._model.coarse if large else self._model.fine
-        low = np.array([x, y]) - self._moved.max(axis=0) - self._model.margin
-        high = np.array([x + width, y + height]) - self._moved.min(axis=0) + self._model.margin
-        block = samples.grid.block(low, high)
-        points, kernel = samples.grid.points[block], samples.to_markers[block]
-        moved = kernel @ self._coefficients
-        share = _covered(mask, points + moved, samples.grid.spacing)
-        if not share.any():
+        rows, columns = self._near(box, samples.grid)
+        moved = samples.to_markers[rows, columns] @ self._coefficients
+        share = _covered(mask, box, samples.grid.points[rows, columns] + moved, samples.grid.spacing)
+        total = float(share.sum())
+        if not total:
             return None
-        weight = share / share.sum()
-        # Mean and gradient are the least-squares fit of 1, x and y, from the middle of the region.
-        terms = np.ones((*share.shape, 3))
-        terms[..., 1:] = points - weight.ravel() @ points.reshape(-1, 2)
-        weighted = weight[..., None] * terms
-        unknown, noise, left = self._covariances(weighted, kernel, samples.between)
-        motion = _fit(terms, weighted, moved, unknown, noise, left, samples.grid.spacing)
-        # A region that is larger by a small part adds as much of its mean slope outwards, times the way from
-        # its middle, to the mean (Gauss's theorem). Where all cells are whole, the picture has none of its
-        # outline.
-        if np.vdot(share, 1 - share) < WHOLE:
-            return motion
-        outline = OUTLINE * np.abs(_outwards(moved, weighted[..., 1:])) / samples.grid.spacing
-        return motion._replace(outline_stderr=(float(outline[0]), float(outline[1])))
-
-    def _covariances(self, weighted: Floats, kernel: Floats, between: Floats) -> tuple[Floats, Floats, float]:
-        """Covariances of weighted sums over cells of the field: (3, 3), of what the markers leave unknown, and
-        (3, 3), of what their own errors add, px^2; share of the first sum's variance that they leave unknown.
-
-        weighted : (r, c, 3), weights of each cell. kernel : (r, c, N), between cells and markers. between : of
-        `Samples`.
-        """
-        to_markers, prior = (weighted.swapaxes(1, 2) @ kernel).sum(axis=0), np.zeros((3, 3))
-        sum_pairs(np.ascontiguousarray(np.moveaxis(weighted, -1, 0)), between, prior)
-        weights = self._weights(to_markers)
-        unknown = prior - weights @ to_markers.T
+        products, to_region, prior = np.zeros((7, 7)), np.zeros((3, len(self._seen))), np.zeros((3, 3))
+        sum_cells(
+            share / total,
+            moved,
+            samples.grid.spacing,
+            samples.to_markers[rows],
+            columns.start,
+            samples.between,
+            products,
+            to_region,
+            prior,
+        )
+        weights = self._weights(to_region)
+        unknown = prior - weights @ to_region.T
+        left = max(float(unknown[0, 0] / prior[0, 0]), 0.0)
+        unknown *= self._scale(to_region[0])
         noise = (weights * self._variance) @ weights.T
-        return self._scale(to_markers[0]) * unknown, noise, max(float(unknown[0, 0] / prior[0, 0]), 0.0)
+        # Where all cells are whole, the picture has none of the region's outline.
+        outline = OUTLINE if total - float(np.vdot(share, share)) > WHOLE else 0.0
+        return _fit(products, unknown, noise, left, outline, samples.grid.spacing)
+
+    def _near(self, box: Sequence[int], grid: Grid) -> tuple[slice, slice]:
+        """Rows and columns of the cells whose gel may be in a box (left, top, width, height)."""
+        slices = []
+        for axis in (0, 1):
+            moved, margin = self._moved[:, axis], self._model.margin
+            low = (box[axis] - float(moved.max()) - margin - grid.first[axis]) / grid.spacing
+            high = (box[axis] + box[axis + 2] - float(moved.min()) + margin - grid.first[axis]) / grid.spacing
+            cells = grid.shape[1 - axis]
+            start = min(max(int(low), 0), cells - 1)
+            slices.append(slice(start, min(max(int(high) + 2, start + 1), cells)))
+        return slices[1], slices[0]
 
 
-@kernel("void(float64[:, :, ::1], float64[:, ::1], float64[:, ::1])")
-def sum_pairs(weights: Floats, between: Floats, sums: Floats) -> None:
-    """Covariance of weighted sums over cells of the field: sums over all pairs of cells.
+@kernel(
+    "void(float64[:, ::1], float64[:, :, ::1], float64, float64[:, :, ::1], int64, float64[:, ::1],"
+    " float64[:, ::1], float64[:, ::1], float64[:, ::1])"
+)
+def sum_cells(
+    weight: Floats,
+    moved: Floats,
+    spacing: float,
+    to_markers: Floats,
+    left: int,
+    between: Floats,
+    products: Floats,
+    to_region: Floats,
+    prior: Floats,
+) -> None:
+    """Weighted sums over cells, in which each is 1, the way (x, y) to it from the middle of all, px, its motion
+    (x, y), px, and how much more that of a cell is which lies farther out by its way.
 
-    weights : (K, r, c). between : of `Samples`. sums : (K, K) of 0, filled. As matrix products or convolutions,
-    this would take several times as long.
+    weight : (r, c), in sum 1. moved : (r, c, 2). spacing : of the cells, px. to_markers : (r, C, N), kernel
+    between cells and markers; the cells begin at column `left`. between : of `Samples`.
+    products : (7, 7) of 0, filled: of any two of the seven. to_region : (3, N) of 0, filled: of the first
+    three, kernel to the markers. prior : (3, 3) of 0, filled: of any two of these, over all pairs of cells,
+    kernel between the two.
     """
-    count, rows, columns = weights.shape
+    rows, columns = weight.shape
+    planes, values = np.zeros((3, rows, columns)), np.empty(7)
+    x = y = 0.0
     for row in range(rows):
         for column in range(columns):
-            if weights[0, row, column] == 0:
+            x += weight[row, column] * column
+            y += weight[row, column] * row
+    for row in range(rows):
+        for column in range(columns):
+            if weight[row, column] == 0:
                 continue
-            for k in range(rows):
-                near = between[between.shape[0] // 2 + row - k, between.shape[1] // 2 - column :]
-                for i in range(count):
-                    total = 0.0
-                    for n in range(columns):
-                        total += weights[i, k, n] * near[n]
-                    for j in range(count):
-                        sums[i, j] += total * weights[j, row, column]
+            before, after = moved[row, max(column - 1, 0)], moved[row, min(column + 1, columns - 1)]
+            above, below = moved[max(row - 1, 0), column], moved[min(row + 1, rows - 1), column]
+            wide = 2 if 0 < column < columns - 1 else 1
+            high = 2 if 0 < row < rows - 1 else 1
+            values[0] = 1
+            values[1], values[2] = spacing * (column - x), spacing * (row - y)
+            for k in range(2):
+                values[3 + k] = moved[row, column, k]
+                across, down = (after[k] - before[k]) / wide, (below[k] - above[k]) / high
+                values[5 + k] = (column - x) * across + (row - y) * down
+            near = to_markers[row, left + column]
+            for i in range(7):
+                part = weight[row, column] * values[i]
+                for j in range(7):
+                    products[i, j] += part * values[j]
+                if i < 3:
+                    planes[i, row, column] = part
+                    for n in range(near.size):
+                        to_region[i, n] += part * near[n]
+    for row in range(rows):
+        for column in range(columns):
+            if weight[row, column] == 0:
+                continue
+            for other in range(row + 1):
+                line = between[between.shape[0] // 2 + row - other, between.shape[1] // 2 - column :]
+                one = along = upright = 0.0
+                for n in range(columns):
+                    one += planes[0, other, n] * line[n]
+                    along += planes[1, other, n] * line[n]
+                    upright += planes[2, other, n] * line[n]
+                for j in range(3):
+                    part = planes[j, row, column] * (1 if other == row else 2)
+                    prior[0, j] += one * part
+                    prior[1, j] += along * part
+                    prior[2, j] += upright * part
 
 
 def _fit(
-    terms: Floats, weighted: Floats, moved: Floats, unknown: Floats, noise: Floats, left: float, spacing: float
+    products: Floats, unknown: Floats, noise: Floats, left: float, outline: float, spacing: float
 ) -> GelMotion:
-    """The affine motion that is nearest to the motions (r, c, 2) of cells.
+    """The affine motion that is nearest to those of a region's cells.
 
-    terms : (r, c, 3), 1 and the way from the middle of the region, px. weighted : the same, times the weight of
-    each cell. unknown, noise, left : of `DisplacementField._covariances`. spacing : of the cells, px.
+    products : of `sum_cells`. unknown, noise : (3, 3), covariance of the sums over 1, x and y of the motion: what
+    the markers leave unknown, and what their own errors add, px^2. left : `GelMotion.unknown`. outline :
+    standard error of the outline, over the radius. spacing : of the cells, px.
     """
-    weight, columns = weighted[..., 0].ravel(), weighted.reshape(-1, 3).T
-    moments, sums = columns @ terms.reshape(-1, 3), columns @ moved.reshape(-1, 2)
-    rest = (moved - sums[0]).reshape(-1, 2)
-    mean, squares = (float(sums[0, 0]), float(sums[0, 1])), float(weight @ np.square(rest).sum(axis=1))
-    stderr = math.sqrt(max(float(unknown[0, 0]), 0.0) + float(noise[0, 0]))
-    motion = GelMotion(mean, stderr, (0.0, 0.0), math.sqrt(squares / 2), None, None, left)
+    # A region that is larger by a small part adds as much of its mean slope outwards, times the way from its
+    # middle, to the mean (Gauss's theorem).
+    _, _, _, u, v, outwards_u, outwards_v = products[0].tolist()
+    squares = max(products[3, 3] + products[4, 4] - u * u - v * v, 0.0)
+    stderr = math.sqrt(max(unknown[0, 0], 0.0) + noise[0, 0])
+    outline_stderr = outline * abs(outwards_u), outline * abs(outwards_v)
+    motion = GelMotion((u, v), stderr, outline_stderr, math.sqrt(squares / 2), None, None, left)
+    (xx, xy, xu, xv), (_, yy, yu, yv) = products[1:3, 1:5].tolist()
+    determinant = xx * yy - xy * xy
     # A single cell has the second moment spacing^2 / 12 along each axis: too small to have slopes.
-    second = moments[1:, 1:]
-    if np.linalg.det(second) <= np.trace(second) * spacing**2 / 12:
+    if determinant <= (xx + yy) * spacing**2 / 12:
         return motion
-    inverse = np.linalg.inv(moments)
-    (dx_u, dx_v), (dy_u, dy_v) = (inverse @ sums)[1:].tolist()
-    variances = np.maximum(np.diag(inverse @ unknown @ inverse), 0) + np.diag(inverse @ noise @ inverse)
-    gradient = Gradient((dx_u, dx_v), (dy_u, dy_v), *np.sqrt(variances[1:]).tolist())
-    growth, turn = gradient.growth
-    rest -= terms[..., 1:].reshape(-1, 2) @ [[growth, turn], [-turn, growth]]
-    residual = math.sqrt(float(weight @ np.square(rest).sum(axis=1)))
-    return motion._replace(gradient=gradient, residual=residual)
-
-
-def _outwards(moved: Floats, ways: Floats) -> Floats:
-    """(2,): sum of the changes of motions (r, c, 2) of cells along their ways (r, c, 2), in cells."""
-    step = np.array([[-0.5, 0.0, 0.5]])
-    across, down = (
-        cv2.filter2D(moved, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (step, step.T)
+    x, y, z = yy / determinant, -xy / determinant, xx / determinant
+    forms = unknown[1:, 1:].tolist(), noise[1:, 1:].tolist()
+    dx_stderr, dy_stderr = (
+        math.sqrt(max(_square(forms[0], *row), 0.0) + _square(forms[1], *row)) for row in ((x, y), (y, z))
     )
-    # At the border the neighbours are one cell apart, not two.
-    across[:, [0, -1]] *= 2
-    down[[0, -1]] *= 2
-    return np.asarray((ways[..., :1] * across + ways[..., 1:] * down).sum(axis=(0, 1)))
+    dx, dy = (x * xu + y * yu, x * xv + y * yv), (y * xu + z * yu, y * xv + z * yv)
+    gradient = Gradient(dx, dy, dx_stderr, dy_stderr)
+    growth, turn = gradient.growth
+    rest = squares - 2 * (growth * (xu + yv) + turn * (xv - yu)) + (growth**2 + turn**2) * (xx + yy)
+    return motion._replace(gradient=gradient, residual=math.sqrt(max(rest, 0.0)))
 
 
-def _covered(mask: Mask, places: Floats, spacing: float) -> Floats:
+def _square(form: Sequence[Sequence[float]], x: float, y: float) -> float:
+    """The square of a vector by a symmetric form (2, 2)."""
+    return x * x * form[0][0] + 2 * x * y * form[0][1] + y * y * form[1][1]
+
+
+def _covered(mask: Mask, box: Sequence[int], places: Floats, spacing: float) -> Floats:
     """(r, c), how much of squares around places (r, c, 2), px, lies in a mask, 0 to 1.
 
-    spacing : of the places, px; the sides of the squares are the nearest odd number.
+    box : (left, top, width, height), of all that is not 0. spacing : of the places, px; the sides of the squares
+    are the nearest odd number.
     """
-    side = 2 * round((spacing - 1) / 2) + 1
-    left, top, width, height = cv2.boundingRect(mask)
-    box = mask[top : top + height, left : left + width]
-    wide = cv2.copyMakeBorder(box, side, side, side, side, cv2.BORDER_CONSTANT, value=0)
-    covered = cv2.boxFilter(wide, cv2.CV_32F, (side, side), borderType=cv2.BORDER_CONSTANT)
-    now = (places - (left - side, top - side)).astype(np.float32)
-    shares = cv2.remap(covered, now, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-    return np.asarray(shares, np.float64) / 255
+    left, top, width, height = box
+    sums = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
+    share = np.empty(places.shape[:2])
+    average_squares(sums, places - (left, top), 2 * round((spacing - 1) / 2) + 1, share)
+    return share
+
+
+@kernel("void(int32[:, ::1], float64[:, :, ::1], int64, float64[:, ::1])")
+def average_squares(sums: NDArray[np.int32], centers: Floats, side: int, means: Floats) -> None:
+    """Mean over squares of a picture that is 0 or 255, 0 to 1; a pixel that is cut counts by its part inside.
+
+    sums : (h + 1, w + 1), of the pixels above and to the left. They may overflow: differences are right.
+    centers : (r, c, 2), px. side : px. means : (r, c), filled. `cv2.boxFilter` takes three times as long.
+    """
+    height, width = sums.shape[0] - 1, sums.shape[1] - 1
+    for row in range(means.shape[0]):
+        for column in range(means.shape[1]):
+            means[row, column] = 0.0
+            x, y = centers[row, column, 0] + 0.5 - 0.5 * side, centers[row, column, 1] + 0.5 - 0.5 * side
+            if not (-side < x < width and -side < y < height):
+                continue
+            left, top = math.floor(x), math.floor(y)
+            for down in range(2):
+                upper, lower = min(max(top + down, 0), height), min(max(top + down + side, 0), height)
+                for across in range(2):
+                    first, last = min(max(left + across, 0), width), min(max(left + across + side, 0), width)
+                    above, below = sums[upper, last] - sums[upper, first], sums[lower, last] - sums[lower, first]
+                    part = abs(1 - down - (y - top)) * abs(1 - across - (x - left))
+                    means[row, column] += part * np.int32(below - above) / (255.0 * side * side)
 
 
 def matern(distance: Floats) -> Floats:
