@@ -18,20 +18,12 @@ class FlowInMask(Stage):
     memory = "pure"
 
     class Params(StageParams):
-        """By what the flow is known, and which markers count as inside."""
+        """How the flow is measured."""
 
         method: Literal["field", "mean"] = Field(
             "field",
             description="field: the integral of the displacement field over the contact, where a stage field "
             "stands above; mean, and where none does: the mean over the markers inside",
-        )
-
-        dilate: float = Field(
-            0.0,
-            ge=0,
-            le=1000,
-            description="markers whose pixel is up to this far outside the contact count too, px, in whole "
-            "pixels; more markers make a mean over markers steadier and mix in gel that moves less",
         )
 
     params: Params
@@ -44,7 +36,6 @@ class FlowInMask(Stage):
         evidence: Evidence | None = None,
     ) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside, or none near."""
-        dilate = self.params.dilate
         if field is None or self.params.method == "mean":
-            return flow_in_mask(markers, contact_mask, dilate=dilate)
-        return flow_of_field(field, markers, contact_mask, dilate=dilate, coarse=evidence == "dots")
+            return flow_in_mask(markers, contact_mask)
+        return flow_of_field(field, markers, contact_mask, coarse=evidence == "dots")

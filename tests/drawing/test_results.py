@@ -53,7 +53,7 @@ def field() -> Markers:
 
 def everything() -> dict[str, Any]:
     dots = field()
-    flow = flow_in_mask(dots, MASK, dilate=8)
+    flow = flow_in_mask(dots, MASK)
     return {"contact": contact(), "flow": flow, "markers": dots, "contact_mask": MASK}
 
 

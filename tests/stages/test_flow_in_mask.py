@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from tactflow.stages.flow_in_mask import FlowInMask
 from tactflow.vision.flow import FieldModel
-from tactflow.vision.types import Flow, Markers
+from tactflow.vision.types import Markers
 
 ORIGIN = np.array([[20.0, 20], [40, 20], [20, 40], [40, 40], [80, 50]])
-MARKERS = Markers(ORIGIN, ORIGIN + np.array([1.5, -0.5]), np.zeros(5, np.uint8), np.full(5, 0.02))
 MASK = np.zeros((60, 90), np.uint8)
 MASK[15:45, 15:40] = 255
-
-
-def run(**params: Any) -> Flow:
-    return FlowInMask(FlowInMask.Params(**params)).process(MARKERS, MASK)
-
-
-def test_the_mean_is_over_the_markers_inside_the_dilated_contact() -> None:
-    flow = run(dilate=4)
-    assert flow.count == 4
-    assert flow.mean == pytest.approx((1.5, -0.5))
-    assert flow.rotation == pytest.approx(0, abs=1e-9)
-    assert run(dilate=0).count == 2
-    assert run(dilate=100).count == 5
 
 
 def test_with_a_field_the_mean_is_an_integral_unless_that_over_markers_is_asked_for() -> None:

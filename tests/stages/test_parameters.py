@@ -40,7 +40,7 @@ WRONG: dict[str, list[dict[str, Any]]] = {
         *({"merge": "near"}, {"merge": "largest", "max_gap": 3}),
     ],
     "tracker": [{"dot": 0.2}, {"polarity": "red"}, {"max_displacement": 0}],
-    "flow_in_mask": [{"dilate": -1}, {"method": "median"}],
+    "flow_in_mask": [{"method": "median"}],
     "visualize": [{"arrow_scale": -1}, {"view": "x"}, {"arrows": 3}, {"deepest": 0}],
 }
 

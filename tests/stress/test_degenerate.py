@@ -108,10 +108,9 @@ def test_few_or_flat_or_far_markers_have_a_defined_flow_and_are_drawn(origin: li
     at = np.array(origin, float).reshape(-1, 2)
     markers = Markers(at, at + 1, np.zeros(len(at), np.uint8), np.full(len(at), np.nan))
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    for dilate in (0.0, 7.5, 1e6):
-        flow = flow_in_mask(markers, mask, dilate=dilate)
-        assert_defined(flow)
-        if len(np.unique(at[:, 1])) < 2:
-            assert flow.rotation is None
+    flow = flow_in_mask(markers, mask)
+    assert_defined(flow)
+    if len(np.unique(at[:, 1])) < 2:
+        assert flow.rotation is None
     near = Markers(np.clip(at, -1e7, 1e7), np.clip(at, -1e7, 1e7) + 1, markers.status, markers.stderr)
     assert Annotator()(np.zeros((HEIGHT, WIDTH, 3), np.uint8), markers=near).shape == (HEIGHT, WIDTH, 3)

@@ -160,9 +160,10 @@ class Annotator:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"required a (H, W, 3) uint8 image, got {image.shape} {image.dtype}")
         if self._view == "contact":
-            picture = self._cut_out(image, contact_mask)
+            shown, picture = self._shown(image, contact_mask), np.zeros_like(image)
+            cv2.copyTo(image, shown, picture)
             if markers is not None:
-                markers = self._inside(markers, contact_mask)
+                markers = _inside(markers, shown)
         elif self._view == "depth":
             picture = self._heights(image, depth, scale)
         elif self._view == "normals":
@@ -178,7 +179,7 @@ class Annotator:
         if field is not None:
             between = field_arrows(field, _BETWEEN * unit)
             if self._view == "contact":
-                between = self._inside(between, contact_mask)
+                between = _inside(between, shown)
             draw_arrows(picture, between, self._arrow_scale, unit)
         if markers is not None:
             draw_arrows(picture, markers, self._arrow_scale, unit)
@@ -212,27 +213,17 @@ class Annotator:
         place = (left + width + round(4 * unit), bottom)
         self._letters.write(picture, f"{self._deepest:g} mm", place, WHITE, round(_TEXT * unit))
 
-    def _cut_out(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-        picture = np.zeros_like(image)
+    def _shown(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+        """(H, W): the contact and what lies up to `dilate` around it."""
         if mask is None:
-            return picture
+            return np.zeros(image.shape[:2], np.uint8)
         if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
             raise ValueError(
                 f"required a contact_mask of shape {image.shape[:2]} uint8, got {mask.shape} {mask.dtype}"
             )
         side = 2 * round(self._dilate) + 1
-        grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
-        cv2.copyTo(image, grown, picture)
-        return picture
-
-    def _inside(self, markers: Markers, mask: NDArray[np.uint8] | None) -> Markers:
-        if mask is None:
-            keep = np.zeros(len(markers.status), np.bool_)
-        else:
-            keep = inside_mask(markers.position, mask, self._dilate)
-        return Markers(
-            markers.origin[keep], markers.position[keep], markers.status[keep], markers.stderr[keep]
-        )
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        return np.asarray(cv2.dilate(mask, disc), np.uint8)
 
     def _axis(self, picture: NDArray[np.uint8], contact: Contact, unit: float) -> None:
         center = np.array(contact.center)
@@ -301,6 +292,11 @@ class Annotator:
         shade: NDArray[Any] = picture[max(0, y - tall - 1) : y + 3, max(0, x - 2) : x + wide + 3]
         shade[...] = shade // 3
         self._letters.write(picture, text, (x, y), colour, size)
+
+
+def _inside(markers: Markers, mask: NDArray[np.uint8]) -> Markers:
+    keep = inside_mask(markers.position, mask)
+    return Markers(markers.origin[keep], markers.position[keep], markers.status[keep], markers.stderr[keep])
 
 
 def _depth_line(depth: Depth | None, scale: Scale | None) -> tuple[str, Colour]:

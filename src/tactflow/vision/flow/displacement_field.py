@@ -35,26 +35,26 @@ MOST_CELLS: Final = 2500
 """Cells of a grid at most; where a quarter of the pitch would make more, the spacing is larger. Chosen by
 hand."""
 MANY: Final = 400
-"""Cells of a region's bounding box from which on a grid with twice the spacing will do: such a region is five
-pitches wide or more, and the field varies over one and a half. Chosen by hand."""
+"""A region whose bounding box has this many cells or more is summed over a grid with twice the spacing: it is
+at least five pitches wide, and the field varies over one and a half. Chosen by hand."""
 OUTLINE: Final = 1 / 3
 """Standard error of a contact's outline, over the radius of a disc of the same area. Gel that a wrong outline
 includes or leaves out moves otherwise than the contact. On labelled frames of nine labs, 71 % of the
 components of the mean lie within one standard error of those inside outlines by eye, and 94 % within two
 (`benchmarks/mean_flow.py`)."""
 FEWEST: Final = 3
-"""Markers that must be seen for a field. Chosen by hand."""
+"""Tracked markers that a field needs. Chosen by hand."""
 OVERSHOOT: Final = 0.5
-"""How much farther gel may have moved than any marker that is seen, pitches. Chosen by hand."""
+"""How much farther the gel may have moved than any tracked marker, pitches. Chosen by hand."""
 POOR: Final = 3.0
-"""Times the median standard error from which on a marker's own error has its weight. Chosen by hand."""
+"""A marker whose standard error exceeds the median by this factor has less weight. Chosen by hand."""
+WHOLE: Final = 1e-9
+"""Sum of share (1 - share) over the cells of a region, up to which all of them are whole: rounding errors."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
-LEAST_INFORMATION: Final = 1e-5
-"""Precision of a marker given all others, 1, at least: one that no other is near. Chosen by hand."""
-NOWHERE: Final = 1e-12
-"""Sum of the kernel to all markers, at least, to divide by. Chosen by hand."""
-WHOLE: Final = 1e-3
-"""Cells that are partly in a region, at least, for it to have an outline; rounding makes fewer. Chosen by hand."""
+_LEAST_PRECISION: Final = 1e-5
+"""Smallest precision of a marker given all others that is divided by: that of an isolated marker, 1."""
+_NOWHERE: Final = 1e-12
+"""Smallest sum of the kernel to all markers that is divided by."""
 
 
 class Grid(NamedTuple):
@@ -189,9 +189,9 @@ class FieldModel:
         self.inverse: Floats = np.asarray(np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64)
         grid = _grid(size, self.pitch)
         self.margin = OVERSHOOT * self.pitch + grid.spacing
-        """How much farther a cell may have moved than any marker that is seen, px."""
+        """How much farther a cell may have moved than any tracked marker, px."""
         self.fine, self.coarse = self._samples(grid), self._samples(grid.coarser())
-        """For small and for large regions. Both are fixed to the frame, so that what is said of a region does
+        """For small and for large regions. Both are fixed to the frame, so that the motion of a region does
         not depend on where its bounding box begins."""
 
     def _samples(self, grid: Grid) -> Samples:
@@ -222,7 +222,7 @@ class DisplacementField:
     Coordinates are those of the gel at rest: `displacement[row, column]` is how far the bit of gel has moved
     that was at `grid.points[row, column]` in the reference frame.
 
-    model : of the reference. markers : of the frame. seen : (N,) bool, those that were seen, three or more.
+    model : of the reference. markers : of the frame. seen : (N,) bool, those that are tracked, three or more.
 
     grid : where the field is known. noise : median standard error of a marker, px; 0 where none is known.
     """
@@ -238,32 +238,32 @@ class DisplacementField:
         self._variance = np.where(known, markers.stderr, self.noise) ** 2
         self._moved = np.where(seen[:, None], markers.position - model.origin, 0.0)
         self._removed = np.empty((0, len(seen)))
-        """(S, N): the inverse is less by their squares, removed.T @ removed."""
+        """(S, N): the inverse of this frame is that of the model less removed.T @ removed."""
         poor = seen & (self._variance > (POOR * self.noise) ** 2)
         doubtful = ~seen | poor
         if doubtful.any():
             self._removed = self._without(doubtful, 0.0)
         if poor.any():
-            # Their variance is compared with that of the field, which all others tell.
+            # The variance of the field, to which theirs is compared, is estimated from all others.
             moved = self._moved[~doubtful]
             scale = float(np.vdot(moved, self._weights(self._moved.T).T[~doubtful])) / moved.size
             self._removed = self._without(doubtful, scale)
         self._coefficients = self._weights(self._moved.T).T
         information = np.diagonal(model.inverse) - np.square(self._removed).sum(axis=0)
-        self._precision = np.where(seen, 0.5 / np.maximum(information, LEAST_INFORMATION), 0.0)
+        self._precision = np.where(seen, 0.5 / np.maximum(information, _LEAST_PRECISION), 0.0)
 
     def _without(self, doubtful: Flags, scale: float) -> Floats:
-        """(S, N): what `_removed` is without these markers (N,), by Cholesky's factors.
+        """(S, N): rows of `_removed` that leave out the doubtful markers (N,).
 
-        scale : variance of the field, px^2, for those of them that are seen; 0 leaves them out, too.
+        scale : variance of the field, px^2, with which tracked ones among them keep some weight; 0: none.
         """
         chosen = np.flatnonzero(doubtful)
         rows = self._model.inverse[chosen]
-        share = np.where(self._seen[chosen], scale / np.maximum(self._variance[chosen], 1e-300), 0.0)
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(rows[:, chosen] + np.diag(share)), rows))
+        precision = scale * self._seen[chosen] / np.maximum(self._variance[chosen], 1e-300)
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(rows[:, chosen] + np.diag(precision)), rows))
 
     def _weights(self, kernel: Floats) -> Floats:
-        """(M, N): how much each marker counts in what has these kernels (M, N) with the markers."""
+        """(M, N): weights of the markers in M values of the field, whose kernel to the markers is (M, N)."""
         return np.asarray(kernel @ self._model.inverse - kernel @ self._removed.T @ self._removed)
 
     @cached_property
@@ -281,9 +281,9 @@ class DisplacementField:
         return np.asarray(np.sqrt(squares).reshape(self.grid.shape))
 
     def _scale(self, kernel: Floats) -> Floats:
-        """(...,): variance of the field, px^2, near what has these kernels (..., N) with the markers."""
+        """(...,): variance of the field, px^2, near places whose kernel to the markers is (..., N)."""
         variances = np.square(self._coefficients).sum(axis=1) * self._precision
-        return np.asarray(kernel @ variances / np.maximum(kernel @ self._seen, NOWHERE))
+        return np.asarray(kernel @ variances / np.maximum(kernel @ self._seen, _NOWHERE))
 
     def at(self, rest: Points) -> Floats:
         """(M, 2) float64, px: displacement of the gel that rests at points (M, 2), px; beyond the grid, that
@@ -325,7 +325,7 @@ class DisplacementField:
         total = float(share.sum())
         if not total:
             return None
-        products, to_region, prior = np.zeros((7, 7)), np.zeros((3, len(self._seen))), np.zeros((3, 3))
+        products, prior, to_region = np.zeros((7, 7)), np.zeros((3, 3)), np.zeros((3, len(self._seen)))
         sum_cells(
             share / total,
             moved,
@@ -338,13 +338,12 @@ class DisplacementField:
             prior,
         )
         weights = self._weights(to_region)
-        unknown = prior - weights @ to_region.T
-        left = max(float(unknown[0, 0] / prior[0, 0]), 0.0)
+        unknown, noise = prior - weights @ to_region.T, (weights * self._variance) @ weights.T
+        unknown_share = max(float(unknown[0, 0] / prior[0, 0]), 0.0)
         unknown *= self._scale(to_region[0])
-        noise = (weights * self._variance) @ weights.T
-        # Where all cells are whole, the picture has none of the region's outline.
+        # Where all cells are whole, the picture shows none of the region's outline.
         outline = OUTLINE if total - float(np.vdot(share, share)) > WHOLE else 0.0
-        return _fit(products, unknown, noise, left, outline, samples.grid.spacing)
+        return _fit(products, unknown, noise, unknown_share, outline, samples.grid.spacing)
 
     def _near(self, box: Sequence[int], grid: Grid) -> tuple[slice, slice]:
         """Rows and columns of the cells whose gel may be in a box (left, top, width, height)."""
@@ -368,20 +367,22 @@ def sum_cells(
     moved: Floats,
     spacing: float,
     to_markers: Floats,
-    left: int,
+    first_column: int,
     between: Floats,
     products: Floats,
     to_region: Floats,
     prior: Floats,
 ) -> None:
-    """Weighted sums over cells, in which each is 1, the way (x, y) to it from the middle of all, px, its motion
-    (x, y), px, and how much more that of a cell is which lies farther out by its way.
+    """Weighted sums over the cells of a region, of seven values v of each cell.
 
-    weight : (r, c), in sum 1. moved : (r, c, 2). spacing : of the cells, px. to_markers : (r, C, N), kernel
-    between cells and markers; the cells begin at column `left`. between : of `Samples`.
-    products : (7, 7) of 0, filled: of any two of the seven. to_region : (3, N) of 0, filled: of the first
-    three, kernel to the markers. prior : (3, 3) of 0, filled: of any two of these, over all pairs of cells,
-    kernel between the two.
+    These are 1; the way (x, y) to the cell from the centroid, px; its motion (x, y), px; and the change of
+    the motion (x, y) along that way, px.
+
+    weight : (r, c), with the sum 1. moved : (r, c, 2). spacing : of the cells, px. to_markers : (r, C, N), of
+    `Samples`, from column `first_column` on. between : of `Samples`.
+    products : (7, 7) of 0, filled with the sums of v_i v_j. to_region : (3, N) of 0, filled with the sums of
+    v_i times the kernel to each marker, for the first three. prior : (3, 3) of 0, filled with the sums of v_i
+    v_j over pairs of cells, times the kernel between the two.
     """
     rows, columns = weight.shape
     planes, values = np.zeros((3, rows, columns)), np.empty(7)
@@ -404,7 +405,7 @@ def sum_cells(
                 values[3 + k] = moved[row, column, k]
                 across, down = (after[k] - before[k]) / wide, (below[k] - above[k]) / high
                 values[5 + k] = (column - x) * across + (row - y) * down
-            near = to_markers[row, left + column]
+            near = to_markers[row, first_column + column]
             for i in range(7):
                 part = weight[row, column] * values[i]
                 for j in range(7):
@@ -425,28 +426,32 @@ def sum_cells(
                     along += planes[1, other, n] * line[n]
                     upright += planes[2, other, n] * line[n]
                 for j in range(3):
-                    part = planes[j, row, column] * (1 if other == row else 2)
+                    # Other pairs of rows come once; each half of their sum is the transpose of the other.
+                    part = planes[j, row, column] * (0.5 if other == row else 1)
                     prior[0, j] += one * part
                     prior[1, j] += along * part
                     prior[2, j] += upright * part
+    for i in range(3):
+        for j in range(i + 1):
+            prior[i, j] = prior[j, i] = prior[i, j] + prior[j, i]
 
 
 def _fit(
-    products: Floats, unknown: Floats, noise: Floats, left: float, outline: float, spacing: float
+    products: Floats, unknown: Floats, noise: Floats, unknown_share: float, outline: float, spacing: float
 ) -> GelMotion:
-    """The affine motion that is nearest to those of a region's cells.
+    """The affine motion nearest to those of the cells of a region.
 
-    products : of `sum_cells`. unknown, noise : (3, 3), covariance of the sums over 1, x and y of the motion: what
-    the markers leave unknown, and what their own errors add, px^2. left : `GelMotion.unknown`. outline :
-    standard error of the outline, over the radius. spacing : of the cells, px.
+    products : of `sum_cells`. unknown, noise : (3, 3), covariance of the sums of the motion times 1, x and y:
+    what the markers leave unknown, and what their own errors add, px^2. unknown_share : see `GelMotion`.
+    outline : standard error of the outline, over the radius. spacing : of the cells, px.
     """
-    # A region that is larger by a small part adds as much of its mean slope outwards, times the way from its
-    # middle, to the mean (Gauss's theorem).
+    # A region that grows by a small part of its radius adds that part of the mean change outwards to the mean
+    # (Gauss's theorem).
     _, _, _, u, v, outwards_u, outwards_v = products[0].tolist()
     squares = max(products[3, 3] + products[4, 4] - u * u - v * v, 0.0)
     stderr = math.sqrt(max(unknown[0, 0], 0.0) + noise[0, 0])
     outline_stderr = outline * abs(outwards_u), outline * abs(outwards_v)
-    motion = GelMotion((u, v), stderr, outline_stderr, math.sqrt(squares / 2), None, None, left)
+    motion = GelMotion((u, v), stderr, outline_stderr, math.sqrt(squares / 2), None, None, unknown_share)
     (xx, xy, xu, xv), (_, yy, yu, yv) = products[1:3, 1:5].tolist()
     determinant = xx * yy - xy * xy
     # A single cell has the second moment spacing^2 / 12 along each axis: too small to have slopes.
@@ -470,10 +475,10 @@ def _square(form: Sequence[Sequence[float]], x: float, y: float) -> float:
 
 
 def _covered(mask: Mask, box: Sequence[int], places: Floats, spacing: float) -> Floats:
-    """(r, c), how much of squares around places (r, c, 2), px, lies in a mask, 0 to 1.
+    """(r, c), how much of the square around each place (r, c, 2), px, lies in a mask, 0 to 1.
 
-    box : (left, top, width, height), of all that is not 0. spacing : of the places, px; the sides of the squares
-    are the nearest odd number.
+    box : (left, top, width, height), bounding box of the mask. spacing : of the places, px; the side of the
+    squares is the nearest odd number.
     """
     left, top, width, height = box
     sums = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
@@ -501,7 +506,10 @@ def average_squares(sums: NDArray[np.int32], centers: Floats, side: int, means: 
                 upper, lower = min(max(top + down, 0), height), min(max(top + down + side, 0), height)
                 for across in range(2):
                     first, last = min(max(left + across, 0), width), min(max(left + across + side, 0), width)
-                    above, below = sums[upper, last] - sums[upper, first], sums[lower, last] - sums[lower, first]
+                    above, below = (
+                        sums[upper, last] - sums[upper, first],
+                        sums[lower, last] - sums[lower, first],
+                    )
                     part = abs(1 - down - (y - top)) * abs(1 - across - (x - left))
                     means[row, column] += part * np.int32(below - above) / (255.0 * side * side)
 

@@ -24,15 +24,13 @@ _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 
 
-def flow_in_mask(markers: Markers, mask: Mask, *, dilate: float = 0.0) -> Flow:
+def flow_in_mask(markers: Markers, mask: Mask) -> Flow:
     """Summarise the displacement of the markers inside the contact.
 
     Parameters
     ----------
     markers : as the tracker gives them, processed pixels.
-    mask : (H, W) uint8, not 0 inside the contact.
-    dilate : px; a marker is inside if its *current* centre lies at most this far outside of the region. More
-        takes in more markers (a steadier mean), also such as move less because they lie outside the contact.
+    mask : (H, W) uint8, not 0 inside the contact. A marker is inside if its *current* centre is.
 
     Returns
     -------
@@ -44,7 +42,7 @@ def flow_in_mask(markers: Markers, mask: Mask, *, dilate: float = 0.0) -> Flow:
 
     Raises
     ------
-    ValueError : mask is not (H, W) uint8, or dilate is negative or not finite.
+    ValueError : mask is not (H, W) uint8.
 
     Examples
     --------
@@ -56,7 +54,7 @@ def flow_in_mask(markers: Markers, mask: Mask, *, dilate: float = 0.0) -> Flow:
     >>> flow.mean, flow.count
     ((1.5, -0.5), 3)
     """
-    chosen = np.flatnonzero(_inside(markers, mask, dilate))
+    chosen = np.flatnonzero(_inside(markers, mask))
     tracked = chosen[markers.status[chosen] == _TRACKED]
     if len(tracked) == 1:
         chosen = tracked
@@ -85,15 +83,13 @@ def flow_in_mask(markers: Markers, mask: Mask, *, dilate: float = 0.0) -> Flow:
     return Flow((fit.mean.real, fit.mean.imag), len(chosen), stderr, rotation, divergence, residual)
 
 
-def flow_of_field(
-    field: DisplacementField, markers: Markers, mask: Mask, *, dilate: float = 0.0, coarse: bool = False
-) -> Flow:
+def flow_of_field(field: DisplacementField, markers: Markers, mask: Mask, *, coarse: bool = False) -> Flow:
     """Summarise the displacement of the gel inside the contact, between its markers.
 
     Parameters
     ----------
     field : of this frame.
-    markers, dilate : as for `flow_in_mask`; they only give the flow's `count`.
+    markers : as for `flow_in_mask`; they only give the flow's `count`.
     mask : (H, W) uint8, 255 inside the contact, else 0.
     coarse : whether the mask only says roughly where the contact is, as one does that markers alone show. The
         standard error of the mean then is how much the displacement differs within it.
@@ -107,7 +103,7 @@ def flow_of_field(
 
     Raises
     ------
-    ValueError : mask is not (H, W) uint8, or dilate is negative or not finite.
+    ValueError : mask is not (H, W) uint8.
 
     Examples
     --------
@@ -121,7 +117,7 @@ def flow_of_field(
     >>> [round(value, 1) for value in flow.mean], flow.count
     ([1.5, -0.5], 1)
     """
-    count = int(np.count_nonzero(_inside(markers, mask, dilate)))
+    count = int(np.count_nonzero(_inside(markers, mask)))
     motion = field.motion(mask) if count else None
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
@@ -129,9 +125,9 @@ def flow_of_field(
     return _flow_of_motion(motion, count, outline)
 
 
-def _inside(markers: Markers, mask: Mask, dilate: float) -> Flags:
-    """Which markers (N,), lost ones left out, lie inside the mask, or at most `dilate` px outside."""
-    return np.asarray(inside_mask(markers.position, mask, dilate) & (markers.status != _LOST))
+def _inside(markers: Markers, mask: Mask) -> Flags:
+    """Which markers (N,) lie inside the mask; lost ones do not count."""
+    return np.asarray(inside_mask(markers.position, mask) & (markers.status != _LOST))
 
 
 def _flow_of_motion(motion: GelMotion, count: int, outline: tuple[float, float]) -> Flow:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import MAD_TO_SIGMA, ColorImage, Floats, Floats32, Indices, Mask
-from tactflow.vision.flow.loops import compare_light
+from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import cell_means
 
 CELL: Final = 4
@@ -229,3 +229,57 @@ def register(
     covariance, known = (turned @ part @ turned.T for part in (covariance, known))
     motion = expected + covariance @ known @ (motion - expected)
     return Registration(motion, covariance, error, residual, count / len(error))
+
+
+@kernel(
+    "int64(float32[:, :, ::1], float64[::1], float64, float32[:, ::1], float32[:, ::1], float32[:, :, ::1],"
+    " int64[::1], float32[:, ::1], float64[::1])"
+)
+def compare_light(
+    change: Floats32,
+    warp: Floats,
+    gain: float,
+    away: Floats32,
+    light: Floats32,
+    by: Floats32,
+    patches: Indices,
+    error: Floats32,
+    sums: Floats,
+) -> int:
+    """How the light of a picture differs from that of a template that has moved; returns how many cells are
+    seen, of which neither the border nor a marker hides a part.
+
+    change : (h, w, 4), of `light_change`. warp : (4,): scale times cosine and sine of the turn, and where the
+    centre is, cells. gain : factor of the light. away, light, by, patches : of a template.
+    error : (N, 3), filled: picture less template, 0 where it is not seen. sums : (10,), filled: `by` times
+    the error; its square; the squares of its sums over patches; the error of each channel.
+    """
+    count, patch = 0, np.zeros(3)
+    sums[:] = 0
+    for i in range(len(away)):
+        if i > 0 and patches[i] != patches[i - 1]:
+            sums[6] += patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2
+            patch[:] = 0
+        error[i] = 0
+        x = warp[0] * away[i, 0] - warp[1] * away[i, 1] + warp[2]
+        y = warp[1] * away[i, 0] + warp[0] * away[i, 1] + warp[3]
+        if not (0 <= x < change.shape[1] - 1 and 0 <= y < change.shape[0] - 1):
+            continue
+        column, row = int(x), int(y)
+        upper, lower = change[row, column : column + 2], change[row + 1, column : column + 2]
+        if min(upper[0, 3], upper[1, 3], lower[0, 3], lower[1, 3]) < 1:
+            continue
+        count += 1
+        right, down = x - column, y - row
+        for channel in range(3):
+            above = upper[0, channel] + right * (upper[1, channel] - upper[0, channel])
+            below = lower[0, channel] + right * (lower[1, channel] - lower[0, channel])
+            left = above + down * (below - above) - gain * light[i, channel]
+            error[i, channel] = left
+            patch[channel] += left
+            sums[5] += left * left
+            sums[7 + channel] += left
+            for k in range(5):
+                sums[k] += by[i, channel, k] * left
+    sums[6] += patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2
+    return count
