@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Mask, Points, check_mask
-from tactflow.vision.compiled import kernel
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -414,26 +414,33 @@ def sum_cells(
                     planes[i, row, column] = part
                     for n in range(near.size):
                         to_region[i, n] += part * near[n]
+    _sum_pairs(planes, between, prior)
+
+
+@helper
+def _sum_pairs(weights: Floats, between: Floats, sums: Floats) -> None:
+    """Sums (3, 3) over pairs of cells of products of weights (3, r, c), times the kernel between the two."""
+    _, rows, columns = weights.shape
     for row in range(rows):
         for column in range(columns):
-            if weight[row, column] == 0:
+            if weights[0, row, column] == 0:
                 continue
             for other in range(row + 1):
                 line = between[between.shape[0] // 2 + row - other, between.shape[1] // 2 - column :]
-                one = along = upright = 0.0
+                one = x = y = 0.0
                 for n in range(columns):
-                    one += planes[0, other, n] * line[n]
-                    along += planes[1, other, n] * line[n]
-                    upright += planes[2, other, n] * line[n]
+                    one += weights[0, other, n] * line[n]
+                    x += weights[1, other, n] * line[n]
+                    y += weights[2, other, n] * line[n]
                 for j in range(3):
-                    # Other pairs of rows come once; each half of their sum is the transpose of the other.
-                    part = planes[j, row, column] * (0.5 if other == row else 1)
-                    prior[0, j] += one * part
-                    prior[1, j] += along * part
-                    prior[2, j] += upright * part
+                    # The sums over `other` above and below `row` are each other's transpose.
+                    part = weights[j, row, column] * (0.5 if other == row else 1.0)
+                    sums[0, j] += one * part
+                    sums[1, j] += x * part
+                    sums[2, j] += y * part
     for i in range(3):
         for j in range(i + 1):
-            prior[i, j] = prior[j, i] = prior[i, j] + prior[j, i]
+            sums[i, j] = sums[j, i] = sums[i, j] + sums[j, i]
 
 
 def _fit(
