@@ -114,7 +114,7 @@ def judge(
     errors = np.array(press_errors(session, model, scale, radii))
     surface, rest = Surface(model, scale, found.errors()), Rest(session.untouched)
     rows = []
-    for press, ball_radius, cap_error in zip(session.presses, radii, errors[:, 3], strict=True):
+    for press, ball_radius, cap_error in zip(session.presses, radii, errors[:, 1], strict=True):
         depth = surface.depth(press.image, rest, press.mask)
         contact = min(press.radius * (scale.x * scale.y) ** 0.5, 0.98 * ball_radius)
         cap = ball_radius - np.sqrt(ball_radius**2 - contact**2)
@@ -125,7 +125,7 @@ def judge(
         off = abs(cap_error) / (1 + cap_error)
         rows.append([depth.greatest / cap, depth.greatest / sneddon, step, off / stated])
     over_cap, over_sneddon, step = np.median(rows, axis=0)[:3]
-    cap_rms = 100 * np.sqrt(np.nanmean(errors[:, 3] ** 2))
+    cap_rms = 100 * np.sqrt(np.nanmean(errors[:, 1] ** 2))
     one, two = (100 * np.nanmean(np.array(rows)[:, 3] < k) for k in (1, 2))
     return (
         f"{np.median(errors[:, 0]):7.1f} {cap_rms:6.1f} {over_cap:8.2f} {over_sneddon:8.2f} "

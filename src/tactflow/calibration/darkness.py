@@ -8,7 +8,6 @@ around the middle give the darkening for each depth, and isotonic regression mak
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -39,12 +38,11 @@ class Ring(NamedTuple):
     darkening: tuple[float, float]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Darkness:
+class Darkness(NamedTuple):
     """A fit.
 
-    found : numbers for the calibration file. kept : (n,) bool, which presses
-    were used. misfit : (n,) float64, RMS error of the depth of each press, mm; infinite where it is unusable.
+    found : numbers for the calibration file. kept : (n,) bool, which presses were used. misfit : (n,)
+    float64, RMS error of the depth of each press, mm; infinite where it is unusable.
     """
 
     found: DarknessEntry
@@ -59,10 +57,8 @@ def fit_darkness(session: Session, scale: Scale, ball_radius: float) -> Darkness
 
     session : what `PressFinder` found. scale : mm per px. ball_radius : mm.
 
-    Raises
-    ------
-    ConfigError : no presses, contacts larger than the ball or too small, or a gel that does not become darker
-    with the depth.
+    Raises ConfigError without presses, for contacts larger than the ball or too small, and for a gel that
+    does not become darker with the depth.
     """
     check_presses(session, scale, np.full(len(session.presses), ball_radius), fewest=1)
     rest = Rest(session.untouched)

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import io
-import math
 import zipfile
 from datetime import UTC, datetime
 from functools import cached_property
@@ -48,12 +47,6 @@ ASPECT: Final = 0.02
 """Relative difference of width over height up to which frames have the same shape. Chosen by hand."""
 ALIGNED: Final = 0.9
 """Cosine of the angle between the axes of two frames above which they are turned alike."""
-KIND_SCALE: Final = 0.05
-"""Relative standard error of the scale on another sensor of the kind: the authors of FOTS measured 19.6 and
-21.1 pixels per mm on two DIGITs."""
-KIND_ERRORS: Final = {"normal_error": 2.6, "sphere_rms": 0.006, "depth_stderr": 0.102, "volume_stderr": 0.125}
-"""Additional errors on another sensor of the kind, measured on two other Minis by
-benchmarks/default_calibrations.py."""
 TERMS: Final = PLACE_TERMS * COLOUR_TERMS
 """Coefficients of one part of the normal."""
 
@@ -63,7 +56,8 @@ LeftOut = Literal["object", "recording", "press"]
 
 
 class _Entry(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+    # Files of earlier versions have entries that nothing reads any more.
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False, frozen=True)
 
 
 class ScaleEntry(_Entry):
@@ -85,22 +79,17 @@ class ScaleEntry(_Entry):
 class PhotometricEntry(_Entry):
     """`photometric` of the file: what it was learned from, and its errors on presses it was not learned from.
 
-    ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. radius_error : median
-    of the fitted radius over the true one, less 1. sphere_rms : of the heights from the fitted ball, mm.
-    depth_stderr, volume_stderr : of balls, relative to the value; for people, since the errors of a height
-    map are those of `SurfaceErrors`. between : the part of `depth_stderr` that is the difference of sensors
-    of the kind. steepest : see `SurfaceErrors`. explained : share of the slopes
-    of a ball that the fit explains, see `Misfit`; None in files of earlier versions.
+    ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. depth_stderr : of
+    balls, relative; for people, since the errors of a height map are those of `SurfaceErrors`. between : the
+    part of it that is the difference of sensors of the kind. steepest : see `SurfaceErrors`. explained :
+    share of the slopes of a ball that the fit explains, see `Misfit`; None in files of earlier versions.
     """
 
     ball_radius: float = Field(gt=0)
     presses: int
     rejected: int
     normal_error: float
-    radius_error: float
-    sphere_rms: float
     depth_stderr: float
-    volume_stderr: float
     between: float = 0.0
     steepest: float | None = None
     explained: float | None = None
@@ -133,9 +122,6 @@ class LinearForceEntry(_Entry):
     stiffness, greatest, error : see `LinearForce`. range : least and largest force of the fit, N.
     rmse : RMS error, N. r2 : share of the variance that is explained.
     """
-
-    # Earlier files have the hysteresis, too.
-    model_config = ConfigDict(extra="ignore")
 
     stiffness: dict[str, float]
     greatest: dict[str, float]
@@ -187,7 +173,7 @@ class Calibration(_Entry):
     sensor; None without slopes, and in files of earlier versions.
     """
 
-    model_config = ConfigDict(arbitrary_types_allowed=True, populate_by_name=True)
+    model_config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, populate_by_name=True)
 
     format: Literal["tactflow.calibration/1"] = "tactflow.calibration/1"
     sensor: str
@@ -220,20 +206,6 @@ class Calibration(_Entry):
         (x, y), (x_error, y_error) = self.scale_entry.mm_per_pixel, self.scale_entry.stderr
         center = (size[0] - 1) / 2, (size[1] - 1) / 2
         return Scale(x * across, y * down, (x_error * across, y_error * down), center)
-
-    def for_kind(self, kind: str) -> Calibration:
-        """The same as the default of a kind of sensor, with the errors that it has on others of the kind."""
-        entry, photometric = self.scale_entry, self.photometric
-        if photometric is not None:
-            own = photometric.model_dump()
-            wider = {name: math.hypot(own[name], more) for name, more in KIND_ERRORS.items()}
-            wider["between"] = math.hypot(photometric.between, KIND_ERRORS["depth_stderr"])
-            photometric = photometric.model_copy(update=wider)
-        pairs = zip(entry.mm_per_pixel, entry.stderr, strict=True)
-        stderr = tuple(math.hypot(error, KIND_SCALE * value) for value, error in pairs)
-        scale_entry = entry.model_copy(update={"stderr": stderr})
-        update = {"kind": kind, "scale_entry": scale_entry, "photometric": photometric}
-        return self.model_copy(update=update)
 
     def save(self, path: Path) -> None:
         """Write the YAML file, and beside it the arrays in a `.npz` of the same name.

@@ -1,8 +1,8 @@
-"""The force on the gel, learned from recordings beside which a gauge was read.
+"""Fit the force on the gel to recordings made while a force gauge was read.
 
-What the force is linear in, and why, says `tactflow.vision.force`. Stiffnesses are never negative, so that
-what lies a little outside of the fit cannot become absurd. The errors are those of forces that the fit has
-not seen: each object in turn is left out, or each recording or press where there are too few of the others.
+`tactflow.vision.force` explains the features that the force is linear in. Stiffnesses are never negative, so
+that the fit stays plausible a little outside of its range. The errors are cross-validated: each object in
+turn is left out, or each recording or press where there are too few of the others.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ NEEDED: Final = {"contact": "hull", "untouched": "untouched", "scale": "scale"}
 FEWEST_PRESSES: Final = 4
 """Presses that a fit needs at least; ten or more are advised. Chosen by hand."""
 FEWEST_GROUPS: Final = 3
-"""Objects, or else recordings, from which on whole ones are left out to judge the fit. Chosen by hand."""
+"""With at least this many objects, or else recordings, the fit is cross-validated over them. By hand."""
 GAP: Final = 3
 """Frames without a contact that do not end a press: a light one flickers. Chosen by hand."""
 RATIOS: Final = np.concatenate([[0.0], np.logspace(-3, 1, 41)])
-"""Relative over absolute part of the standard error that are tried, per N."""
+"""Candidates for the ratio of the relative to the absolute part of the standard error, per N."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Watched:
     """Features of the contacts in a recording, frame by frame; n frames.
 
-    frames, times : (n,) float64, number and time (s). press : feature -> (n,) float64, of `BY_DEPTH`
-    where heights are known, else of `BY_CHANGE`; 0 where nothing touches; the change includes that at rest.
+    frames, times : (n,) float64, number and time (s). press : feature -> (n,) float64, of `BY_DEPTH` where
+    heights are known, else of `BY_CHANGE`, which includes the change at rest; 0 where nothing touches.
     drag : feature -> (n,) complex128, x + i y; NaN where the flow is not known. touched : (n,) bool.
     change_at_rest : see `ForceModel`.
     """
@@ -55,10 +55,8 @@ class Watched:
 
 
 class Watcher:
-    """Collects the features that the force follows from, of results that are added one after the other.
-
-    The results hold their pictures and come from a pipeline with a scale (`NEEDED`) that skips nothing.
-    """
+    """Collects the features of results with pictures, from a pipeline with a scale (`NEEDED`) that skips
+    nothing."""
 
     def __init__(self) -> None:
         self._frames: list[tuple[int, float]] = []
@@ -67,7 +65,7 @@ class Watcher:
         self._light: LightChange | None = None
 
     def add(self, result: Result) -> None:
-        """Look at one result."""
+        """Add one result."""
         scale, unmarked, contact = result.scale, result.get("unmarked", result.image), result.contact
         if scale is None or unmarked is None:
             return
@@ -108,9 +106,9 @@ class Watcher:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Aligned:
-    """A recording and its reference on one clock, frames with contact and a force only; n of them.
+    """The n frames of a recording that have both a contact and a force.
 
-    name, offset : of the recording, and of its time against the reference's, s. press : (n, k) float64.
+    name : of the recording. offset : of its time against the reference's, s. press : (n, k) float64.
     drag : (n, 2) complex128. force : (n, 3) float64, N. presses : (n,) int, which press a frame belongs to.
     """
 
@@ -123,11 +121,9 @@ class Aligned:
 
 
 def align(name: str, watched: Watched, reference: Reference, change_at_rest: float) -> Aligned:
-    """Put the force beside the frames. change_at_rest : of the sensor, see `ForceModel`.
+    """Interpolate the force at the frames of a recording. change_at_rest : of the sensor, see `ForceModel`.
 
-    Raises
-    ------
-    ConfigError : nothing touches, or the reference is of another recording.
+    Raises ConfigError if nothing touches, or the reference is of another recording.
     """
     if not watched.touched.any():
         raise ConfigError(
@@ -150,9 +146,9 @@ def align(name: str, watched: Watched, reference: Reference, change_at_rest: flo
 
 
 class Fit(NamedTuple):
-    """entry : for the calibration file; without `drag` where the flow explains nothing of fx and fy. turned :
-    how the gauge's x axis lies in the picture, degrees, counter-clockwise as seen; None without fx and fy.
-    mirrored : whether its y axis lies on the other side of it than the picture's."""
+    """entry : for the calibration file; without `drag` where the flow does not explain fx and fy. turned :
+    direction of the gauge's x axis in the picture, degrees, counter-clockwise; None without fx and fy.
+    mirrored : whether its y axis is mirrored relative to the picture's."""
 
     entry: ForceEntry
     turned: float | None = None
@@ -160,13 +156,12 @@ class Fit(NamedTuple):
 
 
 def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference]) -> Fit:
-    """Learn the force from recordings.
+    """Fit the force to recordings.
 
     watched, references : recording -> the features of its contacts, and the readings of the gauge.
 
-    Raises
-    ------
-    ConfigError : too few presses, a reference of another recording, or heights in some recordings only.
+    Raises ConfigError for too few presses, a reference of another recording, or heights in some recordings
+    only.
     """
     names = {tuple(recording.press) for recording in watched.values()}
     if len(names) > 1:
@@ -199,13 +194,21 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
             "calibrate force: the CSV has fx and fy, but the flow of the contact is not known; add the "
             "stages tracker and flow_in_mask, or leave these columns out"
         )
-    return _with_drag(entry, drag[known], force[known, 0] + 1j * force[known, 1], groups[known])
+    drag, sideways, groups = drag[known], force[known, 0] + 1j * force[known, 1], groups[known]
+    turn, mirrored = _turn(drag, sideways)
+    sideways = (sideways.conj() if mirrored else sideways) * turn
+    # The same stiffness for x and y: both are samples of one fit.
+    both = [np.concatenate([part.real, part.imag]) for part in (*drag.T, sideways)]
+    learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups, 2))
+    entry = entry.model_copy(update={"drag": learned if learned.r2 > 0 else None})
+    # y points down, so that a positive angle of a complex number is clockwise as seen.
+    return Fit(entry, -float(np.degrees(np.angle(turn))), mirrored)
 
 
 def _left_out(aligned: Sequence[Aligned], presses: NDArray[np.intp]) -> tuple[LeftOut, NDArray[np.intp]]:
-    """What is left out in turn to judge the fit, and the group of each frame: (n,), as presses are."""
+    """What is left out in turn to cross-validate the fit, and the group of each frame, (n,)."""
     names = [Path(part.name).stem for part in aligned]
-    # Recordings of one object are told apart by a number at the end.
+    # The names of recordings of one object differ in a number at the end.
     objects = [name.rstrip("0123456789").rstrip("_- ") for name in names]
     ways: list[tuple[LeftOut, list[str]]] = [("object", objects), ("recording", names)]
     for left_out, labels in ways:
@@ -213,23 +216,6 @@ def _left_out(aligned: Sequence[Aligned], presses: NDArray[np.intp]) -> tuple[Le
         if len(kinds) >= FEWEST_GROUPS:
             return left_out, np.repeat(numbers, [len(part.press) for part in aligned])
     return "press", presses
-
-
-def _with_drag(
-    entry: ForceEntry,
-    drag: NDArray[np.complex128],
-    sideways: NDArray[np.complex128],
-    groups: NDArray[np.intp],
-) -> Fit:
-    """Add the force sideways. drag : (n, 2). sideways : (n,), fx + i fy, N, in the axes of the gauge."""
-    turn, mirrored = _turn(drag, sideways)
-    sideways = (sideways.conj() if mirrored else sideways) * turn
-    # The same stiffness for x and y: both are samples of one fit.
-    both = [np.concatenate([part.real, part.imag]) for part in (*drag.T, sideways)]
-    learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups, 2))
-    # y points down, so that a positive angle of a complex number is clockwise as seen.
-    turned = -float(np.degrees(np.angle(turn)))
-    return Fit(entry.model_copy(update={"drag": learned if learned.r2 > 0 else None}), turned, mirrored)
 
 
 def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Reference) -> float:
@@ -249,8 +235,8 @@ def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Referen
 def _learn(
     names: Sequence[str], features: Floats, force: Floats, groups: NDArray[np.intp]
 ) -> LinearForceEntry:
-    """Fit one component. features : (n, k). force : (n,). groups : (n,), left out in turn."""
-    # Features differ by orders of magnitude.
+    """Fit one component. features : (n, k), which differ by orders of magnitude. groups : (n,), left out in
+    turn."""
     size = np.maximum(np.abs(features).max(axis=0), 1e-12)
     features = features / size
     fitted = nnls(features, force)[0]
@@ -271,9 +257,9 @@ def _learn(
 
 
 def _error(residual: Floats, force: Floats) -> tuple[float, float]:
-    """The absolute and the relative part of the standard error that make the residuals (n,) most likely.
+    """Maximum likelihood estimate of the absolute and the relative part of the standard error.
 
-    force : (n,), N, at which they were made.
+    residual, force : (n,), N.
 
     >>> force = np.tile([1.0, 10.0], 500)
     >>> absolute, relative = _error(force * np.random.default_rng(1).normal(0, 0.1, 1000), force)
@@ -288,9 +274,9 @@ def _error(residual: Floats, force: Floats) -> tuple[float, float]:
 
 
 def _turn(drag: NDArray[np.complex128], force: NDArray[np.complex128]) -> tuple[complex, bool]:
-    """The unit number that turns the gauge's axes into the picture's, and whether y must be mirrored first.
+    """The unit number that rotates the gauge's axes into the picture's, and whether y is mirrored first.
 
-    What drags the gel moves it the same way, so the direction of the flow tells how the gauge is mounted.
+    The gel moves in the direction of the force, so the flow shows how the gauge is mounted.
     """
     moved = drag[:, 0]
     plain, mirror = complex((moved * force.conj()).sum()), complex((moved * force).sum())

@@ -24,9 +24,7 @@ _DEPTHS: Final = ("firmly", "lightly", "half as deep")
 
 
 def fault(press: Press, usual: float) -> str | None:
-    """What is wrong with a press, and what to do; None if it is good.
-
-    usual : radius of contacts, px.
+    """What is wrong with a press, and what to do; None if it is good. usual : radius of contacts, px.
 
     >>> import numpy as np
     >>> mask = np.zeros((60, 60), np.uint8)
@@ -47,30 +45,13 @@ def fault(press: Press, usual: float) -> str | None:
     return None
 
 
-def part(press: Press) -> tuple[int, int]:
-    """(row, column) of the part of the gel that a press lies in."""
-    height, width = press.mask.shape
-    return int(PARTS * press.center[1] / height), int(PARTS * press.center[0] / width)
-
-
-def part_name(row: int, column: int) -> str:
-    """The name of a part of the gel.
-
-    >>> part_name(0, 2)
-    'upper right'
-    """
-    return f"{_ROWS[row]} {_COLUMNS[column]}"
-
-
 def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str, Any]:
-    """The state of a session, as the live page takes it.
+    """The state of a session, for the live page.
 
     lasts : whether the last press is not over. wanted : number of presses to reach.
 
-    Returns
-    -------
-    now : what to do, in words. done, good, wanted : numbers of presses. next : (row, column) of the part of
-    the gel that has the fewest good ones. lasts. presses : center and radius of each, px, and its fault.
+    Returns now : what to do, in words. done, good, wanted : numbers of presses. next : (row, column) of the
+    part of the gel with the fewest good ones. lasts. presses : center and radius of each, px, and its fault.
 
     >>> progress([], False, 20)["now"]
     'Press the ball firmly in the centre.'
@@ -79,10 +60,13 @@ def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str,
     faults = [fault(press, usual) for press in presses]
     done = len(presses) - lasts
     good = [press for press, wrong in zip(presses[:done], faults[:done], strict=True) if wrong is None]
-    there = [part(press) for press in good]
-    row, column = min(_FIRST, key=there.count)
-    where = "in the centre" if (row, column) == (1, 1) else f"at the {part_name(row, column)}"
-    now = f"Press the ball {_DEPTHS[there.count((row, column)) % 3]} {where}."
+    parts = [
+        tuple(int(PARTS * x / side) for x, side in zip(press.center[::-1], press.mask.shape, strict=True))
+        for press in good
+    ]
+    row, column = min(_FIRST, key=parts.count)
+    where = "in the centre" if (row, column) == (1, 1) else f"at the {_ROWS[row]} {_COLUMNS[column]}"
+    now = f"Press the ball {_DEPTHS[parts.count((row, column)) % 3]} {where}."
     if lasts:
         now = "Lift the ball."
     elif done >= wanted:
@@ -106,7 +90,7 @@ class Guide:
 
     wanted : number of presses that are enough. say : shows a line.
 
-    `state` (see `progress`) may be read from any thread: that is what the live page does.
+    `state` (see `progress`) may be read from any thread, as the live page does.
     """
 
     def __init__(self, wanted: int, say: Callable[[str], None]) -> None:

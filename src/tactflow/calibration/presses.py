@@ -66,16 +66,11 @@ class Session:
 class PressFinder:
     """Finds the presses in results, which are added one after the other.
 
-    A press lasts as long as something touches at about one place; of each, the frame with the largest contact
-    is kept.
+    A press lasts as long as something touches about the same place; the frame with its largest contact is
+    kept.
 
-    pictures : the frames were taken one by one, so that each one whose contact has moved or changed its size
-    is a new press, even near the previous one.
-
-    Attributes
-    ----------
-    presses : so far; finished ones may be removed. frames : number of results that were added.
-    lasts : whether the last press is still going on.
+    pictures : frames were taken one by one, so each contact that moves or changes its size is a new press.
+    presses : so far. frames : number of results that were added. lasts : whether the last press goes on.
     """
 
     def __init__(self, pictures: bool = False) -> None:
@@ -133,11 +128,8 @@ class PressFinder:
         if self.lasts:
             last = self.presses[-1]
             moved = float(np.hypot(*np.subtract(press.center, last.center))) / last.radius
-            if self.pictures:
-                same = max(moved, abs(press.radius / last.radius - 1)) < MOVED_ALONE
-            else:
-                same = moved < MOVED_ON
-            if same:
+            changed = abs(press.radius / last.radius - 1)
+            if max(moved, changed) < MOVED_ALONE if self.pictures else moved < MOVED_ON:
                 if press.radius > last.radius:
                     self.presses[-1] = press
                 return
@@ -146,25 +138,16 @@ class PressFinder:
 
     @property
     def untouched(self) -> Picture:
-        """(H, W, 3) uint8: mean of the reference frames.
-
-        Raises
-        ------
-        ConfigError : there were no frames.
-        """
+        """(H, W, 3) uint8: mean of the reference frames. Raises ConfigError if there were no frames."""
         if not self._reference:
             raise ConfigError("calibrate: the source has no frames")
         return np.asarray(np.rint(np.mean(self._reference, axis=0)), np.uint8)
 
-    @property
-    def mapping(self) -> PixelMapping:
-        """From raw to processed pixels."""
-        height, width = self.untouched.shape[:2]
-        return self._mapping or PixelMapping.identity((width, height))
-
     def session(self) -> Session:
         """What was found. Raises ConfigError if there were no frames."""
-        return Session(self.untouched, self.mapping, self.presses, self._dots, self.frames)
+        height, width = self.untouched.shape[:2]
+        mapping = self._mapping or PixelMapping.identity((width, height))
+        return Session(self.untouched, mapping, self.presses, self._dots, self.frames)
 
 
 def difference(untouched: Picture, before: Picture) -> float:

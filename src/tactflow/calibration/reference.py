@@ -1,4 +1,4 @@
-"""The reference of a force calibration: a CSV of time and force, and how its clock differs from ours."""
+"""The reference of a force calibration: a CSV of time and force, and the offset of its clock."""
 
 from __future__ import annotations
 
@@ -64,12 +64,8 @@ class Reference:
 def read_reference(path: Path) -> Reference:
     """Read a CSV with a header: `t` (s) or `frame`, and `fz` (N); `fx` and `fy` if they were measured.
 
-    `NAMES` lists other headers that are understood. Further columns are ignored.
-
-    Raises
-    ------
-    ConfigError : it cannot be read, lacks a column, or has lines that are not numbers, a time that does not
-        grow, too few lines, or a constant force.
+    `NAMES` lists other headers that are understood. Further columns are ignored. Raises ConfigError for a
+    file that is not such a CSV, has too few lines, or a constant force.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "a.csv"
@@ -149,10 +145,9 @@ def recordings_with_csv(source: str) -> dict[str, Path]:
         return {source: path.with_suffix(".csv")}
     pairs: dict[str, Path] = {}
     for file in sorted(path.glob("*.csv")) if path.is_dir() else []:
-        named = [
-            recording for recording in path.iterdir() if recording.stem == file.stem and recording != file
-        ]
-        pairs |= {str(named[0]): file} if len(named) == 1 else {}
+        recordings = [other for other in path.iterdir() if other.stem == file.stem and other != file]
+        if len(recordings) == 1:
+            pairs[str(recordings[0])] = file
     if not pairs:
         raise ConfigError(
             f"calibrate force: found no recording with a CSV of the same name beside it in {source}; name "
@@ -164,17 +159,13 @@ def recordings_with_csv(source: str) -> dict[str, Path]:
 def time_offset(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
     """By how much the time of the frames is ahead of the reference's, s.
 
-    It is the shift at which the force follows the contact best, to a fraction of a frame. A gel that answers
-    late shifts it too: from one recording the two cannot be told apart.
+    It is the shift, to a fraction of a frame, with which the contact explains the force best, and includes
+    any delay of the gel's response.
 
-    Parameters
-    ----------
     seconds : (M,) times of the reference. times : (N,) of the frames. features : (N, k), what the force is
-        linear in, 0 where nothing touches.
+    linear in, 0 where nothing touches.
 
-    Raises
-    ------
-    ConfigError : no shift of up to `MAX_OFFSET` makes the two overlap, or the force follow the contact.
+    Raises ConfigError if no shift of up to `MAX_OFFSET` makes the two overlap and correlate.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     shifts = np.arange(-math.ceil(MAX_OFFSET / step), math.ceil(MAX_OFFSET / step) + 1) * step
@@ -203,7 +194,7 @@ def time_offset(reference: Reference, seconds: Floats, times: Floats, features: 
 
 
 def _explained(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
-    """Share of the force's variance that the features explain; NaN where too few frames have a force."""
+    """Share of the force's variance that the features explain; NaN if too few frames have a force."""
     there = (times >= seconds[0]) & (times <= seconds[-1])
     touched = features.any(axis=1)
     if np.count_nonzero(there & touched) < max(OVERLAP * np.count_nonzero(touched), 1):

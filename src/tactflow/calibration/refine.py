@@ -42,10 +42,7 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
     ConfigError : no presses, more of no ball than of one, or contacts larger than the ball.
     """
     if base.slopes is None or base.photometric is None or base.information is None:
-        raise ConfigError(
-            "calibrate --refine: required a calibration with depth, by this version of tactflow or a "
-            "later one"
-        )
+        raise ConfigError("calibrate --refine: required a calibration with depth")
     radii = np.full(len(session.presses), ball_radius)
     check_presses(session, scale, radii, fewest=1)
     samples = prepared(session, scale, radii)
@@ -74,10 +71,10 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
         presses=count,
         rejected=len(samples) - count,
         steepest=max(before.steepest or 0.0, *(samples[i].reach / samples[i].ball_radius for i in good)),
-        radius_error=left_out["radius_error"],
         explained=float(np.median(explained)),
         between=before.between / (1 + count) ** 0.5,
-        **{name: with_base(name) for name in ("normal_error", "sphere_rms", "depth_stderr", "volume_stderr")},
+        normal_error=with_base("normal_error"),
+        depth_stderr=with_base("depth_stderr"),
     )
     check_error(found)
     pixels = centers / (scale.x, scale.y) + scale.origin

@@ -34,9 +34,7 @@ averages there, too, cables under `dark_channel` have errors of 5.6 % instead of
 TURNS: Final = 3
 """How often fit and centres take turns; later ones move centres by less than 0.05 px on wedge_ball."""
 FEWEST_PIXELS: Final = 12
-"""Pixels at half resolution inside a contact that a sphere can be fitted to. Chosen by hand."""
-EDGE: Final = 0.1
-"""Half the width of the ring that counts as the rim of a contact, relative to its radius. Chosen by hand."""
+"""Least number of pixels at half resolution inside a contact to judge its depth. Chosen by hand."""
 RIM: Final = 6
 """Pixels at half resolution along the border of a press's window that roundness is not asked of. Chosen by
 hand."""
@@ -176,12 +174,9 @@ def press_errors(
 
     session : what `PressFinder` found. ball_radius : mm, of all presses or of each.
 
-    Returns
-    -------
-    (n, 6): mean angle of the normals, degrees; relative error of the ball's radius; RMS distance of the
-    heights from it, mm; relative errors of its depth and its volume, from the middle to the rim of the
-    contact: the gel around it is not known; share of the normals that is explained, see `Misfit`. The
-    middle four are NaN where a contact is too small.
+    Returns (n, 3): mean angle of the normals, degrees; relative error of the depth from the middle to the rim
+    of the contact, since the gel around it is not known, NaN where a contact is too small; share of the
+    normals that is explained, see `Misfit`.
     """
     radii = np.broadcast_to(np.asarray(ball_radius, np.float64), len(session.presses))
     samples = prepared(session, scale, radii)
@@ -203,53 +198,26 @@ def errors_on(
 
 def _errors(sample: Sample, weights: Floats, heights: NDArray[np.float32]) -> list[float]:
     """A row of `press_errors`."""
-    ball_radius = sample.ball_radius
     center = sample.center(sample.start, weights)
     angle, explained, _ = sample.misfit(center, weights)
     found = heights.ravel().astype(np.float64)
-    dx, dy = sample.x - center[0], sample.y - center[1]
-    distance = np.hypot(dx, dy)
+    distance = np.hypot(sample.x - center[0], sample.y - center[1])
     ball = distance < sample.reach
-    edge = np.abs(distance - sample.reach) < EDGE * sample.reach
-    if np.count_nonzero(ball) < FEWEST_PIXELS or not edge.any():
-        return [angle, np.nan, np.nan, np.nan, np.nan, explained]
-    radius, rms = fit_sphere(np.stack([dx[ball], dy[ball], found[ball]], axis=1))
-    cap = np.sqrt(ball_radius**2 - distance[ball] ** 2)
+    if np.count_nonzero(ball) < FEWEST_PIXELS:
+        return [angle, np.nan, explained]
+    cap = np.sqrt(sample.ball_radius**2 - distance[ball] ** 2)
     rise = cap - cap.mean()
-    fall = np.sqrt(ball_radius**2 - distance[edge] ** 2).mean()
-    depth = float(rise @ found[ball] / (rise @ rise)) - 1
-    volume = float((found[ball].mean() - found[edge].mean()) / (cap.mean() - fall)) - 1
-    return [angle, radius / ball_radius - 1, rms, depth, volume, explained]
+    return [angle, float(rise @ found[ball] / (rise @ rise)) - 1, explained]
 
 
 def summary(errors: Sequence[Sequence[float]]) -> dict[str, float]:
     """Numbers of `PhotometricEntry` from the errors of each press."""
-    angle, radius, rms, depth, volume, explained = np.transpose(errors)
+    angle, depth, explained = np.transpose(errors)
     return {
         "normal_error": float(np.mean(angle)),
-        "radius_error": float(np.nanmedian(radius)),
-        "sphere_rms": float(np.nanmean(rms)),
         "depth_stderr": float(np.sqrt(np.nanmean(depth**2))),
-        "volume_stderr": float(np.sqrt(np.nanmean(volume**2))),
         "explained": float(np.median(explained)),
     }
-
-
-def fit_sphere(points: Floats) -> tuple[float, float]:
-    """Radius of the sphere through points (n, 3), by linear least squares, and their RMS distance from it.
-
-    >>> angle = np.linspace(0, 6, 40)
-    >>> flat = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.linspace(0.1, 1.2, 40)[:, None]
-    >>> points = np.column_stack([flat, np.sqrt(4 - (flat**2).sum(axis=1))])
-    >>> [round(value, 6) for value in fit_sphere(points)]
-    [2.0, 0.0]
-    """
-    matrix = np.column_stack([points, np.ones(len(points))])
-    solved = np.linalg.lstsq(matrix, (points**2).sum(axis=1), rcond=None)[0]
-    center = solved[:3] / 2
-    radius = float(np.sqrt(max(solved[3] + center @ center, 0.0)))
-    distance = np.linalg.norm(points - center, axis=1) - radius
-    return radius, float(np.sqrt(np.mean(distance**2)))
 
 
 def upright(flat: Floats) -> Floats:

@@ -94,11 +94,6 @@ OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
         "help": "fit depth to the darkening of the gel, for sensors in white light such as 9DTact; one press "
         "of the ball is enough",
     },
-    "--kind": {
-        "metavar": "NAME",
-        "help": "make a default for all sensors of a kind, such as 'GelSight Mini'; its stated errors are "
-        "those on other sensors",
-    },
     "--csv": {
         "type": Path,
         "metavar": "FILE",
@@ -164,8 +159,8 @@ def _make(args: argparse.Namespace, pipeline: str | None = None) -> int:
     ways = [args.pitch, args.area].count(None)
     if ways == 0 or (ways == 2 and not args.refine):
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
-    if args.darkness and (args.refine or args.kind or args.ball_radius is None):
-        raise ConfigError("calibrate --darkness: required --ball-radius MM, and neither --refine nor --kind")
+    if args.darkness and (args.refine or args.ball_radius is None):
+        raise ConfigError("calibrate --darkness: required --ball-radius MM, and not --refine")
     args.presses = args.presses or ENOUGH[_way(args)]
     base = _base(args, pipeline)
     loaded = _load(args, pipeline)
@@ -232,7 +227,7 @@ def _learned(
     if args.ball_radius is not None:
         say(f"{len(session.presses)} presses; learning from them ...")
         learned = _depth(args, session, scale, base)
-    calibration = Calibration(
+    return Calibration(
         sensor=loaded.sensor,
         made_from=str(args.source or loaded.source.params.model_dump().get("source", "")),
         raw_size=session.mapping.raw_size,
@@ -242,7 +237,6 @@ def _learned(
         look=small_picture(session.untouched),
         **learned,
     )
-    return calibration if args.kind is None else calibration.for_kind(args.kind)
 
 
 def _depth(
@@ -524,7 +518,6 @@ def _darkness_words(found: DarknessEntry) -> str:
 
 def _photometric_words(errors: dict[str, float]) -> str:
     return (
-        f"normals {errors['normal_error']:.1f} degrees off in the mean, radius of the ball "
-        f"{100 * errors['radius_error']:+.1f} %, heights {errors['sphere_rms']:.3f} mm RMS from it, standard "
-        f"error of the depth {100 * errors['depth_stderr']:.0f} %"
+        f"normals {errors['normal_error']:.1f} degrees off in the mean, "
+        f"standard error of the depth {100 * errors['depth_stderr']:.0f} %"
     )
