@@ -207,12 +207,6 @@ def test_set_adds_and_removes_stages_and_changes_the_top_level(load: Load) -> No
     assert (changed.sensor, changed.skipping, changed.opencv_threads) == ("right", False, 2)
 
 
-def test_a_run_knows_how_many_others_run_beside_it(load: Load) -> None:
-    assert load(BODY).runs == 1
-    shared = "sensors: {left: null, right: null, top: null}\n" + BODY.replace("sensor: left\n", "")
-    assert load(shared).runs == 3
-
-
 @pytest.mark.parametrize(
     ("override", "words"),
     [

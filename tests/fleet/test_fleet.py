@@ -310,8 +310,8 @@ def test_one_signal_ends_all_sensors_well(folder: Path, number: int) -> None:
             "left and right would both listen at tcp://127.0.0.1:5557; "
             "give right its own, as sensors.right.sinks.zmq.control",
         ),
-        (GRAPH.replace("rotate: 0", "rotate: 7"), [], "pipeline.yaml:8:28"),
-        (GRAPH.replace("  left: {stages:", "  left: {stagse:"), [], "did you mean stages?"),
+        (GRAPH.replace("rotate: 0", "rotate: 7"), [], "pipeline.yaml:8:20"),
+        (GRAPH.replace("  left: {stages:", "  left: {stagse:"), [], "sensors.left.stagse: unknown key"),
         (GRAPH.replace("  left:", "  'le ft':"), [], "should be a word of letters"),
         (GRAPH.replace("left:", "stats:"), [], "give the sensor another name"),
         (GRAPH + "sensor: main\n", [], "already; leave this one out"),

@@ -51,8 +51,7 @@ class Document:
     def __init__(self, file: str, root: Any = None, *, line: int = 0) -> None:
         self.root = root
         self.lines: list[str] = []
-        # The locations of the key and of the value.
-        self.marks: dict[Keys, tuple[Mark, Mark]] = {(): (Mark(file, line, line),) * 2}
+        self.marks: dict[Keys, Mark] = {(): Mark(file, line, line)}
         self.mistakes: dict[tuple[Mark, str], None] = {}
 
     def get(self, *keys: str | int) -> Any:
@@ -75,20 +74,12 @@ class Document:
         return keys[-1] in self.mapping(*keys[:-1])
 
     def mark(self, *keys: str | int) -> Mark:
-        """The location of a value; for a missing value, of the mapping around it."""
-        return self._marks(keys)[1]
+        """The location of the key of a value, or of an item of a list; for a missing value, of the mapping
+        around it."""
+        return self.marks.get(keys) or self.mark(*keys[:-1])
 
-    def key_mark(self, *keys: str | int) -> Mark:
-        """The location of the key of a value."""
-        return self._marks(keys)[0]
-
-    def _marks(self, keys: Keys) -> tuple[Mark, Mark]:
-        return self.marks.get(keys) or (self.mark(*keys[:-1]),) * 2
-
-    def set(self, keys: Keys, value: Any, mark: Mark, key_mark: Mark | None = None) -> None:
-        """Set a value, and create the mappings around it if needed.
-
-        mark : location of the value. key_mark : location of a new key, if different.
+    def set(self, keys: Keys, value: Any, mark: Mark) -> None:
+        """Set a value, which is located at `mark`, and create the mappings around it if needed.
 
         Raises
         ------
@@ -104,15 +95,13 @@ class Document:
                 problem = f"{dotted(keys[:depth])} is {described(parent)}"
                 raise ConfigError(f"{problem}, so it has no {keys[depth]}; replace it as a whole")
         parent[keys[-1]] = value
-        known, _ = self.marks.get(place, (key_mark or mark, mark))
         # Discard the locations inside the old value.
-        self.marks = {keys: marks for keys, marks in self.marks.items() if keys[: len(place)] != place}
-        self.marks[place] = known, mark
+        self.marks = {keys: known for keys, known in self.marks.items() if keys[: len(place)] != place}
+        self.marks[place] = mark
 
-    def report(self, keys: Keys, message: str, *, at_key: bool = False) -> None:
-        """Record an error in a value, or in its key."""
-        mark = self.key_mark(*keys) if at_key else self.mark(*keys)
-        self.report_at(mark, f"{dotted(keys)}: {message}" if keys else message)
+    def report(self, keys: Keys, message: str) -> None:
+        """Record an error in a value."""
+        self.report_at(self.mark(*keys), f"{dotted(keys)}: {message}" if keys else message)
 
     def report_at(self, mark: Mark, message: str) -> None:
         """Record an error at a location, once."""
@@ -203,7 +192,9 @@ def _parse(text: str, document: Document) -> bool:
         loader = _Loader(text)
         node = loader.get_single_node()
         if node is not None:
-            document.root = _Values(loader, document).value(node, ())
+            values = _Values(loader, document)
+            document.marks[()] = values.mark(node)
+            document.root = values.value(node, ())
         return True
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
@@ -240,7 +231,7 @@ class _Values:
 
     def value(self, node: yaml.Node, keys: Keys) -> Any:
         """The plain value of a node at a path."""
-        self._document.marks[keys] = (self._mark(node),) * 2
+        self._document.marks.setdefault(keys, self.mark(node))
         if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, keys)
         if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
@@ -274,12 +265,13 @@ class _Values:
         values = {}
         for key_node, value_node in node.value:
             place: Keys = (*keys, key_node.value)
+            self._document.marks[place] = self.mark(key_node)
             values[key_node.value] = self.value(value_node, place)
-            self._document.marks[place] = self._mark(key_node), self._mark(value_node)
         return values
 
     def _report(self, node: yaml.Node, message: str) -> None:
-        self._document.report_at(self._mark(node), message)
+        self._document.report_at(self.mark(node), message)
 
-    def _mark(self, node: yaml.Node) -> Mark:
+    def mark(self, node: yaml.Node) -> Mark:
+        """The location of a node."""
         return Mark(self._document.mark().file, node.start_mark.line + 1, node.start_mark.column + 1)

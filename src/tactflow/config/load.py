@@ -75,7 +75,6 @@ def load_pipeline(
         nodes={draft.id: _node(draft, entries[draft.id], document) for draft in drafts},
         skipping=file.skipping,
         opencv_threads=file.opencv_threads,
-        runs=max(1, len(sensors.names(document))),
         calibration=calibration,
         warnings=_warnings(document, drafts),
         settings=_settings(document, name, drafts),
@@ -117,11 +116,11 @@ def _drafts(document: Document, directory: Path) -> list[Draft]:
     drafts: dict[str, Draft] = {}
     for section in _SECTIONS:
         for id_ in document.mapping(section):
-            draft = Draft(id_, section, document.key_mark(section, id_))
+            draft = Draft(id_, section, document.mark(section, id_))
             if id_ in drafts:
                 first = drafts[id_]
                 taken = f"the id {id_} is taken by {dotted(first.keys)} ({first.mark})"
-                document.report(draft.keys, taken, at_key=True)
+                document.report(draft.keys, taken)
             elif is_word(id_):
                 drafts[id_] = draft
                 _resolve(draft, directory, document)
@@ -141,7 +140,7 @@ def _resolve(draft: Draft, directory: Path, document: Document) -> None:
     try:
         draft.component = resolve(use, draft.section, *folders)
     except ConfigError as error:
-        document.report(place, str(error), at_key=place == draft.keys)
+        document.report(place, str(error))
 
 
 def _source(document: Document, drafts: Sequence[Draft]) -> Draft | None:
@@ -150,10 +149,10 @@ def _source(document: Document, drafts: Sequence[Draft]) -> Draft | None:
     sources = [draft for draft in stages if draft.component and draft.component.kind == "source"]
     readable = document.has("stages") and isinstance(document.get("stages"), dict | None)
     if not sources and readable and all(draft.component for draft in stages):
-        document.report(("stages",), "there is no source of frames; add the stage capture", at_key=True)
+        document.report(("stages",), "there is no source of frames; add the stage capture")
     for extra in sources[1:]:
         first = f"{sources[0].id} ({sources[0].mark})"
-        document.report(extra.keys, f"a pipeline has one source, but {first} is one already", at_key=True)
+        document.report(extra.keys, f"a pipeline has one source, but {first} is one already")
     return sources[0] if sources else None
 
 
@@ -176,7 +175,7 @@ def _params(draft: Draft, document: Document) -> StageParams | None:
         return validate(draft.component.params, document, draft.keys, without=reserved, noun="parameter")
     except Exception as error:
         reason = f"{type(error).__name__}: {error} ({code_place(error.__traceback__)})"
-        document.report(draft.keys, f"the parameters fail: {reason}", at_key=True)
+        document.report(draft.keys, f"the parameters fail: {reason}")
     return None
 
 
@@ -196,7 +195,7 @@ def _check_files(
             for path in files_written(draft.component.cls, draft.params):
                 if path in users:
                     message = f"{path} {users[path]}; choose another path"
-                    document.report(draft.keys, message, at_key=True)
+                    document.report(draft.keys, message)
                 users[path] = f"is written by {draft.id} ({draft.mark})"
 
 
@@ -228,7 +227,7 @@ def _check_needs(drafts: Sequence[Draft], document: Document) -> None:
             if draft.inputs.get(port) is None:
                 problem = f"{getattr(draft.params, name)} needs {port}, which no stage gives"
                 place = (*draft.keys, name)
-                document.report(place, f"{problem}; add a stage that does", at_key=not document.has(*place))
+                document.report(place, f"{problem}; add a stage that does")
 
 
 def _node(draft: Draft, entry: Entry, document: Document) -> Node:
@@ -243,7 +242,6 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
         # A source of the command line that cannot be opened is not an error in the file.
         mark = origin
     gates = [Gate(ref, signal.closed or ref.port, signal.otherwise) for ref, signal in draft.gates]
-    marked = {"segment", "queue"} & document.mapping(*draft.keys).keys()
     return Node(
         id=draft.id,
         component=draft.component,
@@ -255,7 +253,6 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
         queue=entry.queue,
         on_error=entry.on_error or default,
         max_rate=entry.max_rate if isinstance(entry, SinkEntry) else None,
-        marks={key: document.mark(*draft.keys, key) for key in marked},
     )
 
 
@@ -271,10 +268,10 @@ def _settings(document: Document, sensor: str, drafts: Sequence[Draft]) -> dict[
 def _warnings(document: Document, drafts: Sequence[Draft]) -> list[str]:
     warnings = []
     if not any(draft.section == "sinks" for draft in drafts):
-        warnings.append(f"{document.key_mark('sinks')}  there are no sinks, so nothing will be computed")
+        warnings.append(f"{document.mark('sinks')}  there are no sinks, so nothing will be computed")
     users = (draft.component.cls for draft in drafts if draft.component)
     if document.get("calibration") and not any(map(_takes_calibration, users)):
-        mark = document.key_mark("calibration")
+        mark = document.mark("calibration")
         warnings.append(f"{mark}  calibration: no stage uses it; add untouched, scale and depth")
     return warnings
 

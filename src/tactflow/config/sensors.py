@@ -37,12 +37,12 @@ def select(document: Document, chosen: str | None) -> str:
             document.report((), f"there is no sensor {chosen!r}; the file's only sensor is {name}")
     else:
         if document.has("sensor"):
-            mark = document.key_mark("sensors")
+            mark = document.mark("sensors")
             message = f"the names stand under sensors ({mark}) already; leave this one out"
-            document.report(("sensor",), message, at_key=True)
+            document.report(("sensor",), message)
         if chosen is not None and chosen not in known:
             hint = did_you_mean(chosen, known)
-            document.report(("sensors",), f"there is no {chosen!r}{hint}", at_key=True)
+            document.report(("sensors",), f"there is no {chosen!r}{hint}")
         name = chosen if chosen in known else known[0] if known else "main"
         for key in document.mapping("sensors", name):
             if key in Changes.model_fields:
@@ -54,16 +54,16 @@ def select(document: Document, chosen: str | None) -> str:
 
 def _merge(document: Document, change: Keys, target: Keys) -> None:
     """Replace a value of the file by one of `sensors:`; mappings are merged."""
-    value, mark, key_mark = document.get(*change), document.mark(*change), document.key_mark(*change)
+    value, mark = document.get(*change), document.mark(*change)
     if isinstance(value, dict):
         if not isinstance(document.get(*target), dict):
-            document.set(target, {}, mark, key_mark)
+            document.set(target, {}, mark)
         for key in value:
             _merge(document, (*change, key), (*target, key))
     elif value is None and len(target) > 1 and document.has(*target):
         del document.mapping(*target[:-1])[str(target[-1])]
     else:
-        document.set(target, value, mark, key_mark)
+        document.set(target, value, mark)
 
 
 def _filled_in(value: Any, name: str) -> Any:

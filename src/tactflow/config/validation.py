@@ -91,16 +91,16 @@ def report(
         if kind == "missing" and not rest:
             about = named[name].description if is_own else None
             message = _message(detail) + (f" ({about})" if about else "")
-            document.report_at(document.key_mark(*place[:-1]), f"{dotted(place)}: {message}")
+            document.report_at(document.mark(*place[:-1]), f"{dotted(place)}: {message}")
         elif kind == "extra_forbidden" and not rest:
             hint = did_you_mean(name, [*named, *sorted(also)], "there are ") if is_own else ""
-            document.report(place, f"unknown {noun}{hint}", at_key=True)
+            document.report(place, f"unknown {noun}{hint}")
         elif rest == ("[key]",):
-            document.report(place, f"{_message(detail)}, got {shown(name)}", at_key=True)
+            document.report(place, f"{_message(detail)}, got {shown(name)}")
         else:
             groups.setdefault(place, []).append((detail, rest))
     for place, members in groups.items():
-        document.report(place, _words(members, document.get(*place)), at_key=place == keys)
+        document.report(place, _words(members, document.get(*place)))
 
 
 def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, Keys]:

@@ -100,7 +100,7 @@ class _Wiring:
         names = [port.name for port in component.ports.inputs]
         for name in explicit.keys() - set(names):
             hint = did_you_mean(name, names, "inputs: ") if names else "; a source has no inputs"
-            document.report((*draft.keys, "in", name), f"{draft.id} has no input {name}{hint}", at_key=True)
+            document.report((*draft.keys, "in", name), f"{draft.id} has no input {name}{hint}")
         unused = draft.params.unused_inputs() if draft.params else ()
         for port in component.ports.inputs:
             draft.inputs[port.name] = None
@@ -115,7 +115,7 @@ class _Wiring:
             elif not (port.optional and port.name in unused):
                 ref = self._nearest(port.name, draft)
                 if ref is None and not port.optional and self._complete:
-                    document.report(place, self._dangling(port, draft), at_key=True)
+                    document.report(place, self._dangling(port, draft))
             if ref is not None:
                 self._check_type(ref, port, mark, place)
                 draft.inputs[port.name] = ref
@@ -128,7 +128,7 @@ class _Wiring:
             return
         if component.kind == "source":
             message = "a source cannot be gated; gate the stages behind it"
-            self._document.report(place, message, at_key=True)
+            self._document.report(place, message)
             return
         for index, signal in enumerate(when if isinstance(when, list) else [when]):
             self._gate(signal, (*place, index) if isinstance(when, list) else place, draft)

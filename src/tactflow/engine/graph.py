@@ -102,9 +102,8 @@ class Node:
 
     inputs : every input port of the component -> connected output, or None for an unconnected optional input.
     mark : location of its definition. gates : all must be open for it to run. segment : name in the file, or
-    None. queue : in front of its segment. max_rate : limit of a sink, Hz. marks : key of the node -> location
-    of its value, for errors of the plan. passive_inputs : names in a sink's result -> outputs that are
-    included if they were computed for other nodes, but never requested.
+    None. queue : in front of its segment. max_rate : limit of a sink, Hz. passive_inputs : names in a sink's
+    result -> outputs that are included if they were computed for other nodes, but never requested.
     """
 
     id: str
@@ -117,7 +116,6 @@ class Node:
     queue: Queue = field(default_factory=Queue)
     on_error: OnError = field(default_factory=OnError)
     max_rate: float | None = None
-    marks: Mapping[str, Mark] = field(default_factory=dict[str, Mark])
     passive_inputs: Mapping[str, Ref] = field(default_factory=dict[str, Ref])
 
 
@@ -126,9 +124,9 @@ class Pipeline:
     """A validated pipeline. `nodes` is in topological order: producers come before consumers.
 
     file, directory : of the pipeline file. nodes : id -> node. skipping : whether work may be skipped.
-    opencv_threads : None leaves the number to OpenCV. runs : number of sensors in the file, each with its own
-    run. calibration : the sensor's calibration file, or None. warnings : for the user, before the run.
-    settings : the file with all overrides, as plain values that can be written as YAML.
+    opencv_threads : None leaves the number to OpenCV. calibration : the sensor's calibration file, or None.
+    warnings : for the user, before the run. settings : the file with all overrides, as plain values that can
+    be written as YAML.
     """
 
     file: str
@@ -137,7 +135,6 @@ class Pipeline:
     nodes: Mapping[str, Node]
     skipping: bool = True
     opencv_threads: int | None = None
-    runs: int = 1
     calibration: Path | None = None
     warnings: Sequence[str] = field(default_factory=list[str])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])

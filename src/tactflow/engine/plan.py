@@ -130,7 +130,7 @@ def plan_problem(pipeline: Pipeline) -> tuple[Mark, str] | None:
         return None
     contents = " and ".join(f"{name} ({', '.join(members[name])})" for name in cycle)
     return (
-        placed[0].marks.get("segment", placed[0].mark),
+        placed[0].mark,
         f"{placed[0].id}: the segments {contents} form a cycle, so none could start; move a stage to another",
     )
 
