@@ -277,13 +277,3 @@ def test_a_user_mistake_ends_with_its_code_and_advice(
     assert words in errors
     assert "Traceback" not in errors
     assert out == ""
-
-
-def test_realtime_plays_a_recording_at_its_own_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    source = ("--source", "sim:idle?frames=30", "--realtime")
-    assert main(["run", *NO_SINKS, *source, "--stats", "s.json", "--jsonl", "o.jsonl"]) == 0
-    stats = json.loads((tmp_path / "s.json").read_text())
-    assert stats["frames"] + stats["dropped"] == 30
-    assert stats["wall_s"] >= 29 / 60, "30 frames at 60 Hz last 29 intervals"
-    assert stats["links"]["capture->compute"]["policy"] == "latest"

@@ -60,12 +60,6 @@ def test_an_array_gives_its_frames_and_its_times(name: str, tmp_path: Path) -> N
         assert [t for _, t in found] == times
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_16_bit_pixels_are_read_in_either_order_of_their_bytes(name: str, tmp_path: Path) -> None:
-    path = KINDS[name](tmp_path / name, frames=(IMAGES.astype(int) * 257).astype(">u2"))
-    assert np.array_equal([image for image, _ in played(f"{path}?dataset=gel/frames")], IMAGES)
-
-
 def test_pictures_kept_as_files_are_decoded(tmp_path: Path) -> None:
     files = [cv2.imencode(".png", image)[1].ravel() for image in IMAGES]
     padded = np.zeros((5, max(map(len, files)) + 3), np.uint8)
@@ -123,16 +117,6 @@ def test_a_zarr_array_that_would_run_code_is_not_read(
     with pytest.raises(SourceError, match="there is no /frames; required one of: none"):
         open_source(f"{frames.parent}?dataset=/frames")
     assert not (tmp_path / "ran").exists()
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such files")
-def test_nobody_reads_a_device_among_the_pieces_of_an_array(tmp_path: Path) -> None:
-    path = write_zarr(tmp_path / "press.zarr", frames=IMAGES)
-    piece = max(path.rglob("c/*/0/0/0"))
-    piece.unlink()
-    piece.symlink_to("/dev/zero")
-    with pytest.raises(SourceError, match="is a pipe or a device"):
-        open_source(f"{path}?dataset=/gel/frames")
 
 
 KEY = "observation.images.gel"

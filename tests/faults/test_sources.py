@@ -107,9 +107,6 @@ FAULTS: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize(
     ("kind", "fault", "at_start", "code", "said", "results"),
     [
-        ("array", "removed", True, 4, "no such file", "none"),
-        ("array", "cut", True, 4, "cut off", "none"),
-        ("array", "something else", True, 4, "not a .npy file", "none"),
         ("array", "removed", False, 0, "^$", "all"),
         ("array", "cut", False, 4, "cut off during the run", "up to there"),
         ("array", "corrupt", False, 0, "^$", "all"),
@@ -117,9 +114,7 @@ FAULTS: dict[str, Callable[[Path], object]] = {
         ("pictures", "cut", False, 4, "frame-90.png: the image is cut off", "up to there"),
         ("pictures", "corrupt", True, 4, "frame-90.png: not an image", "up to there"),
         ("pictures", "another size", True, 4, "80 x 60 pixels", "up to there"),
-        ("film", "something else", True, 4, "neither a video", "none"),
         ("film", "cut", False, 0, "ended after .* may be damaged", "up to there"),
-        ("mcap", "something else", True, 4, "is not an MCAP file", "none"),
         ("mcap", "cut", True, 0, "was not finished.*tactflow repair", "up to there"),
         ("mcap", "corrupt", True, 4, "is damaged.*tactflow repair", "up to there"),
         ("mcap", "removed", False, 0, "^$", "all"),

@@ -12,7 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+import tactflow
 from tactflow.drawing.results import Annotator
+from tactflow.engine.errors import TactflowError
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
 from tactflow.vision.types import Markers
@@ -114,3 +116,29 @@ def test_few_or_flat_or_far_markers_have_a_defined_flow_and_are_drawn(origin: li
         assert flow.rotation is None
     near = Markers(np.clip(at, -1e7, 1e7), np.clip(at, -1e7, 1e7) + 1, markers.status, markers.stderr)
     assert Annotator()(np.zeros((HEIGHT, WIDTH, 3), np.uint8), markers=near).shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (3, 5), (37, 51)], ids=str)
+@pytest.mark.parametrize("name", ["default", "classic", "markerless"])
+def test_tiny_and_odd_frames_end_in_an_answer_or_in_words(name: str, shape: tuple[int, int]) -> None:
+    frames = list(np.random.default_rng(0).integers(0, 256, (4, *shape, 3), dtype=np.uint8))
+    try:
+        found = list(tactflow.stream(name, source=frames, images=True))
+    except TactflowError as error:
+        assert "required" in str(error) or "markers found" in str(error)  # noqa: PT017
+        return
+    for result in found:
+        assert_defined([result.image, result.contact, result.flow, result.markers])
+
+
+def test_a_detector_ends_every_one_of_many_contacts() -> None:
+    pictures = gel(dots=False, noise=0.0)
+    random = np.random.default_rng(0)
+
+    def noisy(picture: Image) -> Image:
+        return np.clip(np.rint(picture + random.normal(0, 1, picture.shape)), 0, 255).astype(np.uint8)
+
+    contact = detector(noisy(pictures.reference))
+    for _ in range(60):
+        assert contact.detect(noisy(pictures.touched)).touching
+        assert not contact.detect(noisy(pictures.reference)).touching

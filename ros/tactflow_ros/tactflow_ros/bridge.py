@@ -7,10 +7,8 @@ connects. The receiving thread publishes the messages; the executor handles only
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable
-from statistics import median
 from typing import Any
 
 import rclpy
@@ -77,45 +75,40 @@ ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
 
 
 class Counts:
-    """Statistics for /diagnostics between two reports; thread-safe.
+    """Statistics of the messages, for /diagnostics.
 
-    last : `time.monotonic` of the last message, or of the start. any : whether there was a message.
-    lost_markers : share of all.
+    frames, missing : numbers so far. last : `time.monotonic` of the last message, or of the start.
+    latency_s : of the last message since its capture; NaN for a recording. lost_markers : share of all.
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._since = self.last = time.monotonic()
-        self._missing = 0
-        self._last_seq: int | None = None
-        # NaN for a recording, whose capture times are no Unix times.
-        self._latency_s: list[float] = []
-        self.any = False
-        self.lost_markers = math.nan
+        self.frames = self.missing = 0
+        self.last = time.monotonic()
+        self.latency_s = self.lost_markers = math.nan
+        self._seq: int | None = None
+        self._reported = (self.last, 0, 0)
 
     def note(self, message: messages.Message) -> None:
         """Count a message."""
         status = (message["markers"] or {}).get("status") or []
-        with self._lock:
-            self.last, self.any = time.monotonic(), True
-            if self._last_seq is not None:
-                self._missing += max(0, message["seq"] - self._last_seq - 1)
-            self._last_seq = message["seq"]
-            self._latency_s.append(time.time() - message["t"] if message["t"] > LIVE else math.nan)
-            self.lost_markers = status.count("lost") / len(status) if status else math.nan
+        seq, t = message["seq"], message["t"]
+        self.missing += 0 if self._seq is None else max(0, seq - self._seq - 1)
+        self._seq = seq
+        self.latency_s = time.time() - t if t > LIVE else math.nan
+        self.lost_markers = status.count("lost") / len(status) if status else math.nan
+        self.frames += 1
+        self.last = time.monotonic()
 
     def report(self) -> dict[str, float]:
         """Statistics since the last report."""
-        with self._lock:
-            now = time.monotonic()
-            numbers = {
-                "rate, Hz": len(self._latency_s) / max(now - self._since, 1e-9),
-                "frames missing": self._missing,
-                "latency since capture, median, ms": median(self._latency_s or [math.nan]) * 1e3,
-                "lost markers, share": self.lost_markers,
-            }
-            self._since, self._missing, self._latency_s = now, 0, []
-        return numbers
+        since, frames, missing = self._reported
+        self._reported = (time.monotonic(), self.frames, self.missing)
+        return {
+            "rate, Hz": (self._reported[1] - frames) / max(self._reported[0] - since, 1e-9),
+            "frames missing": self._reported[2] - missing,
+            "latency since capture, ms": self.latency_s * 1e3,
+            "lost markers, share": self.lost_markers,
+        }
 
 
 class Bridge(LifecycleNode):
@@ -298,7 +291,7 @@ class Bridge(LifecycleNode):
             return DiagnosticStatus.ERROR, link.refused
         silent = time.monotonic() - self._counts.last
         if silent > self.value("timeout"):
-            since = f"for {silent:.0f} s" if self._counts.any else "since the start"
+            since = f"for {silent:.0f} s" if self._counts.frames else "since the start"
             return DiagnosticStatus.STALE, (
                 f"no message {since}; is tactflow running and publishing there, and is its sensor called "
                 f"{self.value('sensor')}?"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, check_array, damaged, require
 from tactflow.sources.files import DEFAULT_FPS, decode_image
-from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
+from tactflow.sources.paths import find_path, listed, split_query
 
 SETTINGS = {
     "dataset": "name of the frames",
@@ -131,7 +131,6 @@ def _open(path: Path) -> tuple[dict[str, Any], Callable[[], object]]:
         require(path, "Zarr files", "zarr", "zarr")
     else:
         require(path, "HDF5 files", "hdf5", "h5py")
-    refuse_devices(path)
     try:
         return _zarr_arrays(path) if is_zarr else _hdf5_arrays(path)
     except Exception as error:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
 from tactflow.sources.files import decode_image
-from tactflow.sources.paths import find_path, listed, refuse_devices, split_query
+from tactflow.sources.paths import find_path, listed, split_query
 
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema
@@ -60,7 +60,6 @@ class Bag(FrameReader):
     def __init__(self, spec: str, directory: Path | None = None, _fps: float | None = None) -> None:
         name, settings = split_query(spec, directory, SETTINGS)
         path = find_path(name, directory)
-        refuse_devices(path)
         self._store = McapFile(path) if path.suffix.lower() == ".mcap" else RosBag(path)
         super().__init__(str(path))
         try:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
 from tactflow.sources.files import decode_image, refuse_playlist
-from tactflow.sources.paths import find_path, refuse_devices, split_query
+from tactflow.sources.paths import find_path, split_query
 
 SCHEME = "lerobot:"
 SETTINGS = {"camera": "key of a camera", "episode": "number of an episode"}
@@ -34,7 +34,6 @@ class LeRobotEpisode(FrameReader):
         require(spec, "LeRobot datasets", "lerobot", "pyarrow", "av")
         name, settings = split_query(spec.removeprefix(SCHEME), directory, SETTINGS)
         root = find_path(name, directory)
-        refuse_devices(root / "meta")
         try:
             info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
             self._camera, self._episode, is_video = _choose(spec, info, settings)
@@ -46,7 +45,6 @@ class LeRobotEpisode(FrameReader):
             raise damaged(f"{root}: this LeRobot dataset", error) from error
         super().__init__(f"{root}, {self._camera}, episode {self._episode}")
         self._video = video if is_video else None
-        refuse_devices(self._data)
         if self._video is not None:
             refuse_playlist(self._video)
         self._read_first()

@@ -7,7 +7,7 @@ with `method: telea`), and the drawing of `draw_flow` and `draw_flow_mask` (the 
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -106,12 +106,8 @@ def get_all_contour(mask: NDArray[np.uint8]) -> NDArray[np.int32]:
 
     mask : (H, W) uint8, non-zero in contact.
     """
-    left, top, width, height = cv2.boundingRect(mask)
-    if width == 0:
-        return np.empty((0, 1, 2), np.int32)
-    inside: NDArray[Any] = mask[top : top + height, left : left + width]
-    contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top))
-    return np.asarray(np.vstack(contours), np.int32)
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(np.vstack(contours) if contours else np.empty((0, 1, 2)), np.int32)
 
 
 def fit_ellipse(points: NDArray[np.int32]) -> Ellipse | None:

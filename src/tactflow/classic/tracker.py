@@ -6,11 +6,13 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from tactflow.classic.functions import marker_center
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.detection import NoMarkersError
-from tactflow.vision.markers.lattice import neighbour_graph
+from tactflow.vision.markers.lattice import neighbour_graph, pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
 MAX_VISITS: Final = 5000
@@ -156,8 +158,8 @@ def grid_of(centers: Floats) -> tuple[Floats, float]:
 
     Returns
     -------
-    grid : (rows, columns, 2) float64, px, NaN where a node has no centre; centres not linked to the grid are
-        left out. spacing : median distance between linked centres, px.
+    grid : (rows, columns, 2) float64, px, NaN where a node has no centre; centres not linked to the largest
+        part of the grid are left out. spacing : median distance between linked centres, px.
 
     Raises
     ------
@@ -167,41 +169,28 @@ def grid_of(centers: Floats) -> tuple[Floats, float]:
         raise NoMarkersError(
             f"{len(centers)} markers found: is the sensor marker-less? then use the pipeline markerless"
         )
-    squared = ((centers[:, None] - centers[None]) ** 2).sum(axis=2)
-    np.fill_diagonal(squared, np.inf)
-    nearest = float(np.median(np.sqrt(squared.min(axis=1))))
-    links: dict[int, list[tuple[int, int, int]]] = {}
-    lengths = []
-    for first, second in neighbour_graph(centers, _LONGEST_LINK * nearest).tolist():
-        step = centers[second] - centers[first]
-        along, across = np.abs(step).max(), np.abs(step).min()
-        if across > _OBLIQUE * along:
-            continue
-        lengths.append(float(np.hypot(*step)))
-        sign = 1 if step[np.argmax(np.abs(step))] > 0 else -1
-        down, right = (0, sign) if abs(step[0]) > abs(step[1]) else (sign, 0)
-        links.setdefault(first, []).append((second, down, right))
-        links.setdefault(second, []).append((first, -down, -right))
-    if not links:
+    links = neighbour_graph(centers, _LONGEST_LINK * pitch_of(centers))
+    steps = centers[links[:, 1]] - centers[links[:, 0]]
+    lengths = np.abs(steps)
+    straight = lengths.min(axis=1) <= _OBLIQUE * lengths.max(axis=1)
+    links, steps, lengths = links[straight], steps[straight], lengths[straight]
+    if not len(links):
         raise NoMarkersError(
             "0 markers found in a grid: is the sensor marker-less? then use the pipeline markerless"
         )
-    largest: dict[tuple[int, int], int] = {}
-    for start in sorted(links, key=lambda center: -len(links[center])):
-        reached = {start: (0, 0)}
-        queue = [start]
-        for center in queue:
-            row, column = reached[center]
-            for neighbour, down, right in links[center]:
-                if neighbour not in reached:
-                    reached[neighbour] = (row + down, column + right)
-                    queue.append(neighbour)
-        component = {node: center for center, node in reversed(reached.items())}
-        if len(component) > len(largest):
-            largest = component
-        if 2 * len(largest) > len(centers):
-            break
-    rows, columns = np.array(list(largest)).T
-    grid = np.full((int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1, 2), np.nan)
-    grid[rows - rows.min(), columns - columns.min()] = centers[list(largest.values())]
-    return grid, float(np.median(lengths))
+    # One row down or up, or one column right or left.
+    moves = (np.sign(steps) * (lengths == lengths.max(axis=1, keepdims=True)))[:, ::-1].astype(int)
+    move = {(a, b): way for (a, b), way in zip(links.tolist(), moves, strict=True)}
+    move |= {(b, a): -way for (a, b), way in move.items()}
+    graph = coo_array((np.ones(len(links)), links.T), (len(centers), len(centers))).tocsr()
+    component = connected_components(graph, directed=False)[1]
+    start = int(np.flatnonzero(component == np.bincount(component).argmax())[0])
+    order, before = breadth_first_order(graph, start, directed=False)
+    places = {start: np.zeros(2, int)}
+    for center in order[1:].tolist():
+        places[center] = places[int(before[center])] + move[int(before[center]), center]
+    nodes = np.array([places[center] for center in order.tolist()])
+    nodes -= nodes.min(axis=0)
+    grid = np.full((*(nodes.max(axis=0) + 1), 2), np.nan)
+    grid[tuple(nodes.T)] = centers[order]
+    return grid, float(np.median(np.hypot(*steps.T)))

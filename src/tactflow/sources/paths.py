@@ -63,15 +63,6 @@ def _suggestion(candidates: list[Path]) -> str:
     return f" (looked in {', '.join(str(path.parent.absolute()) for path in candidates)})"
 
 
-def refuse_devices(path: Path) -> None:
-    """Raise SourceError for a pipe or a device, also by a link or inside a folder, because it may be
-    endless."""
-    inside = [Path(place, name) for place, _, names in os.walk(path) for name in names]
-    for file in inside or [path]:
-        if is_device(str(file)):
-            raise SourceError(f"{file}: is a pipe or a device, not a file")
-
-
 def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> tuple[str, dict[str, str]]:
     """The path and the settings of a source, `path?name=value&name=value`; `%26` stands for &.
 
