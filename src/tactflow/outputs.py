@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -14,6 +15,11 @@ from pydantic import Field, model_validator
 from tactflow.engine.contract import Output, Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.system.files import expanded, is_device, lock, lock_folder, make_folder, next_name
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Error numbers of a full disk and an exhausted quota."""
+FREE_SPACE = "free some space, or choose another folder"
+"""The remedy for them."""
 
 
 class OutputParams(StageParams):
@@ -77,7 +83,9 @@ class OutputSink(Sink):
 
 def cannot_write(path: Path | str, error: OSError, kept: str = "") -> StageError:
     """The error for a file that cannot be written. kept : what is complete, and the remedy."""
-    return StageError(f"{path}: cannot be written: {error.strerror or error}{kept and f'; {kept}'}")
+    remedy = FREE_SPACE if error.errno in DISK_FULL else ""
+    reason = error.strerror or str(error)
+    return StageError(f"{path}: cannot be written: {'; '.join(filter(None, (reason, kept, remedy)))}")
 
 
 def open_output(

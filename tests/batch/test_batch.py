@@ -144,13 +144,6 @@ def test_one_that_fails_stops_no_other_and_is_tried_again(call: Call) -> None:
     assert "1 done now, 1 done before, 0 failed" in call.stderr
 
 
-def test_fail_fast_begins_nothing_more(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(InThisProcess, "slots", 1)
-    (call.folder / "rec" / "a" / "press.npy").write_bytes(b"no array")
-    assert call("--fail-fast") == 3
-    assert [row["status"] for row in call.rows()] == ["failed", "not done"]
-
-
 def test_one_signal_finishes_what_runs_and_leaves_the_rest_for_the_next_call(
     call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,7 +52,8 @@ def test_every_listed_command_is_there(name: str, terminal: Terminal) -> None:
         (["stages", "./nowhere.py:A"], "cannot read ./nowhere.py"),
         (["warmup", "nowhere.yaml"], "there is no file nowhere.yaml"),
         (["run", "sim:press"], "there is no file sim:press, and no pipeline"),
-        (["run", "data/film.avi"], "there is no file data/film.avi; a camera, a recording"),
+        (["run", "data/film.avi"], "a camera, a recording or a stream is given as --source data/film.avi"),
+        (["run", "."], "is a folder; required: a pipeline file (YAML); a camera, a recording or a stream is"),
         (["run", "--max-frames", "none"], "required a whole number"),
         (["explain", "--stats", "nowhere.json"], "nowhere.json: cannot be read"),
     ],
@@ -154,15 +155,6 @@ def test_statistics_replace_no_results(terminal: Terminal) -> None:
     assert '"frames"' not in Path("a.jsonl").read_text()
 
 
-@pytest.mark.parametrize("limit", ["many", "64MB"])
-def test_a_limit_that_is_not_a_number_is_refused(
-    limit: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", limit)
-    assert terminal("check", "default") == 2
-    assert f"OPENCV_IO_MAX_IMAGE_PIXELS is '{limit}'; required: a number" in terminal.err
-
-
 def test_no_name_of_a_file_forges_a_line_of_the_messages(terminal: Terminal) -> None:
     for mark in ("\n", "\r", "\u2028", "\u2029", "\x85", "\u202e", "\x1b["):
         name = f"left{mark}tactflow: INFO: all frames delivered"
@@ -176,16 +168,9 @@ def test_no_name_of_a_file_forges_a_line_of_the_messages(terminal: Terminal) -> 
 def test_a_shipped_pipeline_is_printed_to_be_changed(terminal: Terminal) -> None:
     assert terminal("pipelines", "mini") == 0
     Path("pipeline.yaml").write_text(terminal.out)
-    assert terminal("check", "--json") == 0
-    checked = json.loads(terminal.out)
-    assert checked["mistakes"] == []
-    assert checked["sensors"]["mini"]["stages"][0] == "capture"
-    assert terminal("explain", "--json") == 0
-    assert json.loads(terminal.out)["nodes"]["hull"]["runs because"].endswith("need it")
-    assert terminal("check", "--json", "--set", "stages.hull.min_aera=3") == 2
-    assert "did you mean min_area?" in json.loads(terminal.out)["mistakes"][0]
-    assert terminal("pipelines", "--json") == 0
-    assert "mini" in json.loads(terminal.out)
+    assert terminal("check") == 0
+    assert terminal("pipelines") == 0
+    assert "mini " in terminal.out
     assert terminal("pipelines", "minni") == 2
     assert "did you mean mini?" in terminal.err
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -22,16 +21,6 @@ def test_the_table_has_a_line_for_every_stage_and_sink(terminal: Terminal) -> No
     hull = next(row for row in rows if row.startswith("hull "))
     ports = ["contact_mask,", "evidence?,", "deviations?", "contact"]
     assert hull.split()[:7] == ["hull", "stage", *ports, "built-in"]
-
-
-def test_the_same_as_json(terminal: Terminal) -> None:
-    assert terminal("stages", "--json") == 0
-    every = {part["name"]: part for part in json.loads(terminal.out)}
-    assert sorted(every) == sorted(c.name for c in catalogue()[0])
-    assert terminal("stages", "hull", "--json") == 0
-    assert json.loads(terminal.out) == [every["hull"]]
-    assert every["hull"]["outputs"] == {"contact": "Contact (may be absent)"}
-    assert "rotate" in every["preprocess"]["parameters"]["properties"]
 
 
 def test_one_stage_is_explained_with_ports_and_parameters(tmp_path: Path, terminal: Terminal) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
+import re
 from pathlib import Path
 
 import pytest
@@ -61,10 +61,9 @@ def test_a_camera_is_described_with_all_its_names(dev: Path) -> None:
     assert "no permission" in third
 
 
-def test_the_command_lists_cameras_as_json(dev: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.run(argparse.Namespace(dev=dev, json=True)) == 0
-    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [line["index"] for line in lines] == [0, 1, 10]
+def test_the_command_lists_cameras(dev: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.run(argparse.Namespace(dev=dev)) == 0
+    assert re.findall(r"--source (\d+)", capsys.readouterr().out) == ["0", "1", "10"]
 
 
 @pytest.mark.parametrize(
@@ -83,7 +82,7 @@ def test_without_a_camera_the_command_says_what_to_try(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(command.sys, "platform", system)
-    assert command.run(argparse.Namespace(dev=tmp_path, json=False)) == 0
+    assert command.run(argparse.Namespace(dev=tmp_path)) == 0
     out, err = capsys.readouterr()
     assert out == ""
     assert all(word in err for word in words)

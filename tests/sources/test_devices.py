@@ -16,7 +16,7 @@ from tactflow.sources import CameraRequest, devices, open_source
 @pytest.mark.parametrize(
     ("present", "device", "expected"),
     [
-        ([], "0", "no camera is plugged in"),
+        ([], "0", "no camera is plugged in .*; to try it without one: --source sim:press"),
         ([], "99999999999999999999", "no camera is plugged in"),
         (
             ["/dev/video2", "/dev/video10"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -161,10 +160,7 @@ class Parquet(OutputSink):
                     # Sync before renaming, so that a power cut leaves no empty part.
                     os.fsync(file.fileno())
         except OSError as error:
-            hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-            kept = (
-                f"the {self._counts['frames']} frames written before are complete; not written: {count}{hint}"
-            )
+            kept = f"the {self._counts['frames']} frames written before are complete; not written: {count}"
             raise cannot_write(self._folder, error, kept) from error
         self._next += 1
         self._counts = {"frames": self._counts["frames"] + count, "parts": self._counts["parts"] + 1}

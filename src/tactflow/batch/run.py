@@ -79,8 +79,8 @@ class Result:
 class Batch:
     """One call of a batch.
 
-    signals : returns the number of stop signals received. fail_fast : start no recordings after a failure.
-    on_outcome : called with each outcome.
+    signals : returns the number of stop signals received. on_outcome : called with each
+    outcome.
     """
 
     store: Store
@@ -88,7 +88,6 @@ class Batch:
     request: Request
     workers: Workers
     signals: Callable[[], int]
-    fail_fast: bool = False
     on_outcome: Callable[[Outcome], None] = lambda _: None
 
     def run(self, plan: Plan) -> Result:
@@ -174,6 +173,4 @@ class Batch:
             return "the disk is full; free some space and run again: finished recordings are kept"
         if self._deaths == MAX_DEATHS:
             return f"{MAX_DEATHS} recordings in a row killed their workers; try fewer --workers"
-        if self.fail_fast and outcome.status != "done":
-            return "--fail-fast: a recording failed"
         return None

@@ -63,9 +63,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="process only part I of N of the recordings, as in a job array; a final call without it writes "
         "the table and the page",
     )
-    parser.add_argument(
-        "--fail-fast", action="store_true", help="start no more recordings after one has failed"
-    )
     add_quiet(parser)
 
 
@@ -104,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
                 else LocalProcesses(args.workers or _processors())
             )
             tell(f"on {workers.description}")
-            batch = Batch(store, scratch, request, workers, lambda: len(signals), args.fail_fast)
+            batch = Batch(store, scratch, request, workers, lambda: len(signals))
             with _progress(len(plan.left), tell, shown=not args.quiet) as batch.on_outcome:
                 result = batch.run(plan)
         # Before the table is written, which a full disk may not take.

@@ -5,12 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
-import orjson
-
-from tactflow.cli.options import add_json
 from tactflow.sources.cameras import CameraInfo, list_cameras
 from tactflow.system.terminal import say, show
 
@@ -25,7 +21,6 @@ NO_NAMES = """on this system, cameras have no names, only numbers in the order i
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `cameras`."""
-    add_json(parser, "one JSON object per camera")
     parser.set_defaults(dev=Path("/dev"))
 
 
@@ -38,10 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if not cameras:
         say(NO_CAMERA)
     for camera in cameras:
-        if args.json:
-            print(orjson.dumps(asdict(camera)).decode())
-        else:
-            show(describe(camera))
+        show(describe(camera))
     return 0
 
 

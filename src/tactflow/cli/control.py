@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tactflow.cli.options import add_endpoint, add_json, writing
+from tactflow.cli.options import add_endpoint, writing
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.remote_control import DEFAULT_ENDPOINT, RemoteControl
@@ -36,7 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timeout", type=seconds, default=5.0, metavar="S", help="wait S seconds for an answer; default: 5"
     )
-    add_json(parser, "print the whole answer, a JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,9 +49,7 @@ def run(args: argparse.Namespace) -> int:
         raise SourceError(f"control: {error}") from None
     except RuntimeError as error:
         raise StageError(f"control: {error}") from None
-    if args.json:
-        show_json(answer)
-    elif "stats" in answer:
+    if "stats" in answer:
         show_json(answer["stats"])
     else:
         show([f"{answer['state']['sensor']}: {answer['message']}"])

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.cli.options import add_json, add_overwrite, refuse_output, writing
+from tactflow.cli.options import add_overwrite, refuse_output, writing
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
 from tactflow.system.arguments import number
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
-from tactflow.system.terminal import printable, show_json
+from tactflow.system.terminal import printable
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
@@ -28,19 +28,14 @@ from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect
 _index = number(int, 0, math.inf, "a whole number from 0")
 SHOWN: Final = 0.25
 """Score of the runner-up, relative to that of the marks, above which it is shown."""
-IN_JSON: Final = ("centers", "polarity", "dot_radius", "pitch")
-"""Attributes of the detected marks, px of the picture that was looked at."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `detect`."""
-    parser.add_argument("first", nargs="?", metavar="SRC", help="the same as --source SRC")
-    parser.add_argument("--source", metavar="SRC", help="as in 'tactflow run', of the untouched gel")
-    add_json(parser)
+    parser.add_argument("source", metavar="SRC", help="as in 'tactflow run', of the untouched gel")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the dots, and why they were found")
     add_overwrite(parser)
     parser.add_argument("--frame", type=_index, default=0, metavar="N", help="index of the frame, from 0")
-    parser.add_argument("--rotate", type=int, default=0, choices=(0, 90, 180, 270), help="as in preprocess")
     parser.add_argument(
         "--downsample", type=int, default=1, choices=(1, 2, 4, 8, 16), help="as in preprocess"
     )
@@ -56,13 +51,10 @@ def run(args: argparse.Namespace) -> int:
     ConfigError, SourceError, StageError
         If the options are wrong, the frame cannot be read, or the picture cannot be written.
     """
-    if (args.first is None) == (args.source is None):
-        raise ConfigError("required one source: tactflow detect --source SRC")
-    source = args.source or args.first
     if args.picture is not None:
         refuse_output("--picture", args.picture, overwrite=args.overwrite, suffixes=(".png", ".jpg"))
-    image = _frame(source, args.frame)
-    image = Preprocessor(image.shape[1::-1], rotate=args.rotate, downsample=args.downsample)(image)
+    image = _frame(args.source, args.frame)
+    image = Preprocessor(image.shape[1::-1], downsample=args.downsample)(image)
     valid = valid_area(image)
     marks: Detection | None = None
     try:
@@ -73,16 +65,12 @@ def run(args: argparse.Namespace) -> int:
         rival, lines = error.best, [str(error), *_best(error.best)]
     except ValueError as error:
         raise ConfigError(f"--dot: {error}") from None
-    title = f"{public_address(source)}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
+    title = f"{public_address(args.source)}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
     without = 0.0 if valid is None else float(np.mean(valid == 0))
     if without > 0:
         lines.append(f"dim: {100 * without:.0f} % of the picture shows no gel")
     text = "\n".join(map(printable, [title, *lines]))
-    if args.json:
-        found = {} if marks is None else {key: getattr(marks, key) for key in IN_JSON}
-        show_json({"centers": [], "polarity": None, **found, "notes": lines})
-    else:
-        print(text)
+    print(text)
     if args.picture is not None:
         picture = draw_detection(image, marks, text, rival=rival, valid=valid)
         with writing(f"--picture {args.picture}"), completed(args.picture) as partial:

@@ -7,7 +7,6 @@ import textwrap
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from tactflow.cli.options import add_json
 from tactflow.engine.errors import StageError
 from tactflow.sources import KINDS
 from tactflow.system.arguments import seconds
@@ -39,7 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"how long to observe it; default {LIVE_SECONDS:g}. Leave the gel untouched at the beginning "
         "and end, and press it in between",
     )
-    add_json(parser, "one JSON object with all measurements and versions, as a bug report needs it")
+    parser.add_argument(
+        "--json", action="store_true", help="print all measurements and versions, as a bug report needs them"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

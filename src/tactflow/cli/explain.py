@@ -4,16 +4,21 @@ pipeline as a Mermaid flowchart."""
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
-from tactflow.cli.options import add_json, add_pipeline, load_plan
+from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.cli.progress import END_WORDS
-from tactflow.cli.statistics import Statistics
 from tactflow.engine.contract import Sink
+from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
-from tactflow.system.terminal import show, show_json
+from tactflow.system.terminal import show
+
+FAILURES = ("error", "disabled")
+"""Reasons for not running that are failures, which save no time."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,26 +26,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_pipeline(parser)
     parser.add_argument(
         "--stats",
+        type=Path,
         metavar="run.json",
         help="statistics of a run (tactflow run --stats), to show how often each stage ran and what it cost",
     )
-    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a paragraph for each stage and sink, or the same as JSON."""
-    statistics = None if args.stats is None else Statistics.read(Path(args.stats))
+    """Print a paragraph for each stage and sink."""
+    statistics = None if args.stats is None else _read_statistics(args.stats)
     pipeline, plan = load_plan(args)
-    facts = dict(_facts(pipeline, plan, statistics))
-    if args.json:
-        about = {"file": pipeline.file, "sensor": pipeline.sensor, "segments": list(plan.segments)}
-        show_json(about | {"nodes": facts})
-        return 0
     skipping = "" if pipeline.skipping else ", skipping is off"
     show([f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"])
     if statistics is not None:
         show([_whole_run(statistics)])
-    for id_, texts in facts.items():
+    for id_, texts in _facts(pipeline, plan, statistics):
         width = max(map(len, texts))
         show(
             ["", f"{id_} ({texts.pop('at')})", *(f"  {k.ljust(width)}  {text}" for k, text in texts.items())]
@@ -48,15 +48,47 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _whole_run(run: Statistics) -> str:
-    times = ((name, getattr(run.latency_ms, name)) for name in ("p50", "p99"))
+def _read_statistics(path: Path) -> dict[str, Any]:
+    """Read a statistics file; raises ConfigError if it cannot be read, or is not one."""
+    try:
+        statistics = json.loads(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
+    except ValueError:
+        statistics = None
+    if not isinstance(statistics, dict) or not {"stages", "sinks", "latency_ms"} <= statistics.keys():
+        raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")
+    return statistics
+
+
+def _whole_run(run: Mapping[str, Any]) -> str:
+    times = ((name, run["latency_ms"][name]) for name in ("p50", "p99"))
     latency = ", ".join(f"{name} unknown" if ms is None else f"{name} {ms:.3g} ms" for name, ms in times)
-    frames = f"{run.frames} frames in {run.wall_s:.1f} s, {run.dropped} dropped"
-    return f"the run: {frames}, latency {latency}, ended: {END_WORDS.get(run.end, run.end)}"
+    frames = f"{run['frames']} frames in {run['wall_s']:.1f} s, {run['dropped']} dropped"
+    return f"the run: {frames}, latency {latency}, ended: {END_WORDS.get(run['end'], run['end'])}"
+
+
+def _cost(node: Mapping[str, Any]) -> str:
+    """How often a stage ran and why not, time of a run, and what skipping saved per frame."""
+    runs = node["runs"]
+    frames = runs + sum(node["skips"].values())
+    if not frames:
+        return "never reached by a frame"
+    skips = sorted(((n, reason) for reason, n in node["skips"].items() if n), reverse=True)
+    reasons = ", ".join(f"{100 * n / frames:.3g} % {reason.replace('_', ' ')}" for n, reason in skips)
+    text = f"ran {100 * runs / frames:.3g} %" + (f", skipped {reasons}" if reasons else "")
+    if not runs:
+        return text
+    mean = node["total_ms"] / runs
+    text += f"; a run: mean {mean:.3g} ms, p50 {node['p50_ms']:.3g} ms, p99 {node['p99_ms']:.3g} ms"
+    saved = mean * sum(n for n, reason in skips if reason not in FAILURES)
+    if saved:
+        text += f"; saved {saved / frames:.3g} ms of {(saved + node['total_ms']) / frames:.3g} ms a frame"
+    return text
 
 
 def _facts(
-    pipeline: Pipeline, plan: Plan, statistics: Statistics | None
+    pipeline: Pipeline, plan: Plan, statistics: Mapping[str, Any] | None
 ) -> Iterator[tuple[str, dict[str, str]]]:
     """Each stage and sink with what there is to say about it: heading -> text."""
     sinks = _sinks_behind(pipeline)
@@ -79,8 +111,8 @@ def _facts(
         name, origin = node.component.name, node.component.origin
         facts["is"] = name if ":" in name or name == origin else f"{name} ({origin})"
         if statistics is not None and not is_pruned:
-            entry = (statistics.stages | statistics.sinks).get(node.id)
-            facts["statistics"] = "not part of that run" if entry is None else str(entry)
+            entry = (statistics["stages"] | statistics["sinks"]).get(node.id)
+            facts["statistics"] = "not part of that run" if entry is None else _cost(entry)
         yield node.id, facts
 
 

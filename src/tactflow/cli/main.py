@@ -60,7 +60,6 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
     before_run : called when the command is imported and its arguments are valid.
     """
     try:
-        _check_environment()
         args = _parse(argv)
         before_run()
         return int(args.run(args))
@@ -74,15 +73,6 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
         return INTERRUPTED
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else 0
-
-
-def _check_environment() -> None:
-    """Refuse limits that are not numbers: importing OpenCV would abort the process."""
-    for name in ("PIXELS", "WIDTH", "HEIGHT"):
-        variable = f"OPENCV_IO_MAX_IMAGE_{name}"
-        value = os.environ.get(variable, "1")
-        if not (value.isascii() and value.isdecimal()):
-            raise ConfigError(f"the environment variable {variable} is {value!r}; required: a number")
 
 
 class _Parser(argparse.ArgumentParser):

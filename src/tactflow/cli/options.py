@@ -50,11 +50,6 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress display and no summary")
 
 
-def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object instead of text") -> None:
-    """Declare `--json`."""
-    parser.add_argument("--json", action="store_true", help=what)
-
-
 def add_overwrite(parser: argparse._ActionsContainer, what: str = "FILE") -> None:
     """Declare `--overwrite`."""
     parser.add_argument("--overwrite", action="store_true", help=f"replace {what} if it exists")

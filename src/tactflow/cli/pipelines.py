@@ -7,7 +7,7 @@ import json
 import time
 from importlib.resources import files
 
-from tactflow.cli.options import add_json, add_pipeline, add_quiet, load_plan
+from tactflow.cli.options import add_pipeline, add_quiet, load_plan
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -21,7 +21,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "name", nargs="?", metavar="NAME", help="print this one, to change a copy: NAME > pipeline.yaml"
     )
-    add_json(parser, "a JSON object: name -> what it is for")
     parser.epilog = "for your sensor: tactflow run mini --source 0"
 
 
@@ -29,8 +28,6 @@ def run(args: argparse.Namespace) -> int:
     """Print the name of each shipped pipeline and what it is for, or one of the files."""
     if args.name is not None:
         print(find_pipeline(args.name).read_text(encoding="utf-8"), end="")
-    elif args.json:
-        show_json(described_pipelines())
     else:
         show(table(list(described_pipelines().items())))
     return 0
@@ -39,11 +36,10 @@ def run(args: argparse.Namespace) -> int:
 def add_arguments_check(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `check`."""
     add_pipeline(parser)
-    add_json(parser, "a JSON object: the mistakes, and what each sensor's pipeline consists of")
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Print one line for each sensor, or JSON; raises ConfigError with every mistake."""
+    """Print one line for each sensor; raises ConfigError with every mistake."""
     from tactflow.fleet.sinks import clash_problems
 
     names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
@@ -55,17 +51,9 @@ def run_check(args: argparse.Namespace) -> int:
         except ConfigError as error:
             mistakes += error.mistakes
     mistakes += clash_problems({name: pipeline for name, (pipeline, _) in valid.items() if name is not None})
-    # A mistake that several sensors share is reported once.
-    mistakes = list(dict.fromkeys(mistakes))
-    if args.json:
-        parts = {
-            pipeline.sensor: {"stages": [*pipeline.nodes], "warnings": [*pipeline.warnings, *plan.warnings]}
-            for pipeline, plan in valid.values()
-        }
-        show_json({"mistakes": mistakes, "sensors": parts})
-        return ConfigError.exit_code if mistakes else 0
     if mistakes:
-        raise ConfigError(*mistakes)
+        # A mistake that several sensors share is reported once.
+        raise ConfigError(*dict.fromkeys(mistakes))
     for name, (pipeline, plan) in valid.items():
         sinks = len(pipeline.sinks)
         counts = {"stage": len(pipeline.nodes) - sinks, "sink": sinks, "segment": len(plan.segments)}

@@ -13,7 +13,6 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
-from tactflow.cli.options import add_json
 from tactflow.config.document import shown
 from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, names, resolve
@@ -22,7 +21,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
 from tactflow.engine.ports import Port, describe_type
 from tactflow.system.spelling import did_you_mean
-from tactflow.system.terminal import say, show, show_json, table
+from tactflow.system.terminal import say, show, table
 
 _TYPES = {"integer": "whole number", "string": "text", "boolean": "true | false", "object": "mapping"}
 """Type of JSON Schema -> how it is called here; others keep their names."""
@@ -37,7 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="explain this one: a built-in, a plug-in, module:Class or ./file.py:Class (its code is run)",
     )
-    add_json(parser, "a JSON array with ports, and the parameters as JSON Schema")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,27 +43,12 @@ def run(args: argparse.Namespace) -> int:
     components, problems = ([_find(args.name)], []) if args.name is not None else catalogue()
     for problem in problems:
         say(f"tactflow: warning: {problem}")
-    if args.json:
-        show_json([*map(_as_json, components)])
-        return 0
     if args.name is not None:
         print("\n".join(details(components[0])))
         return 0
     heading = ("NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT IT DOES")
     show(table([heading, *map(_row, components)]))
     return 0
-
-
-def _as_json(component: Component) -> dict[str, Any]:
-    ports = component.ports
-    return {
-        "name": component.name,
-        "kind": component.kind,
-        "origin": component.origin,
-        "inputs": {port.name: _port_type(port) for port in ports.inputs},
-        "outputs": {port.name: _port_type(port) for port in ports.outputs},
-        "parameters": component.params.model_json_schema(schema_generator=_AnySchema),
-    }
 
 
 def details(component: Component) -> Iterator[str]:

@@ -13,7 +13,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Mark
 from tactflow.system.files import read_limited
 
-SOURCE_OPTION = "a camera, a recording or a stream is given by --source"
+SOURCE_OPTION = "a camera, a recording or a stream is given as --source"
 """Advice for an argument that is not the name of a pipeline."""
 Keys = tuple[str | int, ...]
 """Path of a value in a document: keys of mappings and indices of lists, from the root."""
@@ -134,8 +134,8 @@ def read_document(path: Path) -> Document:
     ConfigError : the file cannot be read, or is not YAML.
     """
     if path.is_dir():
-        raise ConfigError(f"{path} is a folder; required: a pipeline file (YAML)")
-    hint = "" if path.suffix in (".yaml", ".yml") else f"; {SOURCE_OPTION}"
+        raise ConfigError(f"{path} is a folder; required: a pipeline file (YAML); {SOURCE_OPTION} {path}")
+    hint = "" if path.suffix in (".yaml", ".yml") else f"; {SOURCE_OPTION} {path}"
     try:
         data = read_limited(path)
     except FileNotFoundError:

@@ -46,7 +46,7 @@ def find_pipeline(name: str | None) -> Path:
     if not path.exists() and name == stem and path.parent == Path():
         raise ConfigError(
             f"there is no file {name}, and no pipeline of that name in tactflow"
-            f"{did_you_mean(name, packaged_pipelines(), 'it has ')}; {SOURCE_OPTION}"
+            f"{did_you_mean(name, packaged_pipelines(), 'it has ')}; {SOURCE_OPTION} {name}"
         )
     return path
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import StageError
-from tactflow.outputs import open_output, refuse_interference
+from tactflow.outputs import FREE_SPACE, open_output, refuse_interference
 
 log = logging.getLogger("tactflow")
 
@@ -120,7 +120,7 @@ class Film:
             writer.release()
             problem = film_problem(self._path, self.frames) if self.frames else None
             kept = problem or f"the {self.frames} frames written before can be played"
-            raise StageError(f"{self._path}: the disk is full; {kept}")
+            raise StageError(f"{self._path}: the disk is full; {kept}; {FREE_SPACE}")
         height, width = picture.shape[:2]
         writer.write(cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
         self.frames += 1

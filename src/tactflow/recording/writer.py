@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -129,12 +128,11 @@ class RecordingWriter:
             with suppress(OSError):
                 os.ftruncate(self._file.fileno(), self.bytes)
             self.close()
-            hint = "free some space, then " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             raise cannot_write(
                 self.path,
                 error,
                 f"the {self.frames} frames written before are complete and can be played; "
-                f"{hint}tactflow repair {self.path} adds the index",
+                f"tactflow repair {self.path} adds the index",
             ) from error
         except BaseException:
             self.close()

@@ -120,7 +120,7 @@ def _camera_hint(device: str) -> str:
     present = sorted(glob.glob("/dev/video*"), key=lambda name: (len(name), name))
     wanted = f"/dev/video{device}" if device.isdecimal() else device
     if not present:
-        return "no camera is plugged in (there is no /dev/video*)"
+        return "no camera is plugged in (there is no /dev/video*); to try it without one: --source sim:press"
     cameras = "this machine has " + ", ".join(present)
     if not os.path.exists(wanted):
         return f"{wanted} does not exist; {cameras}"
