@@ -15,8 +15,6 @@ import pytest
 import yaml
 
 from tactflow import open_scene
-from tactflow.cli import start as start_command
-from tactflow.cli.main import main
 from tests.clock import until
 from tests.program import Program
 
@@ -160,34 +158,3 @@ def test_a_touch_at_rest_is_noticed_and_the_terminal_answers_as_the_page_does(
     assert running.exit_code() == 130
     running.said("stopped; nothing was written")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_script_sets_up_a_live_camera_unless_it_is_touched_at_rest(
-    camera: Callable[[str], Camera],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    gel, look_at_presses = camera("unmarked"), start_command._press
-
-    def press(*args: Any) -> None:
-        gel.pressed.set()
-        look_at_presses(*args)
-
-    monkeypatch.setattr(start_command, "_press", press)
-    monkeypatch.setattr(start_command, "SETTLE_SECONDS", 1.0)
-    # The camera shows a press in 1 s.
-    monkeypatch.setattr(start_command, "PRESS_SECONDS", 3.0)
-    out = tmp_path / "made.yaml"
-    words = ["start", gel.address, "--yes", "--no-run", "--out", str(out)]
-    gel.pressed.set()
-    assert main(words) == 3
-    assert "although nothing should touch the gel" in capsys.readouterr().err
-    assert not out.exists()
-    gel.pressed.clear()
-    until(lambda: gel.count == 0)
-    assert main(words) == 0
-    said = capsys.readouterr().err
-    assert "Press the gel in several places" in said
-    assert "Proposed: markerless: finds 100 % of the presses" in said
-    assert out.exists()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import tactflow
 from tactflow.cli import start
 from tactflow.cli.main import main, make_parser
 from tactflow.engine.errors import SourceError
+from tactflow.sources import FrameReader
 from tests.terminal import Terminal
 
 Recorded = Callable[[str], str]
@@ -83,16 +84,25 @@ def test_a_gel_whose_presses_no_pipeline_finds_is_not_set_up(terminal: Terminal)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="cameras have no list outside Linux")
 def test_without_a_camera_it_is_said_what_to_do(tmp_path: Path) -> None:
     args = make_parser("start").parse_args(["start", "--out", str(tmp_path / "made.yaml")])
-    args.yes, args.dev = True, tmp_path
+    args.dev = tmp_path
     with pytest.raises(SourceError, match="no camera is plugged in") as caught:
         start.run(args)
     assert "tactflow start sim:press" in str(caught.value)
     (tmp_path / "video0").write_text("not a device")
     with pytest.raises(SourceError, match="video0"):
         start.run(args)
-    (tmp_path / "video1").write_text("not a device")
-    with pytest.raises(tactflow.ConfigError, match="2 cameras are plugged in; name the sensor"):
-        start.run(args)
+
+
+def test_a_script_cannot_press_a_camera(monkeypatch: pytest.MonkeyPatch, terminal: Terminal) -> None:
+    class Live(FrameReader):
+        live, fps = True, 30.0
+
+        def _frames(self) -> Iterator[tuple[np.ndarray, float]]:
+            yield np.zeros((60, 80, 3), np.uint8), 0.0
+
+    monkeypatch.setattr(start, "open_source", lambda _: Live("a camera"))
+    assert terminal(*PROPOSE, "0") == 2
+    assert "--yes: required a recording as SRC" in terminal.err
 
 
 class Scripted:
@@ -135,7 +145,11 @@ def test_of_several_cameras_the_one_that_is_the_sensor_is_set_up(
     assert pipeline["sensor"] == "digit"
 
 
-@pytest.mark.parametrize(("recording", "dots"), [("gels/digit_fots", False), ("gels/gelslim_ball", True)])
-def test_real_sensors(recording: str, dots: bool, shared_data: Path, terminal: Terminal) -> None:
-    assert terminal(*PROPOSE, str(shared_data / recording)) == 0
+@pytest.mark.parametrize(
+    ("recording", "base", "dots"),
+    [("digit_fots", "digit", False), ("gelslim_ball", "default", True), ("mini_ball", "mini", True)],
+)
+def test_real_sensors(recording: str, base: str, dots: bool, shared_data: Path, terminal: Terminal) -> None:
+    assert terminal(*PROPOSE, str(shared_data / "gels" / recording)) == 0
+    assert f"from {base}.yaml" in MADE.read_text().splitlines()[0]
     assert ("tracker" in yaml.safe_load(MADE.read_text())["stages"]) == dots

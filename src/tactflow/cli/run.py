@@ -177,18 +177,14 @@ def _statistics_problem(path: str) -> str | None:
 
 
 def _write_statistics(path: str, statistics: Mapping[str, Any]) -> bool:
-    """Returns whether they were written. A partial file is truncated to zero."""
+    """Returns whether they were written."""
     # A sink may have written to it meanwhile.
     problem = _statistics_problem(path)
     if problem is None:
         try:
-            with open(path, "w", encoding="utf-8") as file:
-                file.write(json.dumps(statistics, indent=1) + "\n")
+            Path(path).write_text(json.dumps(statistics, indent=1) + "\n", encoding="utf-8")
         except OSError as error:
             problem = f"cannot be written: {error.strerror or error}"
-            # A device cannot be truncated.
-            with suppress(OSError):
-                os.truncate(path, 0)
     if problem is not None:
         say(f"tactflow: --stats {path}: {problem}")
     return problem is None

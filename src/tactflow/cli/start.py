@@ -29,12 +29,8 @@ from tactflow.tune.recording import CHANGE, Kept
 from tactflow.tune.report import commented
 from tactflow.view.questions import Questions
 
-SETTLE_SECONDS: Final = 3.0
-"""With --yes, time for exposure and white balance to settle, s: `settle` of capture."""
 REST_SECONDS: Final = 2.0
 """How long the untouched gel is observed, s."""
-PRESS_SECONDS: Final = 10.0
-"""With --yes, how long to wait for presses, s."""
 RECORDED_SECONDS: Final = 30.0
 """How much of a recording is read, s."""
 EDGES: Final = {"0": "top", "270": "right", "180": "bottom", "90": "left"}
@@ -47,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "source", nargs="?", metavar="SRC", help="as in 'tactflow run'; default: a camera that is plugged in"
     )
     parser.add_argument(
-        "--yes", action="store_true", help="accept every proposal without asking; for scripts"
+        "--yes", action="store_true", help="accept every proposal for a recording, without asking"
     )
     parser.add_argument(
         "--out", type=Path, default=Path("pipeline.yaml"), metavar="FILE", help="default: pipeline.yaml"
@@ -63,11 +59,11 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     ConfigError
-        The file is there already, there are several cameras and --yes, or nobody can answer.
+        The file is there already, --yes without a recording, or nobody can answer.
     SourceError
         There is no camera, or the source delivers nothing.
     StageError
-        With --yes: no pipeline finds the presses, or the gel was touched while it was looked at untouched.
+        With --yes: no pipeline finds the presses.
     """
     refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
     questions = Questions(None if args.yes else args.port, say)
@@ -94,8 +90,6 @@ def run(args: argparse.Namespace) -> int:
 def _open(args: argparse.Namespace, questions: Questions) -> tuple[str, FrameReader]:
     """The source that was named, or the camera that is the sensor."""
     sources = [args.source] if args.source is not None else _cameras(args.dev)
-    if args.yes and len(sources) > 1:
-        raise ConfigError(f"{len(sources)} cameras are plugged in; name the sensor: {', '.join(sources)}")
     problems: list[str] = []
     while len(problems) < len(sources):
         problems = []
@@ -106,6 +100,9 @@ def _open(args: argparse.Namespace, questions: Questions) -> tuple[str, FrameRea
             except SourceError as error:
                 problems.append(str(error))
                 continue
+            if args.yes and reader.live:
+                reader.close()
+                raise ConfigError("--yes: required a recording as SRC; with a camera, somebody has to press")
             questions.reader = reader if reader.live else None
             choices = {"yes": "Yes, this is the sensor", "no": "No, show the next camera"}
             if len(sources) == 1 or questions.ask(f"Is this the sensor? {source}", choices) == "yes":
@@ -182,9 +179,7 @@ def _watch(
 
 
 def _untouched(source: str, reader: FrameReader, questions: Questions) -> tuple[Observation, Kept]:
-    """Look at the gel at rest. Raises StageError with --yes if it is not at rest."""
-    if questions.unattended:
-        _watch(reader, SETTLE_SECONDS, Observation(source, "", live=True), questions, Kept())
+    """Look at the gel at rest."""
     text = "Leave the gel untouched."
     while True:
         questions.ask(text, {"untouched": "Nothing touches the gel"})
@@ -198,17 +193,12 @@ def _untouched(source: str, reader: FrameReader, questions: Questions) -> tuple[
             f"The picture changed by {100 * change:.0f} %, although nothing should touch the gel. Keep away "
             "from it, and from its light, for a moment."
         )
-        if questions.unattended:
-            raise StageError(text)
 
 
 def _press(reader: FrameReader, observation: Observation, questions: Questions, kept: Kept) -> None:
     """Look at presses."""
     questions.begin("Press the gel in several places, and lift in between.", {"done": "Done"})
-    if questions.unattended:
-        _watch(reader, PRESS_SECONDS, observation, questions, kept)
-    else:
-        _watch(reader, math.inf, observation, questions, kept, until="done")
+    _watch(reader, math.inf, observation, questions, kept, until="done")
 
 
 def _decide(

@@ -87,11 +87,8 @@ MAX_DOT_RADIUS: Final = 0.15
 """Largest plausible dot radius in pitches: blur makes dots look larger. 0.11 to 0.15 in simulated scenes."""
 CODEC_REPEATS: Final = 10.0
 """Repeated frames in a good recording, %: codecs produce them in still scenes (measured)."""
-STEADY: Final = 0.35
-"""Threshold of the 95th percentile of the dots' displacement, px, below which the gel is untouched: the bound
-used to label the recordings of franka_mini."""
 MIN_FRAMES: Final = 3
-"""Minimum number of frames for bands, and of untouched frames for drift."""
+"""Minimum number of frames for bands."""
 
 
 # The slowest cameras of such sensors have 25 frames/s; automatic exposure in the dark halves the rate.
@@ -100,7 +97,6 @@ def _rate(observed: Observation) -> Finding | str:
     if isinstance(gaps := observed.gaps, str):
         return gaps
     rate = 1.0 / float(gaps.mean())
-    jitter = 100.0 * measures.spread(gaps - np.median(gaps)) * rate
     nominal, limits = "", None
     if observed.live and observed.nominal:
         nominal = f" of nominally {observed.nominal:.3g}"
@@ -113,7 +109,7 @@ def _rate(observed: Observation) -> Finding | str:
     )
     return Finding(
         rate,
-        f"{rate:.3g} frames/s{nominal}, jitter {jitter:.0f} %",
+        f"{rate:.3g} frames/s{nominal}",
         f"contacts shorter than {1000 / rate:.0f} ms may be missed{reach}",
         "a fixed short exposure with more light (automatic exposure halves the rate in the dark); format "
         "MJPG or fewer pixels; a separate USB port",
@@ -137,20 +133,6 @@ def _drop_outs(observed: Observation) -> Finding:
         f"{missing} of {total} frames missing, {observed.repeated} repeated{stopped}",
         "contacts are detected late, and dots move further between frames",
         "another cable and port (no hub), fewer pixels or MJPG, less load on the processor",
-    )
-
-
-# Three and nine frames at 30 a second; chosen by hand.
-@check("latency", "ms", warning=100.0, fault=300.0)
-def _latency(observed: Observation) -> Finding | str:
-    if not observed.delays:
-        return "frames have no capture time" if observed.live else "a recording has no latency"
-    delay = 1000.0 * float(np.median(observed.delays))
-    return Finding(
-        delay,
-        f"frames are {delay:.0f} ms old when they are read",
-        "a controller reacts that much later",
-        "fewer pixels or an uncompressed format; a driver that buffers fewer frames",
     )
 
 
@@ -232,31 +214,4 @@ def _dots(observed: Observation) -> Finding | str:
         f"{100 * grid.missing:.0f} % missing, contrast {grid.contrast:.0f} grey levels",
         "motion at missing dots is interpolated from their neighbours",
         "check with tactflow detect SRC --picture FILE; set polarity and dot, reprint worn dots",
-    )
-
-
-# Drift adds to the error of displacements, 0.01 px on a resting simulated gel; the measurement itself has an
-# error of up to 0.05 px. Chosen by hand.
-@check("drift", "px", warning=0.15, fault=1.0)
-def _drift(observed: Observation) -> Finding | str:
-    first, second_half = observed.pairs[0].image, []
-    points = measures.points(first) if observed.dots is None else observed.dots.centers.astype(np.float32)
-    for pair in observed.pairs[1:]:
-        if 2 * pair.number < observed.frames:
-            continue
-        moved = measures.motion(first, pair.image, points)
-        # A reliable median needs ten points, and half of all.
-        if len(moved) >= max(10, len(points) / 2):
-            middle = np.median(moved, axis=0)
-            if np.percentile(np.hypot(*(moved - middle).T), 95) < STEADY:
-                second_half.append(middle)
-    if len(second_half) < MIN_FRAMES:
-        return "too few untouched frames in the second half"
-    x, y = np.median(second_half[-max(MIN_FRAMES, len(second_half) // 3) :], axis=0)
-    drift = math.hypot(x, y)
-    return Finding(
-        drift,
-        f"the resting gel has moved by {drift:.2f} px ({x:+.2f}, {y:+.2f})",
-        f"every displacement, and the flow, is off by {drift:.2f} px",
-        "fasten gel and camera; let the gel settle; take a new reference of the untouched gel",
     )

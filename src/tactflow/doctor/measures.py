@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import MAD_TO_SIGMA, ColorImage
+from tactflow.vision.arrays import ColorImage
 from tactflow.vision.markers import Detection
 from tactflow.vision.markers.lattice import corners
 
@@ -49,11 +49,6 @@ class Lattice(NamedTuple):
     closed: float
     missing: float
     contrast: float
-
-
-def spread(values: NDArray[Any]) -> float:
-    """Robust standard deviation of values around 0, from the median absolute value."""
-    return MAD_TO_SIGMA * float(np.median(np.abs(values)))
 
 
 def grey(image: ColorImage) -> Gray:
@@ -216,29 +211,3 @@ def _empty_positions(detection: Detection) -> list[NDArray[np.float64]]:
         if inside and np.hypot(*(occupied - position).T).min() > detection.pitch / 2:
             empty.append(position)
     return empty
-
-
-def points(image: ColorImage) -> NDArray[np.float32]:
-    """(N, 2) float32, px: up to 200 trackable points of a picture, at least 8 px apart."""
-    found = cv2.goodFeaturesToTrack(_smooth(image), 200, 0.05, 8.0)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2), np.float32)
-
-
-def motion(reference: ColorImage, now: ColorImage, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Displacements (M, 2), px, of those of the points (N, 2) that are found again.
-
-    reference, now : (H, W, 3) uint8. Each point is tracked to `now` and back, and must return to within
-    0.3 px.
-    """
-    if not len(points):
-        return np.zeros((0, 2), np.float32)
-    before, after, window = _smooth(reference), _smooth(now), (31, 31)
-    ends, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, points.copy(), winSize=window)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, ends, points.copy(), winSize=window)
-    good = (np.ravel(found) == 1) & (np.ravel(found_back) == 1) & (np.hypot(*(back - points).T) < 0.3)
-    return np.asarray(np.subtract(ends, points)[good], np.float32)
-
-
-def _smooth(image: ColorImage) -> ColorImage:
-    """(H, W) uint8 grey, blurred by 1.5 px against noise."""
-    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), 1.5), np.uint8)

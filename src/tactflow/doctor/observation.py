@@ -15,7 +15,6 @@ from scipy.spatial.distance import cdist
 from tactflow.doctor.measures import REGULAR, Gray, Pair, exposure, grey
 from tactflow.engine.errors import SourceError
 from tactflow.sources import Arrival, FrameReader, open_source
-from tactflow.sources.devices import Camera
 from tactflow.sources.files import ArrayFile, ImageFiles
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.geometry.valid_area import valid_area
@@ -35,8 +34,7 @@ class Observation:
     source : as given by the user. description : of its kind. live : a camera or stream. nominal : frame rate
     that it reports, 1/s, or None. times : s, or None for single pictures. frames : number of frames.
     repeated : frames bit-identical to their predecessor. missing : lost frames, by the numbers in a
-    recording. stopped : why it ended early, or "". delays : s from the driver's time stamp to reading, for
-    frames with a stamp. pairs : kept frames.
+    recording. stopped : why it ended early, or "". pairs : kept frames.
     """
 
     source: str
@@ -48,7 +46,6 @@ class Observation:
     repeated: int = 0
     missing: int = 0
     stopped: str = ""
-    delays: list[float] = field(default_factory=list[float])
     pairs: list[Pair] = field(default_factory=list[Pair])
 
     def check(self) -> None:
@@ -172,8 +169,6 @@ def _read(
             if len(observation.pairs) > 2 * KEPT:
                 stride *= 2
                 observation.pairs[:] = [pair for pair in observation.pairs if pair.number % stride == 0]
-        if isinstance(reader, Camera) and (delay := reader.delay()) is not None:
-            observation.delays.append(delay)
         times.append(t)
         last, last_seq = image, seq
         observation.frames += 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import os
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -103,17 +102,6 @@ class Camera(CaptureReader):
         while (image := self._grab()) is not None:
             yield image, EPOCH + SYSTEM.now()
         raise SourceError(f"{self.name}: delivers no more frames; unplugged, or in use by another program?")
-
-    def delay(self) -> float | None:
-        """Time since the driver's time stamp of the last frame, s; None if unknown.
-
-        Linux's driver for USB cameras stamps a frame when its first bytes arrive, with the monotonic clock.
-        """
-        if sys.platform != "linux":
-            return None
-        stamped = self._property(cv2.CAP_PROP_POS_MSEC) / 1e3
-        delay = time.monotonic() - stamped
-        return delay if stamped > 0 and 0 <= delay < READ_TIMEOUT else None
 
 
 def _camera_hint(device: str) -> str:

@@ -20,7 +20,6 @@ import numpy as np
 from tactflow.calibration.file import UNLIKE_KIND, Calibration
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
-from tactflow.doctor.checks import STEADY
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
 from tactflow.streaming import stream
@@ -40,6 +39,9 @@ FEWEST_FOUND: Final = 0.5
 """Share of presses below which a pipeline does not find the contacts of a gel: no better than a coin."""
 NEAR: Final = 0.1
 """Difference of two scores up to which they count as equal: the standard error of a share of 25 frames."""
+STEADY: Final = 0.35
+"""95th percentile of the dots' displacement at rest, px, above which they are not tracked: the bound used to
+label the recordings of franka_mini."""
 TRIED: Final = ("default", "markerless", "tactip")
 """Shipped pipelines that are tried for every sensor. The others differ from one of them in geometry and
 calibration alone, except for `OF_ONE`."""
