@@ -72,7 +72,7 @@ def examine(observed: Observation) -> list[Finding]:
 
     >>> from tactflow.doctor import observe
     >>> sorted({finding.verdict for finding in examine(observe("sim:idle?frames=8", 1.0))})
-    ['good', 'unknown']
+    ['good']
     """
     return [run(observed) for run in CHECKS]
 
