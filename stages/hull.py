@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, Self
+from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
@@ -26,16 +26,10 @@ class Hull(Stage):
         min_area: float = Field(
             20.0, ge=0, description="smaller components are ignored, px^2; too large misses light contacts"
         )
-        merge: Literal["all", "largest", "near"] = Field(
+        merge: Literal["all", "largest"] = Field(
             "all",
-            description="all: all regions are one contact, but for improbable ones beside a more probable; "
-            "largest: the one with the most pixels; near: the same, where those up to max_gap apart are one. "
-            "The separate ones are reported as well",
-        )
-        max_gap: float | None = Field(
-            None,
-            ge=0,
-            description="components farther apart than this are not one contact, px; implies merge: near",
+            description="all: all regions are one contact, except improbable ones next to a more probable "
+            "one; largest: the region with the most pixels. The separate regions are reported as well",
         )
         min_confidence: float = Field(
             0.3,
@@ -44,14 +38,6 @@ class Hull(Stage):
             description="regions less elongated than this get no direction, 1: 0.3 is an axis ratio of 1.36, "
             "which 5 % of 200 real presses of a ball exceed, since light makes a mask lopsided",
         )
-
-        @model_validator(mode="after")
-        def _gap_of_near(self) -> Self:
-            if self.merge == "near" and self.max_gap is None:
-                raise ValueError("merge: near requires max_gap, px")
-            if self.merge == "largest" and self.max_gap is not None:
-                raise ValueError("max_gap is for merge: near, not for merge: largest")
-            return self
 
     params: Params
 
@@ -66,7 +52,6 @@ class Hull(Stage):
         parts = contact_parts(
             contact_mask,
             min_area=params.min_area,
-            max_gap=params.max_gap or 0.0,
             min_confidence=params.min_confidence,
             evidence=evidence or "light",
         )
@@ -77,7 +62,7 @@ class Hull(Stage):
         contact = parts[0]
         if len(parts) == 1:
             return contact
-        if params.merge == "all" and params.max_gap is None:
+        if params.merge == "all":
             probable, mask = without_doubtful(parts, contact_mask)
             contact = probable[0]
             whole = contact_geometry(mask, min_area=params.min_area, min_confidence=params.min_confidence)

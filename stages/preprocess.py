@@ -11,7 +11,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import Image
 from tactflow.system.spelling import joined
-from tactflow.vision.geometry import PixelMapping, Preprocessor, check_lens, find_homography
+from tactflow.vision.geometry import Lens, PixelMapping, Preprocessor, find_homography
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 Row = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -30,8 +30,12 @@ class Undistort(StageParams):
 
     @model_validator(mode="after")
     def _usable(self) -> Self:
-        check_lens(self.camera_matrix, self.distortion, self.fisheye)
+        self.lens()
         return self
+
+    def lens(self) -> Lens:
+        """The lens; raises ValueError if it is impossible."""
+        return Lens(self.camera_matrix, self.distortion, self.fisheye)
 
 
 class Homography(StageParams):
@@ -119,15 +123,13 @@ class Preprocess(Stage):
 
     def _build(self, width: int, height: int) -> Preprocessor:
         params = self.params
-        lens, plane = params.undistort, params.homography
+        plane = params.homography
         return Preprocessor(
             (width, height),
             rotate=params.rotate,
             downsample=params.downsample,
             method=params.method,
             crop=params.crop,
-            camera_matrix=lens.camera_matrix if lens else None,
-            distortion=lens.distortion if lens else None,
-            fisheye=lens.fisheye if lens else False,
+            lens=params.undistort.lens() if params.undistort else None,
             homography=(plane.source, plane.destination, plane.size) if plane else None,
         )

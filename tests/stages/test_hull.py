@@ -45,11 +45,7 @@ def two() -> NDArray[np.uint8]:
     return mask
 
 
-@pytest.mark.parametrize(
-    ("params", "right"),
-    [({}, 84), ({"merge": "largest"}, 59), ({"merge": "near", "max_gap": 5}, 59)],
-    ids=str,
-)
+@pytest.mark.parametrize(("params", "right"), [({}, 84), ({"merge": "largest"}, 59)], ids=str)
 def test_separate_contacts_are_told_whatever_the_contact_is(params: Any, right: int) -> None:
     contact = run(two(), **params)
     assert isinstance(contact, Contact)

@@ -36,8 +36,7 @@ WRONG: dict[str, list[dict[str, Any]]] = {
         *({"method": "magic"}, {"edge": 1}),
     ],
     "hull": [
-        *({"min_area": -1}, {"max_gap": -1}, {"min_aera": 3}),
-        *({"merge": "near"}, {"merge": "largest", "max_gap": 3}),
+        *({"min_area": -1}, {"merge": "near"}, {"min_aera": 3}),
     ],
     "tracker": [{"dot": 0.2}, {"polarity": "red"}, {"max_displacement": 0}],
     "flow_in_mask": [{"method": "median"}],

@@ -58,7 +58,7 @@ PICTURES: dict[str, Callable[[Array, Array], Any]] = {
 }
 MASKS: dict[str, Callable[[Array], Any]] = {
     "hull": contact_geometry,
-    "parts": lambda mask: contact_parts(mask, min_area=5, max_gap=2)[0],
+    "parts": lambda mask: contact_parts(mask, min_area=5)[0],
     "flow": lambda mask: flow_in_mask(MARKERS, mask),
     "inside": lambda mask: inside_mask(PLAIN.position, mask),
     "inpaint": lambda mask: remove_markers(PLAIN.touched, mask),

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.geometry.homography import find_homography, project
+from tactflow.vision.geometry.mapping import find_homography, project
 
 Points = NDArray[np.float64]
 

@@ -238,12 +238,11 @@ def test_turning_the_mask_turns_the_result(seed: int, quarters: int) -> None:
         elements=st.sampled_from([0, 0, 1, 255]),
     ),
     min_area=st.sampled_from([0.0, 1.0, 3.0]),
-    max_gap=st.sampled_from([0.0, 2.0, 5.0]),
 )
-def test_any_mask_gives_sound_numbers_or_none(mask: Mask, min_area: float, max_gap: float) -> None:
+def test_any_mask_gives_sound_numbers_or_none(mask: Mask, min_area: float) -> None:
     kept = mask.copy()
     contact = contact_geometry(mask, min_area=min_area)
-    parts = contact_parts(mask, min_area=min_area, max_gap=max_gap)
+    parts = contact_parts(mask, min_area=min_area)
     np.testing.assert_array_equal(mask, kept)
     assert (contact is None) == (not parts)
     for found in [] if contact is None else [contact, *parts]:
@@ -314,34 +313,6 @@ def test_a_hole_belongs_to_the_hull_and_to_the_blob_size_but_not_to_the_region()
     assert contact.area == 400
     assert contact.region_area == 340
     assert contact.center[0] > 29.5
-
-
-def test_blobs_belong_together_up_to_max_gap() -> None:
-    mask = blank()
-    mask[40:60, 10:30] = 255
-    mask[40:60, 40:50] = 255
-    mask[40:60, 70:78] = 255
-    assert described(mask).hull[:, 0].max() == 77
-    # Nearest pixels are 11 and 21 px apart; a gap is judged to within 1 px.
-    for max_gap, areas in (
-        (0, [400, 200, 160]),
-        (9, [400, 200, 160]),
-        (15, [600, 160]),
-        (22, [760]),
-        (1e9, [760]),
-    ):
-        assert [part.region_area for part in contact_parts(mask, max_gap=max_gap)] == areas
-    assert contact_parts(mask, max_gap=15)[0].hull[:, 0].max() == 49
-
-
-def test_the_group_with_most_pixels_is_the_contact_even_of_many_small_blobs() -> None:
-    mask = blank()
-    mask[5:20, 5:20] = 255
-    for k in range(8):
-        mask[60:68, 20 + 11 * k : 28 + 11 * k] = 255
-    contact = contact_parts(mask, max_gap=6)[0]
-    assert contact.region_area == 8 * 64
-    assert contact.angle == 0.0
 
 
 def test_a_large_frame_loses_no_precision() -> None:

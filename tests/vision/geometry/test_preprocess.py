@@ -20,12 +20,9 @@ WEDGE = (
 )
 # Perspective of the kind a tilted camera has, from 400 x 320 to 400 x 320.
 TILT = ([[40, 28], [364, 44], [24, 300], [380, 292]], [[0, 0], [399, 0], [0, 319], [399, 319]], (400, 320))
-CAMERA = [[440.0, 0.3, 202.0], [0.0, 444.0, 158.0], [0.0, 0.0, 1.0]]
-LENSES: dict[str, dict[str, Any]] = {
-    "no lens": {},
-    "polynomial": {"camera_matrix": CAMERA, "distortion": [-0.25, 0.06, 0.001, -0.002, 0.01]},
-    "fisheye": {"camera_matrix": CAMERA, "distortion": [0.05, 0.01, -0.002, 0.001], "fisheye": True},
-}
+CAMERA = [[440.0, 0.0, 202.0], [0.0, 444.0, 158.0], [0.0, 0.0, 1.0]]
+DISTORTION = {"polynomial": [-0.25, 0.06, 0.001, -0.002, 0.01], "fisheye": [0.05, 0.01, -0.002, 0.001]}
+LENSES = {"no lens": None, **{name: Lens(CAMERA, DISTORTION[name], name == "fisheye") for name in DISTORTION}}
 SHRINKS = [(1, "area"), (2, "area"), (4, "area"), (2, "pyramid"), (4, "pyramid")]
 CROP = (42, 26, 303, 263)
 # Each rotation with each way to shrink, every other one cropped: each pair of settings is there.
@@ -85,7 +82,7 @@ def test_a_rendered_dot_lands_where_the_mapping_says(
             method=method,  # type: ignore[arg-type]
             crop=crop,
             homography=homography,
-            **LENSES[lens],
+            lens=LENSES[lens],
         )
         result = preprocess(pictures[factor])
         mapping = preprocess.mapping
@@ -107,7 +104,7 @@ def test_there_and_back_is_the_same_place(homography: Any, lens: str) -> None:
             method=method,  # type: ignore[arg-type]
             crop=crop,
             homography=homography,
-            **LENSES[lens],
+            lens=LENSES[lens],
         ).mapping
         # Double precision leaves 1e-13; Newton's method stops below 1e-10 px.
         np.testing.assert_allclose(mapping.to_raw(mapping.to_processed(points)), points, atol=1e-9)
@@ -165,17 +162,14 @@ def test_nothing_beyond_the_horizon_is_shown() -> None:
 
 @pytest.mark.parametrize("name", ["polynomial", "fisheye"])
 def test_undistorting_agrees_with_opencv(name: str) -> None:
-    given = LENSES[name]
-    # OpenCV's fisheye functions treat skew in their own way; without it all agree.
-    camera = np.array(CAMERA)
-    camera[0, 1] = 0
-    lens = Lens(camera, np.array(given["distortion"]), name == "fisheye")
+    camera, distortion, lens = np.array(CAMERA), np.array(DISTORTION[name]), LENSES[name]
+    assert lens is not None
     points = np.random.default_rng(2).uniform([20, 20], [380, 300], (40, 2))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
     # OpenCV 4 has a name of its own for the function that takes a stopping rule.
     plain = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
-    undistort: Any = cv2.fisheye.undistortPoints if lens.fisheye else plain
-    expected = undistort(points[:, None], camera, lens.distortion, R=np.eye(3), P=camera, criteria=stop)
+    undistort: Any = cv2.fisheye.undistortPoints if name == "fisheye" else plain
+    expected = undistort(points[:, None], camera, distortion, R=np.eye(3), P=camera, criteria=stop)
     # Measured: 1e-9 px, OpenCV's own stopping rule.
     np.testing.assert_allclose(lens.undistort(points), expected[:, 0], atol=1e-6)
 
@@ -227,24 +221,14 @@ SQUARE = [[0, 0], [30, 0], [0, 30], [30, 30]]
         ({"downsample": 3}, "1, 2, 4"),
         ({"downsample": 0}, "1, 2, 4"),
         ({"downsample": 32}, "both sides"),
-        ({"method": "cubic"}, "'area' or 'pyramid'"),
         ({"crop": (30, 0, 20, 10)}, r"inside the 40 x 30 frame, got \(30, 0, 20, 10\)"),
         ({"crop": (-1, 0, 20, 10)}, "inside"),
         ({"crop": (0, 0, 0, 10)}, "inside"),
-        ({"crop": (0, 0, 10)}, "x, y, width, height"),
-        ({"camera_matrix": CAMERA}, "no distortion"),
-        ({"distortion": [0, 0, 0, 0]}, "no camera_matrix"),
-        ({"fisheye": True}, "with fisheye"),
-        ({"camera_matrix": CAMERA, "distortion": [0, 0, 0]}, "4 or 5 or 8 or 12 or 14 .*got 3"),
-        ({"camera_matrix": CAMERA, "distortion": [0] * 5, "fisheye": True}, "required 4 fisheye.*got 5"),
-        ({"camera_matrix": [[1, 2]], "distortion": [0] * 4}, "3 x 3"),
-        ({"camera_matrix": np.zeros((3, 3)), "distortion": [0] * 4}, "focal lengths > 0"),
-        ({"camera_matrix": CAMERA, "distortion": [np.nan, 0, 0, 0]}, "finite distortion"),
         ({"homography": (LINE, SQUARE, (30, 30))}, "no three lie on a line"),
         ({"homography": (SQUARE, LINE, (30, 30))}, "no three lie on a line"),
         ({"homography": (SQUARE, [[0, 0], [30, 0], [30, 30], [0, 30]], (30, 30))}, "same order"),
         ({"homography": (SQUARE[:3], SQUARE, (30, 30))}, "four finite source"),
-        ({"homography": (SQUARE, SQUARE, (0, 30))}, "homography size"),
+        ({"homography": (SQUARE, SQUARE, (0, 30))}, "at least 1 x 1 px, got 0 x 30"),
         ({"homography": (SQUARE, [[900, 0], [930, 0], [900, 30], [930, 30]], (30, 30))}, "none of it"),
     ],
 )
@@ -253,10 +237,20 @@ def test_impossible_geometry_is_refused_with_a_reason(kwargs: dict[str, Any], me
         Preprocessor((40, 30), **kwargs)
 
 
-@pytest.mark.parametrize("size", [(0, 5), (5, 0)])
-def test_an_empty_frame_is_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match="raw_size"):
-        Preprocessor(size)
+@pytest.mark.parametrize(
+    ("lens", "message"),
+    [
+        ((CAMERA, [0, 0, 0]), "4 or 5 or 8 or 12 or 14 .*got"),
+        ((CAMERA, [0] * 5, True), "required 4 finite .* fisheye model"),
+        ((CAMERA, [np.nan, 0, 0, 0]), "finite distortion"),
+        (([[1, 2]], [0] * 4), "3 x 3"),
+        ((np.zeros((3, 3)), [0] * 4), "focal lengths"),
+        (([[440.0, 0.3, 202.0], *CAMERA[1:]], [0] * 4), r"\[\[fx, 0, cx\]"),
+    ],
+)
+def test_an_impossible_lens_is_refused_with_a_reason(lens: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Lens(*lens)
 
 
 @pytest.mark.parametrize(

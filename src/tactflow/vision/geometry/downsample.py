@@ -13,41 +13,21 @@ from tactflow.vision.compiled import kernel
 Bytes = NDArray[np.uint8]
 
 
-def halved(
-    picture: Bytes,
-    block: tuple[slice, slice] | None = None,
-    *,
-    into: Bytes | None = None,
-    upside_down: bool = False,
-) -> Bytes:
+def halved(picture: Bytes, block: tuple[slice, slice] | None = None) -> Bytes:
     """Means over 2 x 2 pixels of a picture or of a block of it, rounded half up.
 
-    Parameters
-    ----------
-    picture : (H, W, 3) uint8.
-    block : rows and columns, slices with start and stop inside the picture; None takes all of it.
-    into : (h // 2, w // 2, 3) uint8, C-contiguous, to be written and returned.
-    upside_down : whether the first row of the block becomes the last one.
+    picture : (H, W, 3) uint8. block : rows and columns, slices with start and stop inside the picture; None
+    takes all of it. Returns (h // 2, w // 2, 3) uint8; an odd last row or column of the block is left out.
 
-    Returns
-    -------
-    (h // 2, w // 2, 3) uint8; an odd last row or column of the block is left out.
-
-    Examples
-    --------
     >>> picture = np.zeros((2, 4, 3), np.uint8)
     >>> picture[0, 0] = 8
     >>> halved(picture)[..., 0]
     array([[2, 0]], dtype=uint8)
     """
     rows, columns = block or (slice(0, picture.shape[0]), slice(0, picture.shape[1]))
-    if not picture.flags.c_contiguous:
-        picture = np.ascontiguousarray(picture[rows, columns])
-        rows, columns = slice(0, picture.shape[0]), slice(0, picture.shape[1])
-    height, width = (rows.stop - rows.start) // 2, (columns.stop - columns.start) // 2
-    half = np.empty((height, width, 3), np.uint8) if into is None else into
-    lines = half.reshape(height, 3 * width)
-    _halve(picture.reshape(len(picture), -1), rows.start, 3 * columns.start, upside_down, lines)
+    picture = np.ascontiguousarray(picture)
+    half = np.empty(((rows.stop - rows.start) // 2, (columns.stop - columns.start) // 2, 3), np.uint8)
+    _halve(picture.reshape(len(picture), -1), rows.start, 3 * columns.start, half.reshape(len(half), -1))
     return half
 
 
@@ -55,8 +35,8 @@ def cell_means(picture: NDArray[Any], side: int) -> NDArray[Any]:
     """Means over square cells; means of whole numbers are rounded.
 
     picture : (H, W) or (H, W, channels), uint8 or float32. side : of a cell, px, a power of two. Returns
-    (H // side, W // side, ...) of the picture's dtype; what fills no cell at the right and below is left out,
-    unless there is no whole one: then the one is of what there is.
+    (H // side, W // side, ...) of the picture's dtype. Rows and columns that fill no whole cell are left out;
+    a picture smaller than a cell is one cell.
 
     >>> cell_means(np.arange(10, dtype=np.float32).reshape(2, 5), 2)
     array([[3., 5.]], dtype=float32)
@@ -71,11 +51,11 @@ def cell_means(picture: NDArray[Any], side: int) -> NDArray[Any]:
     return np.asarray(cells)
 
 
-@kernel("void(Array(uint8, 2, 'C', readonly=True), int64, int64, boolean, uint8[:, ::1])")
-def _halve(picture: Bytes, top: int, left: int, upside_down: bool, half: Bytes) -> None:
+@kernel("void(Array(uint8, 2, 'C', readonly=True), int64, int64, uint8[:, ::1])")
+def _halve(picture: Bytes, top: int, left: int, half: Bytes) -> None:
     """Fill `half`, (h, 3 w), from `picture`, (H, 3 W), from row `top` and byte `left` on.
 
-    `cv2.resize` by `INTER_AREA` gives the same, in three times the time.
+    `cv2.resize` by `INTER_AREA` gives the same, in twice the time.
     """
     height, count = half.shape[0], 2 * half.shape[1] - 3
     sums, means = np.empty(count, np.uint16), np.empty(count + 3, np.uint8)
@@ -83,7 +63,7 @@ def _halve(picture: Bytes, top: int, left: int, upside_down: bool, half: Bytes) 
         # One line after the other, in the order of memory; each loop over all pixels, also those that are
         # then left out, for it becomes whole vectors.
         upper, lower = picture[top + 2 * y, left:], picture[top + 2 * y + 1, left:]
-        line = half[height - 1 - y if upside_down else y]
+        line = half[y]
         for i in range(count):
             sums[i] = np.uint16(upper[i]) + np.uint16(upper[i + 3])
         for i in range(count):

@@ -60,36 +60,24 @@ def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float
 
 
 def contact_parts(
-    mask: Mask,
-    *,
-    min_area: float = 1.0,
-    max_gap: float = 0.0,
-    min_confidence: float = 0.0,
-    evidence: Evidence = "light",
+    mask: Mask, *, min_area: float = 1.0, min_confidence: float = 0.0, evidence: Evidence = "light"
 ) -> list[Contact]:
     """Describe each separate contact region of a mask, the one with the most pixels first.
 
-    Parameters
-    ----------
-    max_gap : px; components whose nearest pixels are at most this far apart (to within 1 px and 2 %) belong
-        together, also by way of others.
-    evidence : what shows the contacts.
+    evidence : what shows the contacts. The other parameters and errors are those of `contact_geometry`,
+    which describes all regions as one contact.
 
-    The other parameters and what is raised are those of `contact_geometry`, which describes all as one.
-
-    Examples
-    --------
     >>> mask = np.zeros((60, 80), np.uint8)
     >>> mask[20:30, 10:50] = mask[50:55, 10:20] = 255
     >>> [contact.region_area for contact in contact_parts(mask)]
     [400.0, 50.0]
     """
-    if not max_gap >= 0:
-        raise ValueError(f"required max_gap >= 0 px, got {max_gap}")
     region, contours = _large_regions(mask, min_area, min_confidence)
-    groups = sorted(_groups(contours, max_gap), key=_pixels, reverse=True)
-    regions = [region] if len(groups) == 1 else [_only(mask, group) for group in groups]
-    return [_describe(*part, min_confidence, evidence) for part in zip(regions, groups, strict=True)]
+    parts = []
+    for contour in sorted(contours, key=_filled_area, reverse=True):
+        part = region if len(contours) == 1 else _only(mask, [contour])
+        parts.append(_describe(part, [contour], min_confidence, evidence))
+    return parts
 
 
 def _large_regions(mask: Mask, min_area: float, min_confidence: float) -> tuple[Region, Contours]:
@@ -147,28 +135,3 @@ def _hull(contours: Contours) -> tuple[Points, float]:
 def _filled_area(contour: NDArray[Any]) -> float:
     """Pixels of a component from its outline of pixel centres, holes filled (Pick's theorem)."""
     return cv2.contourArea(contour) + len(contour) / 2 + 1 if len(contour) > 1 else 1.0
-
-
-def _pixels(contours: Contours) -> float:
-    """Pixels of some components, holes filled."""
-    return sum(map(_filled_area, contours))
-
-
-def _groups(contours: Contours, max_gap: float) -> list[Contours]:
-    """The contours in groups that are linked by gaps of at most max_gap px."""
-    if max_gap == 0 or len(contours) < 2:
-        return [[contour] for contour in contours]
-    left, top, width, height = cv2.boundingRect(np.concatenate(contours))
-    reach = min(max_gap, float(height + width))
-    border = math.ceil(reach / 2) + 1
-    left, top = left - border, top - border
-    free = np.full((height + 2 * border, width + 2 * border), 255, np.uint8)
-    cv2.drawContours(free, contours, -1, 0, cv2.FILLED, offset=(-left, -top))
-    # Two components grown by half the gap each touch where the gap was bridged.
-    distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
-    _, labels = cv2.connectedComponents((distance <= reach / 2).astype(np.uint8))
-    groups: dict[int, list[NDArray[Any]]] = {}
-    for contour in contours:
-        x, y = contour[0, 0]
-        groups.setdefault(int(labels[y - top, x - left]), []).append(contour)
-    return list(groups.values())
