@@ -1,13 +1,13 @@
 """The printed markers of a gel: detection, mask, removal and tracking.
 
-Find: once for each reference, `spots` are looked for at every size, and `selection` tells which of them are
-marks by the `lattice` that they form and by how much they look like each other; `detection` puts it together.
+Detection, once per reference: `spots` finds spots of every size, and `selection` chooses the marks among them
+by the `lattice` that they form and their likeness to each other; `detection` combines both.
 
-Match and refine: in each frame, `tracking` aligns each mark with its `template`, from where it was last.
-Where one is missing or does not move like its neighbours, `matching` grows the smooth part of the field over
-the spots of the frame, and places the marks that are not seen. `motion` tells which do not move with the gel.
+Tracking, in each frame: `tracking` aligns each mark with its `template`, from its last position. If one is
+missing or does not move like its neighbours, `matching` grows the smooth part of the field over the spots of
+the frame, and interpolates invisible marks. `motion` rejects marks that do not move with the gel.
 
-`mask` tells where markers cover the gel, and `inpaint` fills these places.
+`mask` marks the pixels that markers cover, and `inpaint` fills them.
 """
 
 from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers

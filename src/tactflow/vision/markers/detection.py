@@ -28,37 +28,37 @@ from tactflow.vision.markers.spots import ONE_SIZE, Spots, find_spots, sigmas
 Polarity = Literal["auto", "dark", "bright"]
 
 LEAST_SCORE: Final = 2.5
-"""Score of the weakest candidate that is believed to be marks (see `selection.candidates`). Real gels with
-marks score 4 and more; dust, reflections and noise on gels without at most 0.4, what compression leaves along
-edges up to 3, in 36 of 38 such pictures of wedge_grasp up to 2.4 (measured). Marks 3.5 px apart need as
+"""Minimum score of a candidate to be accepted as marks (see `selection.candidates`). Real gels with marks
+score 4 and more; dust, reflections and noise on gels without marks at most 0.4, compression artefacts along
+edges up to 3, in 36 of 38 such pictures of wedge_grasp up to 2.4 (measured). Marks 3.5 px apart score as
 little."""
 
 MOST_BETWEEN: Final = 0.01
-"""Level half-way between two neighbouring marks, on the way from the gel's (0) to that of the marks (1), at
-most, in the better one of two directions: dashes may touch in the other one. The gel is looked at on the
-diagonal, 0.7 of the way to the middle of a cell, where another lattice may have its marks. Two waves that
-cross, as in a weave, have 0.37 if they are alike, 0.16 if one is twice as strong. Marks of 18 sensors, and
-of 164 simulated ones, have at most 0.00 (measured)."""
+"""Maximum level half-way between two neighbouring marks, on a scale from the gel's level (0) to that of the
+marks (1), in the better of two directions: dashes may touch in the other one. The gel is sampled on the
+diagonal, 0.7 of the way to the middle of a cell, where another lattice may have its marks. Two crossing
+waves, as in a weave, have 0.37 if they are alike, 0.16 if one is twice as strong. Marks of 18 sensors, and of
+164 simulated ones, have at most 0.00 (measured)."""
 
 CLOSE: Final = 0.8
-"""Score of the best group of the other polarity over that of the best, from which on there are no marks: a
-texture looks the same when dark and bright are swapped, marks and the gel between them do not. Marks of 18
-sensors have at most 0.67, dashes that touch 0.78, three of twelve simulated cloths that are refused for
-nothing else 0.86 and more (measured). So have marks that cover 0.4 of the gel."""
+"""Ratio of the scores of the best candidates of the two polarities above which there are no marks: a texture
+looks the same with dark and bright swapped, marks on a gel do not. Marks of 18 sensors have at most 0.67,
+dashes that touch 0.78; three of twelve simulated cloths that no other test rejects have 0.86 and more
+(measured), as have marks that cover 0.4 of the gel."""
 
 CROWDED: Final = 0.32
-"""Radius of a mark over the distance of the nearest other, at most: so its surroundings hold no other. With
-0.37, 0.2 % of the marks of seven recordings are lost (measured)."""
+"""Maximum radius of a mark over the distance of its nearest neighbour, so that its surroundings hold no other
+mark. With 0.37, 0.2 % of the marks of seven recordings are lost (measured)."""
 
 CENTROID_WINDOW: Final = 1.6
-"""Radius of the window of a centroid, in radii of the mark. Chosen by hand: it holds the mark's border."""
+"""Radius of the window of a centroid, in radii of the mark. Chosen by hand: it includes the mark's border."""
 
 SURROUNDINGS: Final = (1.4, 1.9)
-"""Inner and outer radius of the ring that gives the level around a mark, in radii of the mark; the outer one
-is 1.5 px wider. Chosen by hand."""
+"""Inner and outer radius of the ring for the background of a mark, in radii of the mark; the outer one is 1.5
+px wider. Chosen by hand."""
 
 LONE_PITCH: Final = 8.0
-"""Pitch of a single mark, in radii. Chosen by hand."""
+"""Pitch assumed for a single mark, in radii. Chosen by hand."""
 
 _NO_MARKERS: Final = (
     "0 markers found: is the sensor marker-less? then use the pipeline markerless, or one that is made for "
@@ -68,7 +68,7 @@ _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels
 
 
 class NoMarkersError(ValueError):
-    """The image shows no marks that could be tracked. best : the spots that came closest, or None."""
+    """The image shows no trackable marks. best : the best candidate, or None."""
 
     def __init__(self, message: str, best: Candidate | None = None) -> None:
         super().__init__(message)
@@ -79,14 +79,13 @@ class NoMarkersError(ValueError):
 class Detection:
     """The marks of an image.
 
-    centers : (N, 2) float64, px. dot_radius : of a disc that answers like most marks, px.
+    centers : (N, 2) float64, px. dot_radius : of a disc with the response of most marks, px.
     polarity : whether the marks are darker or brighter than the gel.
     pitch : median distance of a mark to its nearest neighbour, px; with one mark, eight radii.
     edges : (E, 2) int64, pairs of neighbouring marks, each pair once, smaller index first.
-    radii : (N,) float64, of each mark, px; None where all are of one size.
-    chosen : the spots that the marks grew from. rival : the next best spots elsewhere, if there
-    are any.
-    evidence : (N, 3) float64, what the probability of each mark rests on (see `selection.evidence`).
+    radii : (N,) float64, of each mark, px; None if all have the same size.
+    chosen : the candidate that the marks were grown from. rival : the next best one elsewhere, or None.
+    evidence : (N, 3) float64, features behind the probability of each mark (see `selection.evidence`).
     """
 
     centers: Floats
@@ -101,12 +100,13 @@ class Detection:
 
     @property
     def probability(self) -> Floats | None:
-        """(N,) float64, of each mark to be one, 0 to 1; NaN for one alone. None without evidence."""
+        """(N,) float64, probability that each mark is one, 0 to 1; NaN for a single mark. None without
+        evidence."""
         return None if self.evidence is None else probability(self.evidence)
 
 
 def require_image(image: NDArray[np.uint8]) -> None:
-    """Raises ValueError for anything but (H, W, 3) or (H, W) uint8, not empty."""
+    """Raise ValueError unless the image is a non-empty (H, W, 3) or (H, W) uint8."""
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise ValueError(
             f"required image to be (H, W, 3) or (H, W) uint8, got shape {image.shape}, dtype {image.dtype}"
@@ -135,31 +135,32 @@ def detect_markers(
     valid: NDArray[np.uint8] | None = None,
     least_probability: float = 0.5,
 ) -> Detection:
-    """Find the marks of a gel: of one size or many, of any shape, in one lattice or several.
+    """Detect the marks of a gel: of one size or many, of any shape, in one lattice or several.
 
     Differences of Gaussians over a range of scales give spots of every size. Those of one scale with the most
-    contrast in the best lattice are marks; a random texture forms none. Spots of other scales join where the
-    lattice wants a mark. Weak spots, ones between the others and ones cut by the border are left out.
+    contrast in the best lattice are marks; a random texture forms no lattice. Spots of other scales are added
+    where the lattice predicts a mark. Weak spots, spots between others and spots cut by the border are
+    rejected.
 
     Parameters
     ----------
     image : (H, W, 3) uint8 BGR or (H, W) uint8, grey levels.
-    dot_radius : of a (whole) mark, px, 1 to a quarter of the shorter side; None finds it, but then wants at
-        least four marks in an even arrangement, lest dust passes for them.
+    dot_radius : of a (whole) mark, px, 1 to a quarter of the shorter side; None estimates it, but requires at
+        least four marks in a regular arrangement, so that dust is not mistaken for marks.
     polarity : "dark" or "bright" against the gel; "auto" takes the better lattice.
-    valid : (H, W) uint8, not 0 where there is gel; no mark is looked for where most of what lies around is
-        none. None: everywhere.
-    least_probability : of a mark, 0 to 1; only where `dot_radius` is None.
+    valid : (H, W) uint8, non-zero where there is gel; marks are only searched where most of the surroundings
+        are gel. None: everywhere.
+    least_probability : minimum probability of a mark, 0 to 1; only if `dot_radius` is None.
 
     Returns
     -------
-    Detection : centres ordered by rows, top to bottom, left to right. The search in float32 decides which
-        they are; the centres are float64, and those of a search in float64 would be the same to 1e-3 px.
+    Detection : centres ordered by rows, top to bottom, left to right. The search runs in float32, the
+        centres are refined in float64; a search in float64 would give the same to 1e-3 px.
 
     Raises
     ------
     NoMarkersError : nothing looks like marks.
-    ValueError : the image or a parameter is not of that kind.
+    ValueError : the image or a parameter is invalid.
 
     References
     ----------
@@ -193,14 +194,14 @@ def _in_lattice(
 ) -> Detection:
     """The marks of the best candidate; raises NoMarkersError if they look like something else.
 
-    by_scale : the spots of its polarity, for each scale, px. least : probability of a mark.
+    by_scale : the spots of its polarity for each scale, px. least : minimum probability of a mark.
     """
     best = found[0]
     _require_lattice(found)
     _require_gel_between(gray, best, best.spots)
     marks = marks_of(gray, best, by_scale)
     _require_gel_between(gray, best, marks)
-    # One alone has no probability.
+    # A single mark has no probability.
     marks = marks.at(~(probability(evidence(gray, marks)) < least))
     if not len(marks.points):
         raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, best)
@@ -221,7 +222,7 @@ def _levels(gray: NDArray[np.float32], points: Floats) -> NDArray[np.float32]:
 
 
 def _require_lattice(found: list[Candidate]) -> None:
-    """Raises NoMarkersError for spots, best first, that are too few, too faint, or in no lattice."""
+    """Raise NoMarkersError if the best candidate has too few or too faint spots, or forms no lattice."""
     if found[0].score >= LEAST_SCORE:
         return
     best = max(found, key=lambda other: float(other.spots.strength.sum()))
@@ -235,7 +236,7 @@ def _require_lattice(found: list[Candidate]) -> None:
 
 
 def _require_gel_between(gray: NDArray[np.float32], best: Candidate, spots: Spots) -> None:
-    """Raises NoMarkersError for marks between which there is no even gel, as in a weave."""
+    """Raise NoMarkersError if the marks run into each other, without even gel between them, as in a weave."""
     points, radius = spots.points, best.radius
     around = corners(points, links(points))
     if not len(around.points):
@@ -257,7 +258,7 @@ def _require_gel_between(gray: NDArray[np.float32], best: Candidate, spots: Spot
 def _detection(
     gray: NDArray[np.float32], best: Candidate, marks: Spots, others: list[Candidate]
 ) -> Detection:
-    """The marks in reading order, and what else they might be."""
+    """The marks in reading order, with the best rival candidate."""
     radius = best.radius
     ratio = np.maximum(marks.radius / radius, radius / marks.radius)
     radii = np.where(ratio < ONE_SIZE, radius, marks.radius)
@@ -274,12 +275,13 @@ def _detection(
 
 
 def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Floats:
-    """Centroids (N, 2) of what is darker than its surroundings, in windows that follow them, px.
+    """Centroids (N, 2) of dark marks in windows that follow them, px.
 
-    The surroundings are a plane fitted to a ring around the mark, so a slope of the light does not pull.
+    The background is a plane fitted to a ring around the mark, so a gradient of the light does not bias them.
 
-    gray : (H, W) float32, grey levels; marks are dark. centers : (N, 2) float64, starting points, px, right
-    to about a radius; they stay where there is nothing dark. radii : (N,) float64, of the marks, px.
+    gray : (H, W) float32, grey levels; marks are dark. centers : (N, 2) float64, starting points, px, within
+    about a radius; they stay where nothing is darker than the background. radii : (N,) float64, of the marks,
+    px.
     """
     radius = radii[:, None]
     inner, outer = SURROUNDINGS[0] * radius, SURROUNDINGS[1] * radius + 1.5
@@ -314,14 +316,14 @@ def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Flo
 
 
 def _same(other: Candidate, centers: Floats, radii: Floats) -> bool:
-    """Whether most of another candidate are the marks again, at another scale, or their highlights."""
+    """Whether most spots of another candidate are the same marks at another scale, or their highlights."""
     return bool(np.any(cdist(other.centers, centers) < radii, axis=1).mean() > 0.5)
 
 
 def _require_options(
     dot_radius: float | None, polarity: str, valid: NDArray[np.uint8] | None, shape: tuple[int, ...]
 ) -> None:
-    """Raises ValueError for options of `detect_markers` that are not of their kind."""
+    """Raise ValueError for invalid options of `detect_markers`."""
     largest = max(1.0, min(shape) / 4)
     if dot_radius is not None and not 1.0 <= dot_radius <= largest:
         raise ValueError(f"required dot_radius 1 to {largest:g} px, got {dot_radius:g}")

@@ -1,4 +1,4 @@
-"""Removal of markers: fill masked pixels from their surroundings."""
+"""Inpainting of markers: fill masked pixels from their surroundings."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 _METHODS: Final = get_args(InpaintMethod)
 
 RADIUS: Final = 7.0
-"""Neighbourhood from which a marker is filled unless said otherwise, px: that of the original script."""
+"""Default neighbourhood from which a marker is filled, px: that of the original script."""
 
 CELL: Final = 4
-"""Side of the blocks on which means are formed, px; the kernels spell it out."""
+"""Side of the cells over which means are formed, px; hard-coded in the kernels."""
 
 FAR_WEIGHT: Final = 0.01
-"""Weight of the wide window against the 3 x 3 cells around: those decide wherever any of them is valid.
+"""Weight of the wide window relative to the 3 x 3 cells around, which decide wherever one of them is valid.
 Chosen by hand."""
 
 FRAME_WEIGHT: Final = np.float32(1e-6)
-"""Weight of the mean of the whole frame: it decides where a window has no valid pixel. Chosen by hand."""
+"""Weight of the mean of the whole frame, which decides where a window has no valid pixel. Chosen by hand."""
 
 LEAST_WEIGHT: Final = 1e-3
 """Weight, of at most 255, below which a window has no valid pixel: one px in 10 000 gives more (derived)."""
 
 MOST_REACH: Final = 31
-"""Cells of the wide window on either side, at most: so its columns' sums fit in 16 bits. Derived: 63 cells of
-at most 4 * 255 are below 2**16."""
+"""Maximum half-width of the wide window, cells, so that sums of its columns fit in 16 bits. Derived: 63 cells
+of at most 4 * 255 are below 2**16."""
 
 LANES: Final = 32
-"""A line's sections are padded to multiples of so many cells: whole vectors. What is left of one is computed
-value by value, slowly."""
+"""The sections of a line are padded to multiples of this number of cells, whole vector registers; remainders
+would be computed value by value."""
 
 
 def remove_markers(
@@ -60,8 +60,10 @@ def remove_markers(
     method : `normalized` takes a smooth average of the valid pixels around, in about 0.1 ms; `telea` marches
         inwards from the border of the mask, 10 ms and more; `ns` continues lines of equal brightness, as
         slow; `none` returns a copy of the image.
-    radius : neighbourhood, px, > 0. For `normalized` about the radius of a dot: a larger one is smoother, a
-        much smaller one leaves the middle of a dot to its far surroundings; beyond 120 px it changes nothing.
+    radius : neighbourhood, px, > 0. For `normalized` about the radius of a dot: a larger one is smoother,
+    with
+        a much smaller one the middle of a dot is filled from far away; beyond 120 px it has no further
+        effect.
 
     Returns
     -------
@@ -69,7 +71,7 @@ def remove_markers(
 
     Raises
     ------
-    ValueError : image and mask do not fit together, there is no such method, or the radius is not positive.
+    ValueError : image and mask differ in size, the method is unknown, or the radius is not positive.
 
     References
     ----------
@@ -98,7 +100,7 @@ def remove_markers(
 
 
 def _check(image: Bytes, mask: Bytes, method: str, radius: float) -> None:
-    """Raise what `remove_markers` raises."""
+    """Validate the arguments of `remove_markers`."""
     check_color_image(image)
     if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
         raise ValueError(
@@ -113,7 +115,7 @@ def _check(image: Bytes, mask: Bytes, method: str, radius: float) -> None:
 def _normalized(image: Bytes, mask: Bytes, radius: float) -> Bytes:
     """Normalized convolution on means over cells: the sum of the valid ones over their weight.
 
-    Computed in float32; gives what float64 would, to 1 grey level.
+    Computed in float32, within 1 grey level of the result in float64.
     """
     height, width = mask.shape
     bottom, right = -height % CELL, -width % CELL
@@ -127,9 +129,9 @@ def _normalized(image: Bytes, mask: Bytes, radius: float) -> Bytes:
 
 
 def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
-    """`_normalized` for a picture of whole cells, which is written over and returned.
+    """`_normalized` for a picture of whole cells, which is overwritten and returned.
 
-    The kernels compute with sums where the definition has means, so their weights are up to 64 * 255.
+    The kernels use sums instead of means, so weights are up to 64 * 255.
     """
     reach = min(math.ceil(radius / CELL + 1), MOST_REACH)
     height, width = mask.shape[0] // CELL, mask.shape[1] // CELL
@@ -151,17 +153,17 @@ def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
 
 @lru_cache(maxsize=32)
 def _reflected(count: int, margin: int) -> Indices:
-    """Which of `count` cells is seen at each place of a line, and at `margin` places before and after it."""
+    """Indices of the cells of a line, extended by reflection by `margin` cells on either side."""
     return np.pad(np.arange(count), margin, mode="reflect")
 
 
-# A line of cells has four sections one after another, the sums of the three channels and the weight. Each has
-# a margin of `reach` cells before its own and as many or more after them. So one loop serves all of them, and
-# what it computes across two sections lies in their margins. A loop writes to an array of its own, not to
-# another line of one that it reads: only so does the compiler turn it into whole vectors.
+# A line of cells has four consecutive sections: the sums of the three channels, and the weight. Each has a
+# margin of at least `reach` cells on either side, so that one loop can run over all sections: results across
+# two of them fall into the margins. Loops never write to the array that they read, so that the compiler can
+# vectorise them.
 
 _READ: Final = "Array(uint8, 2, 'C', readonly=True)"
-"""numba's type of a picture that a caller may have locked."""
+"""numba's type of a picture that may be read-only."""
 
 
 @kernel(f"void({_READ}, uint8[:, ::1], int64[::1], uint16[:, ::1], boolean[::1])")
@@ -169,7 +171,7 @@ def sum_valid(mask: Bytes, half: Bytes, columns: Indices, cells: Sums, masked: F
     """Sums over the valid ones of each cell's 2 x 2 values at half resolution, and 255 for each as weight.
 
     A value is valid where none of its 2 x 2 px is masked. mask : (4 h, 4 w). half : (2 h, 6 w), the picture.
-    columns : (w + 2 reach,), the place in a section of which each place shows the cell. cells :
+    columns : (w + 2 reach,), for each place in a section, the place whose cell it repeats. cells :
     (h, 4 sections) and masked : (h,), whether a line has a masked px, are filled.
     """
     width, wide, section = mask.shape[1] // 4, half.shape[1], cells.shape[1] // 4
@@ -187,7 +189,7 @@ def sum_valid(mask: Bytes, half: Bytes, columns: Indices, cells: Sums, masked: F
         any_bits = np.uint8(0)
         for x in range(either.size):
             any_bits = np.uint8(any_bits | either[x])
-        # Most often what is valid is that of the line before: all.
+        # Usually all pixels are valid, as in the previous line.
         if any_bits or y == 0 or masked[y - 1]:
             for x in range(4 * width):
                 kept = np.uint8(0) if either[2 * x] | either[2 * x + 1] else np.uint8(255)
@@ -225,10 +227,10 @@ def sum_windows(
 ) -> bool:
     """Binomial windows of 3 x 3 cells plus `far` times windows of 2 reach + 1 cells each way.
 
-    cells : (h, 4 sections) and masked : (h,), of `sum_valid`. rows : (h + 2 reach + 2,), which line is seen
-    at each, from -reach - 1 on. windows : (h, 4 sections) is filled in masked lines and those beside them;
-    each section starts with its first cell, and what follows its `width` cells means nothing. Returns whether
-    a weight is below `least`.
+    cells : (h, 4 sections) and masked : (h,), from `sum_valid`. rows : (h + 2 reach + 2,), indices of lines
+    from -reach - 1 on, reflected at the borders. windows : (h, 4 sections) is filled in masked lines and
+    those beside them; each section starts with its first cell, and only its first `width` cells are defined.
+    Returns whether a weight is below `least`.
     """
     height, long = windows.shape
     last = height - 1
@@ -247,7 +249,7 @@ def sum_windows(
         if not (masked[max(y - 1, 0)] or masked[y] or masked[min(y + 1, last)]):
             continue
         out = windows[y]
-        # Sums of whole numbers below 2**24 are exact, in whatever order.
+        # Sums of integers below 2**24 are exact in any order.
         for x in range(long):
             out[x] = np.float32(tall[x])
         for step in range(1, 2 * reach, 2):
@@ -267,9 +269,9 @@ def sum_windows(
 
 @kernel(f"void({_READ}, boolean[::1], float32[:, ::1], uint8[:, ::1])")
 def fill_masked(mask: Bytes, masked: Flags, windows: Floats32, picture: Bytes) -> None:
-    """Masked px become the sums over their weight, interpolated between the centres of cells.
+    """Set masked px to the sums over their weight, interpolated between the centres of cells.
 
-    mask : (4 h, 4 w). masked : (h,) and windows : (h, 4 sections), of `sum_windows`; these become the
+    mask : (4 h, 4 w). masked : (h,) and windows : (h, 4 sections), from `sum_windows`, overwritten by the
     quotients. picture : (4 h, 12 w).
     """
     height, width, section = windows.shape[0], mask.shape[1] // 4, windows.shape[1] // 4
@@ -295,7 +297,7 @@ def fill_masked(mask: Bytes, masked: Flags, windows: Floats32, picture: Bytes) -
         here, beyond = windows[cell], windows[max(cell - 1, 0) if y % 2 == 0 else min(cell + 1, last)]
         for x in range(3 * section):
             inner[x] = most * here[x] + rest * beyond[x]
-        # Beyond its ends a section goes on as it ends; there is room in the margins.
+        # Replicate the ends of each section into its margins.
         for start in range(0, 3 * section, section):
             line[start] = inner[start]
             inner[start + width] = inner[start + width - 1]
@@ -318,6 +320,6 @@ def fill_masked(mask: Bytes, masked: Flags, windows: Floats32, picture: Bytes) -
                 chosen[3 * x] = bits
                 chosen[3 * x + 1] = bits
                 chosen[3 * x + 2] = bits
-            # Bits instead of a choice: so it takes a tenth of the time.
+            # Selecting by bits takes a tenth of the time of a branch.
             for x in range(12 * width):
                 values[x] ^= (values[x] ^ colours[x]) & chosen[x]

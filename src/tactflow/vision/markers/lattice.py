@@ -1,4 +1,4 @@
-"""The lattice of the marks: which are neighbours, and whether neighbours repeat in parallelograms."""
+"""The lattice of the marks: which are neighbours, and whether they form parallelograms."""
 
 from __future__ import annotations
 
@@ -12,32 +12,33 @@ from scipy.spatial import KDTree
 from tactflow.vision.arrays import Floats, Indices
 
 BLOCKING: Final = 1.1
-"""Sum of squares, over the squared distance of two marks, below which a third one between them blocks their
-link. A right angle has 1; a tenth more keeps a skewed square free of diagonals. Chosen by hand."""
+"""Sum of the squared distances of a third mark to two others, over the squared distance of these, below which
+it blocks their link. At a right angle it is 1; a tenth more keeps a skewed square free of diagonals. Chosen
+by hand."""
 
 LONGEST_LINK: Final = 2.3
-"""Distance of neighbours at most, pitches: marks on the other side of one that is missing. Without such a
-bound on the second nearest, two more of twelve simulated cloths show marks (measured)."""
+"""Maximum distance of neighbours, pitches: that of the two marks on either side of a missing one. Without
+this bound on the second nearest, two more of twelve simulated cloths show marks (measured)."""
 
 CLOSED: Final = 0.25
-"""Distance of a mark from the fourth corner of a parallelogram at most, in mean sides. Chosen by hand."""
+"""Maximum distance of a mark from the fourth corner of a parallelogram, in mean sides. Chosen by hand."""
 
 FLAT: Final = 0.8
-"""Cosine of the angle between two sides from which on they span no parallelogram. With 0.71, marks of a grid
-in perspective are lost (sts_torque160)."""
+"""Cosine of the angle between two sides above which they span no parallelogram. With 0.71, marks of a grid in
+perspective are lost (sts_torque160)."""
 
 BESIDE: Final = 4
-"""Marks next to one on a square grid: those that it is compared with."""
+"""Number of neighbours that a mark is compared with: those of a square grid."""
 
 PRIOR_TESTS: Final = 4.0
-"""Parallelograms, none of them closed, that are added to those of a picture: so few marks need more evidence.
-Without, three more of 121 pictures without dots show a lattice."""
+"""Pseudo-count of open parallelograms, so that a lattice of few marks needs more evidence. Without it, three
+more of 121 pictures without dots show a lattice."""
 
 
 class Corners(NamedTuple):
-    """Fourth corners of the parallelograms that two neighbours of one mark span.
+    """Fourth corners of the parallelograms spanned by two neighbours of a mark.
 
-    points : (M, 2) float64, px. reach : (M,) float64, how far from there a mark still closes it, px.
+    points : (M, 2) float64, px. reach : (M,) float64, maximum distance of a mark that closes it, px.
     first, middle, last : (M,) int64, the marks that span it.
     """
 
@@ -49,17 +50,17 @@ class Corners(NamedTuple):
 
 
 def neighbour_graph(centers: Floats, longest: float) -> Indices:
-    """Which marks are neighbours: a beta-skeleton, free of diagonals on square grids.
+    """The graph of neighbouring marks: a beta-skeleton, free of diagonals on square grids.
 
-    Two marks are neighbours unless a third lies (nearly) inside the circle whose diameter they are.
+    Two marks are neighbours unless a third one lies (nearly) inside the circle that has them as its diameter.
 
     Parameters
     ----------
-    centers : (N, 2) float64, px. longest : neighbours are no farther apart than this, px.
+    centers : (N, 2) float64, px. longest : maximum distance of neighbours, px.
 
     Returns
     -------
-    edges : (E, 2) int64, each pair once, smaller index first, sorted. Marks in one place are no neighbours.
+    edges : (E, 2) int64, each pair once, smaller index first, sorted. Coinciding marks are not linked.
 
     References
     ----------
@@ -78,8 +79,8 @@ def neighbour_graph(centers: Floats, longest: float) -> Indices:
     pairs = tree.query_pairs(longest, output_type="ndarray")
     one, other = centers[pairs[:, 0]], centers[pairs[:, 1]]
     length = np.hypot(*(one - other).T)
-    # By Apollonius, the squares are small enough for a third mark that is as near to the middle as this. The
-    # two marks themselves are.
+    # By Apollonius' theorem, a third mark blocks the link if it is this near to the midpoint, as the two
+    # marks themselves are.
     reach = length * np.sqrt((BLOCKING - 0.5) / 2)
     near = np.asarray(tree.query_ball_point((one + other) / 2, reach, return_length=True))
     edges = pairs[(near == 2) & (length > 0)]
@@ -91,7 +92,7 @@ def nearest(points: Floats, count: int) -> tuple[Floats, Indices]:
     count = min(count, len(points) - 1)
     if count < 1:
         return np.zeros((len(points), 0)), np.zeros((len(points), 0), np.int64)
-    # The nearest is the point itself.
+    # The nearest one is the point itself.
     distances, near = KDTree(points).query(points, np.arange(2, count + 2))
     return np.asarray(distances, np.float64), np.asarray(near, np.int64)
 
@@ -102,7 +103,7 @@ def pitch_of(points: Floats) -> float:
 
 
 def corners(centers: Floats, edges: Indices) -> Corners:
-    """Where parallelograms of neighbours (E, 2) would have their fourth corners.
+    """Predict the fourth corners of the parallelograms of neighbours (E, 2).
 
     >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
     >>> corners(square, np.array([[0, 1], [0, 2]])).points.tolist()
@@ -111,7 +112,7 @@ def corners(centers: Floats, edges: Indices) -> Corners:
     both = np.concatenate([edges, edges[:, ::-1]])
     both = both[np.lexsort((both[:, 1], both[:, 0]))]
     middle, first, last = ([np.zeros(0, np.int64)] for _ in range(3))
-    # The second link of a pair is 1, 2, ... places after the first, as long as both start at one mark.
+    # Pair each link with the one 1, 2, ... places after it, as long as both start at the same mark.
     for step in range(1, np.bincount(both[:, 0]).max(initial=1)):
         same = np.flatnonzero(both[:-step, 0] == both[step:, 0])
         middle.append(both[same, 0])
@@ -126,10 +127,10 @@ def corners(centers: Floats, edges: Indices) -> Corners:
 
 
 def closed_share(centers: Floats, edges: Indices) -> float:
-    """How much of a lattice the marks form: the share of parallelograms of neighbours that a mark closes.
+    """Regularity of a lattice: the share of parallelograms of neighbours that a mark closes.
 
-    Real grids, also painted ones, curved ones and ones in perspective, have 0.8 and more; marks that are
-    scattered at random 0.1, and 0.3 where they keep a distance from each other (measured).
+    Real grids, including hand-painted, curved and tilted ones, have 0.8 and more; marks scattered at random
+    have 0.1, or 0.3 if they keep a distance from each other (measured).
 
     centers : (N, 2) float64, px. edges : (E, 2) int64, neighbours.
 
@@ -144,8 +145,8 @@ def closed_share(centers: Floats, edges: Indices) -> float:
 
 
 def own_shares(centers: Floats, edges: Indices) -> tuple[Floats, Indices]:
-    """For each mark the share of closed ones among the parallelograms that it is part of, and how many marks
-    hang together with it by closed parallelograms: two (N,) arrays; 0 and 1 for a mark that is in none."""
+    """For each mark, the share of closed ones among its parallelograms, and the number of marks connected to
+    it by closed parallelograms: two (N,) arrays; 0 and 1 for a mark without any."""
     count, expected = len(centers), corners(centers, edges)
     closing = _closing(centers, expected)
     closed = closing >= 0
@@ -161,14 +162,14 @@ def own_shares(centers: Floats, edges: Indices) -> tuple[Floats, Indices]:
 
 
 def components(groups: Indices, count: int) -> Indices:
-    """For each mark (count,) the number of the component that it is in, of groups of marks (C, k)."""
+    """Label (count,) of the connected component of each mark; groups : (C, k), connected marks."""
     first, others = np.repeat(groups[:, 0], groups.shape[1] - 1), groups[:, 1:].ravel()
     linked = coo_array((np.ones(len(first)), (first, others)), shape=(count, count))
     return np.asarray(connected_components(linked, directed=False)[1], np.int64)
 
 
 def support(points: Floats, expected: Corners) -> Indices:
-    """How many corners each point (n, 2) closes, (n,)."""
+    """Number (n,) of corners that each point (n, 2) closes."""
     if not (len(points) and len(expected.points)):
         return np.zeros(len(points), np.int64)
     closing = KDTree(points).query_ball_point(expected.points, expected.reach)
@@ -176,11 +177,11 @@ def support(points: Floats, expected: Corners) -> Indices:
 
 
 def _closing(centers: Floats, expected: Corners) -> Indices:
-    """(M,) which mark closes each parallelogram, -1 for none."""
+    """Index (M,) of the mark that closes each parallelogram, or -1."""
     if len(expected.points) == 0:
         return np.zeros(0, np.int64)
     away, near = map(np.asarray, KDTree(centers).query(expected.points, 2))
-    # The middle one is opposite to that corner, and closes nothing.
+    # The middle mark is opposite to the corner and cannot close it.
     second = (near[:, 0] == expected.middle).astype(np.int64)
     which = np.arange(len(near))
     return np.where(away[which, second] < expected.reach, near[which, second], -1)

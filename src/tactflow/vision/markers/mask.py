@@ -1,4 +1,4 @@
-"""Where markers cover the gel: spots that differ from their surroundings on all sides."""
+"""Mask of the markers: spots that differ from their surroundings on all sides."""
 
 from __future__ import annotations
 
@@ -21,26 +21,25 @@ Bytes = NDArray[np.uint8]
 Polarity = Literal["dark", "bright"]
 
 CIRCLE_POINTS: Final = 12
-"""Points on the circle around a spot that it is compared with. Chosen by hand."""
+"""Number of points on the circle that a spot is compared with. Chosen by hand."""
 
 SHARPEST_CIRCLE: Final = 4.0
-"""px; the circle lies at least this far outside a dot, so that the blurred border of a small dot is not taken
-for the gel. Chosen by hand."""
+"""Minimum distance of the circle from the centre's dot, px, so that the blurred border of a small dot is not
+taken for gel. Chosen by hand."""
 
 CONTRAST_FRACTION: Final = 0.25
-"""Fraction of the dots' median contrast from which on a spot is a dot. Worn dots keep that much.
-Chosen by hand."""
+"""Minimum contrast of a dot, relative to the median. Worn dots keep that much. Chosen by hand."""
 
 LEAST_CONTRAST: Final = 6.0
-"""Least contrast of a dot, grey levels: 120 / 20, the threshold of the original script over its gain."""
+"""Minimum contrast of a dot, grey levels: 120 / 20, the threshold of the original script over its gain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """What the markers of a gel look like.
+    """Appearance of the markers of a gel.
 
-    radius : px, > 0. polarity : darker or brighter than the gel. contrast : difference to the gel above which
-    a spot is a marker, grey levels, > 0. others : radii of those of other sizes, px, each > 0.
+    radius : px, > 0. polarity : darker or brighter than the gel. contrast : minimum difference of a marker to
+    the gel, grey levels, > 0. others : radii of markers of other sizes, px, each > 0.
     """
 
     radius: float
@@ -65,18 +64,18 @@ def find_dot(
     polarity: Literal["dark", "bright", "auto"] = "auto",
     valid: Bytes | None = None,
 ) -> Dot | None:
-    """Size, polarity and contrast of the markers of a gel, from a picture of the untouched gel.
+    """Estimate size, polarity and contrast of the markers from a picture of the untouched gel.
 
     Parameters
     ----------
     image : (H, W, 3) uint8, BGR grey levels.
     radius : of a marker, px, if it is known.
     polarity : of the markers; "auto" takes the better lattice.
-    valid : (H, W) uint8, not 0 where there is gel; None: everywhere.
+    valid : (H, W) uint8, non-zero where there is gel; None: everywhere.
 
     Returns
     -------
-    dot : what the markers look like; None where there are none.
+    dot : appearance of the markers; None if there are none.
 
     Examples
     --------
@@ -97,10 +96,10 @@ def find_dot(
 
 
 def _other_sizes(found: Detection) -> tuple[float, ...]:
-    """Radii, px, of marks that a circle around one of the usual size would cut or lead past."""
+    """Radii, px, of marks for which the circle of the usual size does not fit."""
     if found.radii is None:
         return ()
-    # One circle serves for marks that are smaller or larger by that ratio.
+    # A circle fits marks that are smaller or larger by up to this ratio.
     step = np.rint(np.log(found.radii / found.dot_radius) / np.log(ONE_SIZE**2))
     sizes, counts = np.unique(step, return_counts=True)
     return tuple(float(np.median(found.radii[step == s])) for s in sizes[(counts > 1) & (sizes != 0)])
@@ -116,7 +115,7 @@ def marker_mask(image: Bytes, dot: Dot) -> Bytes:
     Parameters
     ----------
     image : (H, W, 3) uint8, BGR grey levels.
-    dot : what a marker looks like.
+    dot : appearance of the markers.
 
     Returns
     -------
@@ -125,7 +124,7 @@ def marker_mask(image: Bytes, dot: Dot) -> Bytes:
 
     Raises
     ------
-    ValueError : the image is not of that kind.
+    ValueError : the image has another type or shape.
 
     Examples
     --------
@@ -152,7 +151,7 @@ def _mask(whole: Bytes, dot: Dot, radius: float) -> Bytes:
 
 
 def _even(image: Bytes) -> Bytes:
-    """The image with its last row and column repeated where their number is odd."""
+    """The image with its last row or column repeated if the number of rows or columns is odd."""
     bottom, right = image.shape[0] % 2, image.shape[1] % 2
     if bottom or right:
         return np.asarray(cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
@@ -160,23 +159,23 @@ def _even(image: Bytes) -> Bytes:
 
 
 def _contrast(whole: Bytes, radius: float, polarity: Polarity) -> Bytes:
-    """By how much each px differs from all of a circle around it: (H / 2, W / 2, 3) uint8, grey levels."""
+    """Smallest contrast of each px with a circle around it: (H / 2, W / 2, 3) uint8, grey levels."""
     half, circle = halved(whole), _circle(_circle_radius(radius))
-    # What lies outside the frame does not count.
+    # Points outside the frame are ignored.
     if polarity == "dark":
         return np.asarray(cv2.subtract(cv2.erode(half, circle), half), np.uint8)
     return np.asarray(cv2.subtract(half, cv2.dilate(half, circle)), np.uint8)
 
 
 def _circle_radius(radius: float) -> float:
-    """Radius at half resolution of the circle that a dot of a radius at full resolution is compared with."""
+    """Radius of the circle at half resolution for a dot whose radius is given at full resolution."""
     return (radius + max(radius, SHARPEST_CIRCLE) + 1) / 2
 
 
 def _corner(radius: float) -> int:
-    """Side, px, of the squares in the corners of the half-size frame in which no dot is looked for.
+    """Side, px, of the squares in the corners of the half-size frame where no dots are searched.
 
-    Most of the circle is missing there, so any dark corner would be a spot.
+    Most of the circle lies outside there, so any dark corner would be a spot.
     """
     return (2 * math.ceil(_circle_radius(radius)) + 1) // 4
 
@@ -199,7 +198,7 @@ def _cover_spots(contrast: Bytes, threshold: int, corner: int, mask: Bytes) -> N
     contrast : (h, w, 3). threshold : grey levels. corner : side of squares in the corners without spots, px.
     """
     height, width, _ = contrast.shape
-    # With a px more on all sides.
+    # One more px on all sides.
     spots, line = np.empty((height + 2, width + 2), np.uint8), np.empty(width + 2, np.uint8)
     spots[:] = 0
     least = np.uint8(threshold)

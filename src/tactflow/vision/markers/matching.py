@@ -1,4 +1,4 @@
-"""Which spot of a frame is which mark, and where a mark is that is not seen: neighbours move alike."""
+"""Match spots of a frame to marks, and interpolate invisible marks, because neighbours move alike."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import components, nearest
 
 MOST_STRAIN: Final = 0.5
-"""Strain of a link from which on its two marks do not move together; 0.3 and 0.7 change no identity in six
+"""Strain of a link above which its two marks do not move together; 0.3 and 0.7 change no identity in six
 scenes and seven recordings (measured)."""
 
 REACH: Final = 0.4
-"""Scatter of the field, pitches: distance of a mark from where those around it predict it, or from where it
-would be if all moved alike, at most; and of a spot from the mark that it is. With 0.3 three times as
-many marks of wedge_roll are not seen, with 0.5 some take a shadow half a pitch away (measured)."""
+"""Scatter of the displacement field, pitches: maximum distance of a spot from the predicted position of its
+mark. With 0.3 three times as many marks of wedge_roll are missed, with 0.5 some take a shadow half a pitch
+away (measured)."""
 
 LEAST_SHARE: Final = 0.15
-"""Share, by weight, of the marks around that are known where they predict a mark: one alone is not enough.
-With 0.2, jumps of 0.9 pitches cost identities; with 0.1, marks of sts_torque160, 3 px apart, take the spots
-of others in 2 % of all cases (measured)."""
+"""Minimum share, by weight, of known neighbours to predict a mark: a single one is not enough. With 0.2,
+jumps of 0.9 pitches cost identities; with 0.1, marks of sts_torque160, 3 px apart, take the spots of others
+in 2 % of all cases (measured)."""
 
 NEIGHBOURS: Final = 24
-"""Marks around a mark that a fit uses, at most: the two rings of a square grid, 8 + 16."""
+"""Maximum number of neighbours in a fit: the two rings of a square grid, 8 + 16."""
 
 WEIGHT_SIGMA: Final = 1.1
-"""Width of the Gaussian by which a mark's weight falls with its distance, pitches: 0.66 at one pitch. Chosen
+"""Standard deviation of the Gaussian weight of a neighbour, pitches: the weight is 0.66 at one pitch. Chosen
 by hand."""
 
 RIDGE: Final = np.diag([1e-9, 0.05, 0.05, 0.3, 0.3, 0.3])
-"""Ridge of the fit's coefficients 1, x, y, x^2, x y, y^2. It turns a quadratic fit into a plane, and a plane
-into a mean, where there is too little to fit it. Chosen by hand."""
+"""Ridge of the fit's coefficients 1, x, y, x^2, x y, y^2. It reduces a quadratic fit to a plane, and a plane
+to a mean, where the data do not suffice. Chosen by hand."""
 
 
 class MarkerGraph:
@@ -49,7 +49,7 @@ class MarkerGraph:
 
     Raises
     ------
-    ValueError : an edge names a mark that there is not.
+    ValueError : an edge has an invalid index.
 
     Examples
     --------
@@ -72,18 +72,21 @@ class MarkerGraph:
         self._length = np.linalg.norm(origin[self._edges[:, 0]] - origin[self._edges[:, 1]], axis=1)
         self._grid = components(self._edges, count)
         self.grids = [np.flatnonzero(self._grid == grid) for grid in np.unique(self._grid)]
-        """The marks of each grid without links to others."""
+        """The marks of each connected grid."""
 
     def check(self, position: Floats, seen: Flags) -> tuple[Flags, bool]:
-        """Of positions (N, 2), px, of marks that are seen, (N,): which links (E,) have little strain, between
-        marks that are seen; and whether any has much."""
+        """Test the links between visible marks: which (E,) have little strain, and whether any has much.
+
+        position : (N, 2), px. seen : (N,), whether a mark is visible.
+        """
         smooth = np.empty(len(self._edges), np.bool_)
         return smooth, check_links(position, seen, self._origin, self._edges, self._length, smooth)
 
     def largest_component(self, seen: Flags, smooth: Flags) -> Flags:
-        """The seen marks (N,) of the largest component, in each grid, by links (E,) of little strain."""
+        """The visible marks (N,) of the largest component of each grid, connected by links of little
+        strain."""
         component = components(self._edges[smooth], len(seen))
-        # Of components of one size the first one.
+        # The first of components of equal size.
         rank = np.where(seen, np.bincount(component)[component] - component / len(seen), 0.0)
         best = np.zeros(len(seen))
         np.maximum.at(best, self._grid, rank)
@@ -94,7 +97,7 @@ class MarkerGraph:
 def check_links(
     position: Floats, seen: Flags, origin: Floats, edges: Indices, length: Floats, smooth: Flags
 ) -> bool:
-    """Fill `smooth`, (E,); returns whether marks that are seen have a link that is not."""
+    """Fill `smooth`, (E,); returns whether a link between visible marks is not smooth."""
     torn = False
     for e in range(len(edges)):
         one, other = edges[e, 0], edges[e, 1]
@@ -107,7 +110,7 @@ def check_links(
 
 
 class Interpolator:
-    """Places marks by those around them.
+    """Interpolates marks from their neighbours.
 
     origin : (N, 2) float64, marks in the reference, px. pitch : px.
 
@@ -128,10 +131,10 @@ class Interpolator:
         self._around, self._weight = surroundings(origin, pitch)
 
     def place(self, position: Floats, found: Flags) -> Indices:
-        """Place the marks that are not found, where enough of those around them are.
+        """Interpolate the marks that were not found, if enough of their neighbours were.
 
         position : (N, 2) float64, px, finite, changed in place. found : (N,) bool.
-        Returns the numbers of the marks that are placed; the positions of others stay.
+        Returns the indices of the interpolated marks; the positions of others stay.
         """
         missing = np.flatnonzero(~found)
         around = self._around[missing]
@@ -151,7 +154,7 @@ class Interpolator:
 
 
 def surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
-    """For each mark up to 24 nearest others, and their weights: two (N, n) arrays."""
+    """The up to 24 nearest neighbours of each mark, and their weights: two (N, n) arrays."""
     away, near = nearest(origin, NEIGHBOURS)
     return near, np.exp(-(away**2) / (2 * (WEIGHT_SIGMA * pitch) ** 2))
 
@@ -159,20 +162,20 @@ def surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
 def grow(
     last: Floats, known: Flags, spots: Floats, interpolator: Interpolator, reach: Floats
 ) -> tuple[Indices, Indices]:
-    """Give marks that are not known one of the spots, or none, from those that are known outwards.
+    """Assign spots to unknown marks, from the known marks outwards.
 
-    In each round the known marks around predict where a mark is, and it takes the spot that is nearest to
-    there, unless that is farther away than its `reach` or another mark is nearer to it. Marks that are left
-    take what is left near their last position.
+    In each round the known neighbours predict the position of a mark, which takes the nearest spot, unless
+    that is farther away than its `reach` or nearer to another mark. Remaining marks take a remaining spot
+    near their last position.
 
     Parameters
     ----------
-    last : (N, 2) float64, px, positions of the marks that are known, and the last ones of the others.
+    last : (N, 2) float64, px, current positions of the known marks, and last positions of the others.
     known : (N,) bool. spots : (M, 2) float64, px. interpolator : of the marks. reach : (N,) float64, px.
 
     Returns
     -------
-    marks, chosen : (n,) int64, which marks took which spots; no spot is taken twice.
+    marks, chosen : (n,) int64, indices of marks and of the spots assigned to them, each spot at most once.
 
     Examples
     --------
@@ -208,7 +211,7 @@ def grow(
 
 
 def common_displacement(position: Floats, spots: Floats, pitch: float, farthest: float) -> Floats:
-    """The displacement that most marks share: every pair of a mark and a spot votes for its own.
+    """The displacement of most marks, by votes of all pairs of a mark and a spot.
 
     Parameters
     ----------
@@ -218,7 +221,7 @@ def common_displacement(position: Floats, spots: Floats, pitch: float, farthest:
 
     Returns
     -------
-    displacement : (2,) float64, px; zero where no spot is near enough.
+    displacement : (2,) float64, px; zero if no spot is near enough.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Whether marks move with the gel: dirt before the camera and reflections stay where they are."""
+"""Detect marks that do not move with the gel, such as dirt before the camera and reflections."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ from tactflow.vision.markers.lattice import BESIDE
 from tactflow.vision.markers.matching import LEAST_SHARE, surroundings
 
 REST: Final = 0.1
-"""Distance of a mark from its origin, along either axis, within which it rests, pitches. Chosen by hand."""
+"""Maximum displacement of a resting mark along either axis, pitches. Chosen by hand."""
 
 BEST_AGREEMENT: Final = 0.25
-"""Difference of a mark's displacement from the mean of those around it, over this mean, that is always
-expected. Chosen by hand."""
+"""Expected scatter of a mark's displacement about the mean of its neighbours, relative to this mean, at best.
+Chosen by hand."""
 
 LEAVING_EVIDENCE: Final = 5.0
-"""Evidence that a mark stays while those around it move, from which on it leaves: very strong (Kass and
-Raftery, "Bayes factors", 1995)."""
+"""Log Bayes factor above which a mark is rejected because it stays while its neighbours move: very strong
+evidence (Kass and Raftery, "Bayes factors", 1995)."""
 
 
 class MotionEvidence:
-    """Compares two explanations of where a mark is seen: it moves with the marks around it, or not at all.
+    """Compares two hypotheses about each mark: it moves with its neighbours, or it does not move at all.
 
-    In one frame a mark that moves with those around is as far from their mean displacement as they are
-    themselves: normally distributed. One that stays is so far from zero. Frames repeat each other, so only
-    the strongest evidence of all frames counts.
+    The displacement of a mark that moves with its neighbours is normally distributed about their mean, with
+    their scatter; that of one that stays is distributed about zero with the same scatter. Frames are
+    correlated, so only the strongest evidence of all frames counts.
 
     origin : (N, 2) float64, marks in the reference, px. pitch : px.
-    prior : (N,) float64, probability of being a mark by its looks, 0 to 1.
-    against : (N,) float64, logarithm of how much more probable it is that a mark stays, 0 or more: what is
-    known so far.
+    prior : (N,) float64, probability of being a mark by its appearance, 0 to 1.
+    against : (N,) float64, log likelihood ratio of staying over moving so far, 0 or more.
 
     left : (n,) int64, marks that do not move with the gel.
 
@@ -72,9 +71,9 @@ class MotionEvidence:
         return np.flatnonzero((self.against > LEAVING_EVIDENCE) & (self.against > self._log_odds))
 
     def add(self, displacement: Floats, stderr: Floats32, seen: Flags) -> bool:
-        """Take one frame into account; returns whether the gel is not at rest.
+        """Add one frame; returns whether the gel moves.
 
-        displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool, which are measured.
+        displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool, visible marks.
         """
         around = self._around, self._share, self._rest
         moves = weigh_motion(displacement, stderr, seen, *around, self.against)
@@ -96,10 +95,10 @@ def weigh_motion(
     rest: float,
     against: Floats,
 ) -> bool:
-    """Raise `against`, (N,), to the evidence of a frame; returns whether a mark moves.
+    """Update `against`, (N,), with the evidence of a frame; returns whether a mark moves.
 
-    displacement : (N, 2). stderr, seen : (N,). around, share : (N, K), the marks around, nearest first, and
-    their shares in a mean. rest : distance along an axis within which a mark rests.
+    displacement : (N, 2). stderr, seen : (N,). around, share : (N, K), the neighbours, nearest first, and
+    their weights in a mean. rest : maximum displacement of a resting mark along an axis.
     """
     moves, moving = np.empty(len(displacement), np.bool_), False
     for n in range(len(displacement)):

@@ -1,7 +1,7 @@
-"""Which spots of a picture are the marks: those that are alike and form a lattice.
+"""Select the spots of a picture that are marks: those that are alike and form a lattice.
 
 The spots of one scale and polarity with the most contrast in the best lattice come first. Spots of other
-scales, and ones that others crowd, join them where the lattice wants a mark and they look like those around.
+scales, and crowded ones, are added where the lattice predicts a mark and they look like the marks around.
 """
 
 from __future__ import annotations
@@ -23,71 +23,70 @@ from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, Spots, joined
 Sign = Literal["dark", "bright"]
 
 LEAST_STRENGTH: Final = 0.35
-"""Response of a mark over that of the typical one of its scale, at least: dirt and grain are a tail. With
-0.25, grain between marks that are 3 px apart takes their places (sts_torque160)."""
+"""Minimum response of a mark, relative to the typical one of its scale: dirt and grain are a tail. With 0.25,
+grain between marks that are 3 px apart takes their places (sts_torque160)."""
 
 BETWEEN: Final = 0.55
 """Distance, pitches, below which the weaker of two spots lies between marks. Chosen by hand."""
 
 RANDOM_SHARE: Final = 0.3
-"""Share of parallelograms that close among spots in no lattice: 0.1 to 0.25 on rendered textures, 0.31 where
-spots keep nearly the distance of a lattice from each other (measured)."""
+"""Share of closed parallelograms without a lattice: 0.1 to 0.25 on rendered textures, 0.31 for spots that
+keep nearly the distance of a lattice from each other (measured)."""
 
 LONG_LINK: Final = 2.0
-"""Length of a link of the lattice, over the median one at either end, at most: across one missing mark.
-Without such a bound, the bright rims of a TacTip's pins are taken for marks."""
+"""Maximum length of a link, relative to the median one at either end: it may span one missing mark. Without
+this bound, the bright rims of a TacTip's pins are taken for marks."""
 
 APART: Final = 0.9
-"""Distance of two marks, sums of their radii, at least: with 1, marks that crowd are lost (sts_torque160)."""
+"""Minimum distance of two marks, in sums of their radii: with 1, crowded marks are lost (sts_torque160)."""
 
 CLEAR: Final = 0.65
-"""Clearance of a spot that is a mark without the others' agreement: on its own, or where a single corner or
-line of the lattice wants one. Dots on even ground have 0.8 to 1, pieces of edges and lines 0.3 to 0.7
+"""Minimum clearance of a mark that little else supports: an isolated one, or one that a single corner or line
+of the lattice predicts. Dots on an even background have 0.8 to 1, pieces of edges and lines 0.3 to 0.7
 (tactip_video, sts_640)."""
 
 NEAR: Final = 3.2
-"""Ratio of the responses of a spot and of the marks around, either way, at most, where the lattice
-wants a mark: light and dirt weaken marks."""
+"""Maximum ratio of the responses of a spot and of the marks around, either way, where the lattice predicts a
+mark: uneven light and dirt weaken marks."""
 
 ALIKE: Final = 1.5
-"""Ratio of the radii of a spot and of the marks around, either way, at most; and of their responses, where
-only a clear ring or even ground says that it is a mark."""
+"""Maximum ratio of the radii of a spot and of the marks around, either way; and of their responses, where
+only clearance supports it."""
 
 LEAST_BEND: Final = 0.15
-"""Bend of a mark over that of most marks, at least: a piece of an edge or a line has 0. Of the dots marked on
-18 sensors 0.2 loses 0.2 % more, and 0.1 takes a fifth more places for dots that are none."""
+"""Minimum bend of a mark, relative to the median: a piece of an edge or a line has 0. With 0.2, 0.2 % more of
+the dots labelled on 18 sensors are lost; with 0.1, there are a fifth more false dots."""
 
 LEAST_SUPPORT: Final = 2
-"""Corners and lines of the lattice that want a mark there, at least: one may be a coincidence."""
+"""Minimum number of corners and lines of the lattice that predict a mark: one may be a coincidence."""
 
 RING_CONTRAST: Final = 0.3
-"""Clearance of a spot that is more than a piece of an edge, a line or a texture, at least. Chosen by hand."""
+"""Minimum clearance of a spot: pieces of edges, lines and textures have less. Chosen by hand."""
 
 LIKENESS: Final = 0.64
-"""Likeness of a spot to the marks around, at least, to be one of them where the lattice wants one and other
-marks are too near for the ring to tell. Chosen on pictures of eight sensors, shrunk until their marks were 3
-to 8 px apart: 0.6 finds 0.2 % more of them and 0.2 % more that are none."""
+"""Minimum likeness of a spot to the marks around, where the lattice predicts a mark and other marks are too
+near for the ring. Chosen on pictures of eight sensors, shrunk until their marks were 3 to 8 px apart: 0.6
+finds 0.2 % more marks and 0.2 % more false ones."""
 
 LEAST_CLUSTER: Final = 6
-"""Marks of a lattice beside a larger one, at least: four or five spots form a parallelogram by chance
+"""Minimum number of marks in a lattice beside a larger one: four or five spots form a parallelogram by chance
 (sts_torque160)."""
 
 PROBABILITY: Final = (-0.37, -4.72, 5.65, 2.42)
 """Log odds of a mark: constant, and weights of its `evidence`. Fitted to 18 sensors by `python -m
-benchmarks.probability dots`, which also tells how often marks of a probability are marks on a sensor that was
+tactflow.bench.judge_dots --fit`, which also reports the calibration of the probability on sensors that were
 left out."""
 
 WINDOW: Final = 2.6
-"""Radius of the discs that are compared, in radii of the marks: they hold the gaps to the neighbours, too.
+"""Radius of the discs that are compared, in radii of the marks: they include the gaps to the neighbours.
 Chosen on sts_640 and sts_torque160, where glare correlates less with marks than with 1.9 radii."""
 
 
 class Candidate(NamedTuple):
     """Spots of one scale and polarity that may be the marks of a gel.
 
-    spots : about as strong, and apart from each other. radius : of a disc that answers like them, px.
-    score : how much they look like marks, comparable within one picture. lattice : share of parallelograms
-    of neighbours that close, 0 to 1.
+    spots : of similar strength, apart from each other. radius : of a disc with the same response, px. score :
+    rank among the candidates of a picture. lattice : share of closed parallelograms, 0 to 1.
     """
 
     spots: Spots
@@ -106,9 +105,9 @@ class Candidate(NamedTuple):
 
 
 def candidates(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Candidate]:
-    """The candidate of each polarity and scale that has one, the best first.
+    """The candidates of all polarities and scales, the best first.
 
-    scales : for each polarity and scale, px, its spots.
+    scales : the spots for each polarity and scale, px.
     """
     found = []
     for polarity, by_scale in scales.items():
@@ -116,7 +115,7 @@ def candidates(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Candidate]:
             members = _alike(spots.at(spots.clear > RING_CONTRAST))
             if len(members.points):
                 share = lattice.closed_share(members.points, links(members.points))
-                # More contrast is evidence, but six lamps are no better than a hundred faint dots.
+                # More contrast is more evidence, but six lamps must not beat a hundred faint dots.
                 total = float(np.median(members.strength)) * len(members.points)
                 score = max(share - RANDOM_SHARE, 0.0) * total**0.5
                 found.append(Candidate(members, sigma * RADIUS_PER_SIGMA, polarity, score, share))
@@ -124,7 +123,7 @@ def candidates(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Candidate]:
 
 
 def marks_of(gray: NDArray[np.float32], chosen: Candidate, by_scale: Mapping[float, Spots]) -> Spots:
-    """The marks of a candidate in all their sizes, without spots that only look like them.
+    """The marks of all sizes that belong to a candidate.
 
     gray : (H, W) float32, grey levels. by_scale : the spots of its polarity.
     """
@@ -138,10 +137,10 @@ def marks_of(gray: NDArray[np.float32], chosen: Candidate, by_scale: Mapping[flo
 
 
 def evidence(gray: NDArray[np.float32], marks: Spots) -> Floats:
-    """What tells how probable it is that marks are marks, (N, 3); NaN for one alone.
+    """Features (N, 3) for the probability that each mark is one; NaN for a single mark.
 
-    How much its response differs from those around, as the absolute logarithm of their ratio; how much it
-    looks like them, -1 to 1; and the share of parallelograms that it is part of and that close, 0 to 1.
+    The absolute logarithm of the ratio of its response to that of the marks around; its likeness to them, -1
+    to 1; and the share of closed ones among its parallelograms, 0 to 1.
     """
     _, around = nearest(marks.points, BESIDE)
     if not around.size:
@@ -153,7 +152,7 @@ def evidence(gray: NDArray[np.float32], marks: Spots) -> Floats:
 
 
 def probability(evidence: Floats) -> Floats:
-    """Probability, (N,), of being a mark, of its evidence, (N, 3): logistic regression.
+    """Probability (N,) that each mark is one, from its evidence (N, 3), by logistic regression.
 
     References
     ----------
@@ -180,12 +179,12 @@ def links(points: Floats) -> NDArray[np.int64]:
 
 
 def _alike(spots: Spots) -> Spots:
-    """The spots of one scale that may be marks of one gel: about as strong, none between others or lonely."""
+    """The spots of one scale that may be marks: of similar strength, none between others, none isolated."""
     order = np.argsort(-spots.strength, kind="stable")
     if len(order) == 0:
         return spots
-    # Strengths of marks are alike, those of dirt and grain are a tail: cut at a part of the typical one,
-    # which is found from the top down so that the tail's length does not matter.
+    # Marks are similar in strength, dirt and grain form a tail: cut at a fraction of the typical strength,
+    # which is estimated from the top down, independently of the tail's length.
     ranked = spots.strength[order]
     typical = ranked[0]
     for _ in range(8):
@@ -205,7 +204,7 @@ def _alike(spots: Spots) -> Spots:
 
 
 def _in_lattice(marks: Spots) -> Spots:
-    """The marks that are part of a lattice, or stand alone on even ground."""
+    """The marks that belong to a lattice, or stand isolated on an even background."""
     if len(marks.points) < BESIDE:
         return marks
     share, cluster = lattice.own_shares(marks.points, links(marks.points))
@@ -215,7 +214,7 @@ def _in_lattice(marks: Spots) -> Spots:
 
 
 def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
-    """The marks, and spots where their lattice wants one, a row at a time."""
+    """Extend the marks by spots where their lattice predicts one, row by row."""
     while len(marks.points) >= BESIDE:
         touching = APART * (spots.radius[:, None] + marks.radius)
         spots = spots.at(np.all(cdist(spots.points, marks.points) > touching, axis=1))
@@ -227,7 +226,7 @@ def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
 
 
 def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
-    """Of spots that touch no mark, those that go on with the lattice and are like the marks around."""
+    """The spots, none of which touches a mark, that extend the lattice and resemble the marks around."""
     support = lattice.support(spots.points, expected_marks(marks.points))
     wanted, support = spots.at(support > 0), support[support > 0]
     away = cdist(wanted.points, marks.points)
@@ -245,12 +244,13 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
 
 
 def _ratio(one: Floats, other: Floats | np.float64) -> Floats:
-    """How many times larger the larger of two is, (n,)."""
+    """Ratio (n,) of the larger to the smaller of two values."""
     return np.asarray(np.maximum(one / other, other / one), np.float64)
 
 
 def expected_marks(points: Floats) -> Corners:
-    """Where the lattice wants marks: the corners of parallelograms, and the next place along each line."""
+    """Where the lattice predicts marks: at corners of parallelograms, and one step further along each
+    line."""
     edges = links(points)
     found = lattice.corners(points, edges)
     first, last = np.concatenate([edges, edges[:, ::-1]]).T
@@ -266,7 +266,7 @@ def expected_marks(points: Floats) -> Corners:
 
 
 def _apart(spots: Spots, rank: Floats) -> Spots:
-    """Of spots that touch each other, the one of the highest rank."""
+    """Keep the spot with the highest rank among spots that touch each other."""
     left = np.ones(len(rank), bool)
     kept = []
     for n in np.argsort(-rank, kind="stable"):
@@ -278,19 +278,19 @@ def _apart(spots: Spots, rank: Floats) -> Spots:
 
 
 def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: Floats) -> Floats:
-    """How much the discs around points look like those around others: mean correlation, -1 to 1.
+    """Likeness of the discs around points to those around others: mean correlation, -1 to 1.
 
-    Brightness, contrast and the slope of the light play no part.
+    It is invariant to brightness, contrast and a gradient of the light.
 
     Parameters
     ----------
     gray : (H, W) float32, grey levels.
-    points : (n, 2) float64, px. others : (n, K, 2) float64, px, with which each is compared.
+    points : (n, 2) float64, px. others : (n, K, 2) float64, px, to compare each with.
     radius : (n,) float64, of the marks there, px.
 
     Returns
     -------
-    likeness : (n,) float64, mean over K; 0 for a disc on even ground.
+    likeness : (n,) float64, mean over K; 0 for a uniform disc.
 
     References
     ----------
@@ -313,7 +313,7 @@ def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: 
 
 
 def _surroundings(gray: NDArray[np.float32], points: Floats, reach: Floats) -> Floats:
-    """The levels of the discs around points (n, 2) without their mean and slope, as unit vectors (n, P)."""
+    """Grey levels of the discs around points (n, 2), less mean and gradient, as unit vectors (n, P)."""
     axis = np.linspace(-1, 1, 9)
     x, y = (part.ravel() for part in np.meshgrid(axis, axis))
     inside = x * x + y * y <= 1

@@ -1,4 +1,4 @@
-"""Spots of one scale: peaks of a difference of Gaussians that differ from what lies around them."""
+"""Spots of one scale: peaks of a difference of Gaussians that differ from their surroundings."""
 
 from __future__ import annotations
 
@@ -15,55 +15,55 @@ SCALE_RATIO: Final = 1.6
 Laplacian of a Gaussian (Marr and Hildreth 1980)."""
 
 RADIUS_PER_SIGMA: Final = 1.83
-"""Radius of the disc that such a difference answers most strongly, over the narrower width. Measured on
-rendered discs of radius 2 to 12 px."""
+"""Radius of the disc with the strongest response, over the narrower width. Measured on rendered discs of
+radius 2 to 12 px."""
 
 LEAST_SIGMA: Final = 0.75
-"""Smallest scale that is looked at, px: marks of radius 1.4. Chosen by hand."""
+"""Smallest scale, px: marks of radius 1.4. Chosen by hand."""
 
 SIGMA_STEP: Final = 1.2
-"""Ratio of neighbouring scales. Chosen by hand."""
+"""Ratio of adjacent scales. Chosen by hand."""
 
 LARGEST_MARK: Final = 1 / 16
-"""Largest scale that is looked at, over the shorter side of the image. Chosen by hand."""
+"""Largest scale, over the shorter side of the image. Chosen by hand."""
 
 ONE_SIZE: Final = 1.3
-"""Ratio of the radii of marks, at most, that count as of one size: what choosing among scales leaves
-uncertain, a step either way. Up to 1.6 it changes no identity in seven recordings (measured)."""
+"""Largest ratio of the radii of marks that count as equal in size: the uncertainty of one step of scale
+either way. Up to 1.6 it changes no identity in seven recordings (measured)."""
 
 FULL_SIZE_SIGMA: Final = 4.0
-"""Scales from here on are looked at in a smaller picture, px: it gives the same peaks at a cost that does not
-grow."""
+"""Scales from this one on are computed in a shrunk picture, px: the peaks are the same at a bounded cost."""
 
 LEAST_STRENGTH: Final = 1.0
-"""Response of a spot, grey levels, at least: below it is rounding."""
+"""Minimum response of a spot, grey levels: weaker ones are rounding."""
 
 MOST_PEAKS: Final = 3000
-"""Peaks of one scale, the strongest ones: bounds the time on a textured picture."""
+"""Maximum number of peaks of one scale, the strongest ones: bounds the time on a textured picture."""
 
 RING: Final = 1.9
-"""Radius of the ring around a spot that is compared with it, in radii of the spot. Chosen by hand."""
+"""Radius of the ring that a spot is compared with, in radii of the spot. Chosen by hand."""
 
 RING_POINTS: Final = 16
-"""Points of that ring. Chosen by hand."""
+"""Number of points of that ring. Chosen by hand."""
 
 RING_MISSES: Final = 2
-"""Points of the ring that need not differ from the spot: what touches it there. Chosen by hand."""
+"""Number of points of the ring that need not differ from the spot, where something touches it. Chosen by
+hand."""
 
 OVERLAP: Final = 1.3
-"""Distance of neighbouring marks at least, in radii: spots closer than that are ridges of a pattern."""
+"""Minimum distance of neighbouring marks, in radii: closer spots are ridges of a pattern."""
 
 BORDER_MARGIN: Final = 0.8
-"""Distance of a mark from the border of the image at least, in radii: others are cut by it."""
+"""Minimum distance of a mark from the border of the image, in radii: closer ones are cut by it."""
 
 
 class Spots(NamedTuple):
-    """Spots of some size.
+    """Spots and their properties.
 
     points : (N, 2) float64, px. radius : (N,) float64, of discs of that scale, px. strength : (N,) float64,
-    response, grey levels. clear : (N,) float64, least contrast with the ring around over the median, at most
-    1; 1 is a spot alone on even ground. bend : (N,) float64, how fast the response falls in the direction
-    in which it falls least, grey levels per squared scale.
+    response, grey levels. clear : (N,) float64, smallest contrast with the surrounding ring over the median
+    one, at most 1; an isolated spot on an even background has 1. bend : (N,) float64, smallest curvature of
+    the peak of the response, grey levels per squared scale.
     """
 
     points: Floats
@@ -73,17 +73,17 @@ class Spots(NamedTuple):
     bend: Floats
 
     def at(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> Spots:
-        """Some of the spots, by their numbers or by (N,) bool."""
+        """A selection of the spots, by index or by (N,) bool."""
         return Spots(*(values[which] for values in self))
 
 
 def joined(*parts: Spots) -> Spots:
-    """All spots of several."""
+    """Concatenate spots."""
     return Spots(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 def sigmas(dot_radius: float | None, shortest: int) -> list[float]:
-    """Scales to look at, px: of one radius, or of all that fit a picture of that shorter side."""
+    """Scales to search, px: that of one radius, or all that fit a picture with this shorter side."""
     if dot_radius is not None:
         return [dot_radius / RADIUS_PER_SIGMA]
     largest = max(SIGMA_STEP, shortest * LARGEST_MARK)

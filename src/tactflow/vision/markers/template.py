@@ -1,4 +1,4 @@
-"""Align marks with their templates: what each looks like in the reference frame."""
+"""Align marks with their templates, which are cut from the reference frame."""
 
 from __future__ import annotations
 
@@ -16,45 +16,44 @@ Bytes = NDArray[np.uint8]
 Levels = NDArray[np.int16]
 
 PHASES: Final = 4
-"""Sub-pixel phases per axis at which templates are kept. An estimate then lies at most an eighth of a pixel
-from one of them, where the linear model errs by far less than the noise; another step is made where it lies
-nearer to another one. Chosen by hand."""
+"""Sub-pixel phases per axis at which templates are stored. An estimate lies at most an eighth of a pixel from
+the nearest one, where the error of the linear model is far below the noise; if another phase is nearer, one
+more step is made. Chosen by hand."""
 
 ROUNDS: Final = 3
-"""Steps after the first one, at most. Chosen by hand."""
+"""Maximum number of steps after the first one. Chosen by hand."""
 
 SAMPLING_ERROR: Final = 0.003
-"""Error that remains without noise, px: edges sharper than the pixels allow cannot be interpolated exactly.
-Measured on rendered dots of radius 4.6 px with edges of 0.7 px standard deviation."""
+"""Error without noise, px: edges sharper than the sampling limit cannot be interpolated exactly. Measured on
+rendered dots of radius 4.6 px with edges of 0.7 px standard deviation."""
 
 PATCH_SCALE: Final = 1.55
-"""Radius of a template over that of its mark: it holds the mark's border and gel around it. Chosen by
-hand."""
+"""Radius of a template over that of its mark: it includes the mark's border and some gel. Chosen by hand."""
 
 PATCH_MARGIN: Final = 1.2
-"""What a template extends farther, px: shifts of a phase and a step stay inside. Chosen by hand."""
+"""Additional margin of a template, px, for the shift of a phase and a step. Chosen by hand."""
 
 RIDGE: Final = 1e-6
 """Ridge of the normal equations, relative to their trace: keeps marks without contrast solvable. Such marks
-are never trusted. Chosen by hand."""
+are never accepted. Chosen by hand."""
 
 TINY: Final = np.finfo(np.float32).tiny
 """Keeps quotients finite."""
 
 LEAST_GAIN: Final = np.float32(0.2)
-"""Contrast of a mark that is seen, over that of its template, at least. A step is divided by no less: that
-of a faint mark would be all noise. Chosen by hand."""
+"""Minimum contrast of a visible mark, relative to its template, and lower bound of the divisor of a step:
+that of a fainter mark would be all noise. Chosen by hand."""
 
 LEAST_R_SQUARED: Final = np.float32(0.5)
-"""Fraction of its contrast that the template of a mark that is seen explains, at least. Another step is only
-made from there: elsewhere it leads nowhere. Chosen by hand."""
+"""Minimum fraction of a visible mark's contrast that its template explains. Only then is another step made,
+since it would not converge. Chosen by hand."""
 
 
 class Alignment(NamedTuple):
-    """Where marks are.
+    """Positions of marks.
 
     position : (n, 2) float64, px. stderr : (n,) float32, standard error of each coordinate, px. seen : (n,)
-    bool, whether the template explains what is there.
+    bool, whether the template fits.
     """
 
     position: Floats
@@ -62,22 +61,22 @@ class Alignment(NamedTuple):
     seen: Flags
 
     def put(self, marks: Indices, others: Alignment) -> None:
-        """Write the places of others, (k,), over those of the marks with these indices, (k,), in place."""
+        """Replace the marks with indices (k,) by others, (k,), in place."""
         self.position[marks] = others.position
         self.stderr[marks] = others.stderr
         self.seen[marks] = others.seen
 
     def take(self, marks: Indices) -> Alignment:
-        """Those of the marks with these indices, (k,)."""
+        """The marks with indices (k,)."""
         return Alignment(self.position[marks], self.stderr[marks], self.seen[marks])
 
 
 class _Model(NamedTuple):
-    """What the alignment of marks of one size needs.
+    """Precomputed terms for the alignment of marks of one size.
 
-    weights : (PHASES^2 N, 5, p) int16, of the pixels of a disc. terms : (PHASES^2 N, 15) float32, 9 of the
-    Gram matrix, variance per pixel, 5 units of the weights. widths : (rows,) int64, of the disc's rows, px.
-    radius : of a mark, px.
+    weights : (PHASES^2 N, 5, p) int16, of the pixels of a disc. terms : (PHASES^2 N, 15) float32: the 9
+    elements of the Gram matrix, the variance per pixel, and the units of the 5 weights. widths : (rows,)
+    int64, of the disc's rows, px. radius : of a mark, px.
     """
 
     weights: Levels
@@ -87,19 +86,19 @@ class _Model(NamedTuple):
 
 
 class MarkerTemplates:
-    """Aligns each mark of a frame with its template, by least squares in the image as it is.
+    """Aligns each mark of a frame with its template by least squares on the raw pixels.
 
     A patch of the frame is modelled as gain * template, shifted, times a plane of illumination, plus a
-    constant. The plane is needed at the edge of a contact, where the light has a slope. A dark mark dims this
-    slope as it dims all light, so a plane that is merely *added* pulls the mark by up to 0.2 px. A bright
-    mark has a level of its own, so to it the slope is added. The frame is only read at whole pixels; the
-    reference, which has less noise, is interpolated, once.
+    constant. The plane is needed at the edge of a contact, where the light has a gradient. A dark mark dims
+    this gradient as it dims all light, so merely *adding* a plane shifts the mark by up to 0.2 px. A bright
+    mark has a brightness of its own, so there the gradient is added. The frame is only read at whole pixels;
+    the reference, which has less noise, is interpolated once.
 
     Parameters
     ----------
     reference : (H, W) float32, grey levels.
     origin : (N, 2) float64, centres of the marks in the reference, px.
-    radii : (N,) float64, px. Each template holds its mark, and no neighbour.
+    radii : (N,) float64, px. A template must not include a neighbouring mark.
     dark : whether marks are darker than the gel.
 
     References
@@ -128,7 +127,7 @@ class MarkerTemplates:
         self.add(reference, origin, radii)
 
     def add(self, reference: Floats32, origin: Floats, radii: Floats) -> None:
-        """Append marks (n, 2), px, with radii (n,), px, as they look in another frame."""
+        """Append marks (n, 2), px, with radii (n,), px, with templates from another frame."""
         step = np.floor(np.log(radii / radii.min()) / np.log(ONE_SIZE) + 1e-6)
         sizes, size_of = np.unique(step, return_inverse=True)
         place = np.empty(len(radii), np.int64)
@@ -143,15 +142,15 @@ class MarkerTemplates:
         self._all = [self._those_of(model, every) for model in range(len(self._models))]
 
     def _those_of(self, model: int, marks: Indices) -> tuple[Indices, Indices]:
-        """Which of some marks have a model, and their places in it."""
+        """The marks among these that belong to a model, and their indices in it."""
         which = np.flatnonzero(self._model_of[marks] == model)
         return which, self._place[marks[which]]
 
     def align(self, image: NDArray[np.uint8], start: Floats, marks: Indices | None = None) -> Alignment:
-        """Find marks from starting points that are right to about a radius.
+        """Align marks, from starting points within about a radius.
 
-        image : (H, W, 3) uint8 BGR or (H, W) uint8. start : (n, 2) float64, px. marks : (n,) int64, which
-        marks these are; None for all.
+        image : (H, W, 3) uint8 BGR or (H, W) uint8. start : (n, 2) float64, px. marks : (n,) int64, their
+        indices; None for all.
         """
         picture = np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
         start, count = np.ascontiguousarray(start), len(start)
@@ -170,11 +169,11 @@ def _model(reference: Floats32, origin: Floats, radius: float, dark: bool) -> _M
     grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
     disc = np.hypot(grid_x, grid_y) <= extent
     pixels, count = int(disc.sum()), len(origin)
-    # Of 16 bits, since reading the weights of all marks is what takes most of the time.
+    # 16 bits, because reading the weights of all marks takes most of the time.
     weights = np.empty((PHASES, PHASES, count, 5, pixels), np.int16)
     terms = np.empty((PHASES, PHASES, count, 15), np.float32)
     scaled = np.array([grid_x[disc], grid_y[disc]]) / radius
-    # What lies beyond the border is as in `read_patch`.
+    # The border is replicated, as in `read_patch`.
     spline = spline_filter(np.pad(reference.astype(np.float64), reach, mode="edge"))
     at_y, at_x = origin[:, 1:] + grid_y[disc] + reach, origin[:, :1] + grid_x[disc] + reach
     # From one phase before the first to one after the last, for the slopes.
@@ -200,7 +199,7 @@ def _model(reference: Floats32, origin: Floats, radius: float, dark: bool) -> _M
 def _normal_equations(
     template: Floats, slope_x: Floats, slope_y: Floats, disc: Floats, dark: bool
 ) -> tuple[Floats, Floats, Floats]:
-    """What least squares need of templates (N, p) at one phase.
+    """Terms of the least-squares problem for templates (N, p) at one phase.
 
     disc : (2, p), x and y of the pixels, in radii.
     Returns weights (N, 5, p): products with a patch give gain and shift x, y times gain, and the two
@@ -220,8 +219,8 @@ def _normal_equations(
 
 @helper
 def nearest_phase(x: float, y: float, width: int, height: int) -> Any:
-    """The phases nearest to a point: whole pixels in the higher digits, the phase in the lowest."""
-    # Written so that NaN, too, becomes a place inside the image.
+    """The nearest phase to a point, per axis: PHASES times the pixel plus the phase."""
+    # Comparisons with NaN are false, so NaN becomes a point inside the image, too.
     inside_x = min(x, width - 1.0) if x > 0.0 else 0.0
     inside_y = min(y, height - 1.0) if y > 0.0 else 0.0
     return int(inside_x * PHASES + PHASES / 2), int(inside_y * PHASES + PHASES / 2)
@@ -229,7 +228,7 @@ def nearest_phase(x: float, y: float, width: int, height: int) -> Any:
 
 @helper
 def read_patch(image: Bytes, left: int, top: int, widths: Indices, patch: Floats32) -> float:
-    """Fill `patch` with the grey levels of a disc around a pixel; beyond the border those of the border.
+    """Fill `patch` with the grey levels of a disc around a pixel; the border is replicated.
 
     widths : of the disc's rows, px. Returns the sum of squares about the mean.
     """
@@ -255,7 +254,7 @@ def read_patch(image: Bytes, left: int, top: int, widths: Indices, patch: Floats
 
 @helper
 def to_gray(pixels: Bytes, channels: int, levels: Floats32) -> None:
-    """Fill `levels` with grey levels as OpenCV makes them of BGR, or of grey pixels themselves; less 128."""
+    """Fill `levels` with grey levels minus 128; BGR is converted as in OpenCV."""
     blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
     if channels == 1:
         for x in range(levels.size):
@@ -284,10 +283,10 @@ def align_marks(
     stderr: Floats32,
     seen: Flags,
 ) -> None:
-    """All steps of those `marks`, into `position` (n, 2), `stderr` (n,) and `seen` (n,).
+    """Align `marks`; fill `position` (n, 2), `stderr` (n,) and `seen` (n,).
 
-    image : (H, W, 3) BGR or (H, W, 1). start : (n, 2). places : as many as marks, where they are in the
-    model (see `_Model`). No step is longer along an axis than a radius.
+    image : (H, W, 3) BGR or (H, W, 1). start : (n, 2). places : indices of the marks in the model (see
+    `_Model`). Steps are limited to a radius along each axis.
     """
     height, width, _ = image.shape
     longest, count = np.float32(radius), weights.shape[0] // (PHASES * PHASES)
@@ -301,7 +300,7 @@ def align_marks(
         for _ in range(ROUNDS + 1):
             left, top = phase_x // PHASES, phase_y // PHASES
             which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + place
-            # A step of less than a pixel often sees the same patch from another phase.
+            # A step of less than a pixel often needs the same patch at another phase.
             if left != seen_left or top != seen_top:
                 seen_left, seen_top = left, top
                 varies = read_patch(image, left, top, widths, patch)
@@ -314,7 +313,8 @@ def align_marks(
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
             next_x, next_y = nearest_phase(now_x, now_y, width, height)
             if next_x == before_x and next_y == before_y:
-                # Between two phases, each of which leads to the other: the same from whichever it began.
+                # Two phases lead to each other: average them, so that the result does not depend on the
+                # start.
                 x, y = (x + now_x) / 2, (y + now_y) / 2
                 break
             x, y = now_x, now_y
@@ -328,7 +328,7 @@ def align_marks(
 
 @helper
 def fit_template(weight: Levels, term: Floats32, patch: Floats32, varies: float) -> Any:
-    """Gain, shift x and y times gain, r_squared, and the sum of squares of a patch that is not explained.
+    """Gain, shift x and y times gain, r_squared, and the residual sum of squares of a patch.
 
     varies : the patch's sum of squares about its mean.
     """

@@ -1,4 +1,4 @@
-"""Where every mark of the reference frame is now."""
+"""Track the marks of the reference frame."""
 
 from __future__ import annotations
 
@@ -32,53 +32,52 @@ from tactflow.vision.markers.template import Alignment, MarkerTemplates
 from tactflow.vision.types import Markers, MarkerStatus
 
 SEARCH_INTERVAL: Final = 10
-"""Frames between two searches for marks that stay missing. Chosen by hand."""
+"""Number of frames between two searches for marks that stay missing. Chosen by hand."""
 
 MAX_DISPLACEMENT: Final = 1.3
-"""Farthest a mark goes between two frames unless said otherwise, pitches. Chosen by hand."""
+"""Default maximum displacement of a mark between two frames, pitches. Chosen by hand."""
 
 JOINING_PROBABILITY: Final = 0.95
-"""Of a mark that the reference did not show, at least: of those called so 96 % are marks."""
+"""Minimum probability of a new mark that the reference did not show: 96 % of these are marks."""
 
 _INFERRED: Final = np.uint8(MarkerStatus.INFERRED)
 _LOST: Final = np.uint8(MarkerStatus.LOST)
 
 
 class MarkerTracker:
-    """Follows the marks of a reference frame: position, status, standard error and probability of each.
+    """Tracks the marks of a reference frame: position, status, standard error and probability of each.
 
-    Each mark is first aligned with its template, from where it was last. Where all are found and their
-    displacements form a smooth field, this is the answer. Otherwise spots are searched, and the largest
-    smooth component of the field grows: it predicts where the marks beside it are, and these take the spots
-    there. Every choice is then aligned as before. Marks that are not seen are placed by those around them.
+    Each mark is first aligned with its template, starting from its last position. If all are found and their
+    displacements form a smooth field, the frame is done. Otherwise the frame is searched for spots, and the
+    largest smooth component of the field is grown: it predicts the positions of adjacent marks, which take
+    the nearest spots and are aligned as before. Invisible marks are interpolated from their neighbours.
 
-    A position is always measured against the reference, so nothing drifts. What a mark did before only serves
-    as a starting point. Identities rest on the smoothness of the whole field, so a wrong one does not
-    survive.
+    Positions are always measured against the reference, so they do not drift; the last position is only a
+    starting point. Identities rest on the smoothness of the whole field, so a wrong one does not persist.
 
-    A mark that stays while those around it move, as dirt before the camera or a reflection does, leaves: it
-    is lost from then on. When the gel is at rest again after its first motion, marks are looked for once
-    more. Those that the reference did not show, where the lattice wants a mark, join behind the others.
+    A mark that stays while its neighbours move, such as dirt before the camera or a reflection, is rejected
+    and lost from then on. When the gel is at rest again after its first motion, marks are detected once more;
+    new ones, where the lattice predicts a mark, are appended.
 
-    Measured in float32, with templates of 16 bits; positions and standard errors are those of float64 to
-    1e-4 px.
+    Computed in float32, with templates of 16 bits; positions and standard errors agree with float64 to 1e-4
+    px.
 
     Parameters
     ----------
     reference : (H, W, 3) uint8 BGR or (H, W) uint8, the untouched gel; or several such frames of one size,
         whose mean has less noise.
     detection : the marks of the reference. None: those that `detect_markers` finds in the first frame.
-    max_displacement : farthest a mark may go between two frames, or from where its neighbours suggest, px.
-        Larger values cost time in the search and admit more confusion. None: 1.3 times the pitch.
-    valid : (H, W) uint8, not 0 where there is gel, for marks that join. None: everywhere.
+    max_displacement : maximum displacement of a mark between two frames, or from the prediction of its
+        neighbours, px. Larger values cost time in the search and risk confusion. None: 1.3 times the pitch.
+    valid : (H, W) uint8, non-zero where there is gel, for new marks. None: everywhere.
 
     Raises
     ------
-    ValueError : no reference frames, or frames of different size or kind.
+    ValueError : no reference frames, or frames of different size or type.
 
     References
     ----------
-    The modules `template`, `spots` and `matching` name those of their methods.
+    See the modules `template`, `spots` and `matching`.
 
     Examples
     --------
@@ -116,7 +115,7 @@ class MarkerTracker:
         self._pitch, self._radius = detection.pitch, detection.dot_radius
         self._valid, self._looked_again = valid, False
         self._prior = detection.probability
-        # Nothing that is seen goes farther than across the frame; the votes for a jump take memory.
+        # A visible mark moves at most across the frame; the votes for a jump take memory.
         across = float(np.hypot(*self._shape))
         self._farthest = min(max_displacement or MAX_DISPLACEMENT * self._pitch, across)
         self._polarity = detection.polarity
@@ -131,7 +130,7 @@ class MarkerTracker:
         self.reset()
 
     def _know(self, origin: Floats, edges: Indices) -> None:
-        """What follows from where the marks are in the reference, (N, 2) px, and from their links (E, 2)."""
+        """Set the marks of the reference, (N, 2) px, and what depends on them; edges : (E, 2)."""
         self._origin, self._count = origin, len(origin)
         self._graph = MarkerGraph(origin, edges)
         self._interpolator = Interpolator(origin, self._pitch)
@@ -147,16 +146,16 @@ class MarkerTracker:
         self._has_moved = False
 
     def _weigh(self, against: Floats) -> MotionEvidence:
-        """Begin with evidence (N,) against marks that is known already."""
+        """Motion evidence that starts from known evidence (N,) against the marks."""
         prior = np.full(self._count, np.nan) if self._prior is None else self._prior
         return MotionEvidence(self._origin, self._pitch, prior, against)
 
     def track(self, image: NDArray[np.uint8]) -> Markers:
-        """Find the marks in one frame.
+        """Track the marks in one frame.
 
         image : (H, W, 3) uint8 BGR or (H, W) uint8, of the reference's size.
-        Returns fresh arrays; `stderr` is NaN for marks that are not seen. Marks that join are behind those
-        that were there before. Raises ValueError for another size.
+        Returns new arrays; `stderr` is NaN for invisible marks, and new marks are appended. Raises ValueError
+        for another size.
         """
         if image.shape not in self._shapes or image.dtype != np.uint8:
             require_image(image)
@@ -164,14 +163,14 @@ class MarkerTracker:
         image = np.ascontiguousarray(image)
         found = self._align(image, self._position)
         smooth, torn = self._graph.check(found.position, found.seen)
-        # Where something stays missing, look again now and then.
+        # If marks stay missing, search again from time to time.
         missing = np.count_nonzero(found.seen) < self._count - len(self._evidence.left)
         self._age = self._age + 1 if missing else 0
         if torn or self._age >= SEARCH_INTERVAL or (missing and (self._seen & ~found.seen).any()):
             found = self._search(image, found, smooth)
             self._age = 0
         position, stderr, seen = found
-        # All tracked, which is 0; `np.full` takes three times as long.
+        # All TRACKED, which is 0; `np.full` takes three times as long.
         status = np.zeros(self._count, np.uint8)
         errors = stderr.astype(np.float64)
         if not seen.all():
@@ -191,13 +190,13 @@ class MarkerTracker:
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
 
     def _align(self, image: NDArray[np.uint8], start: Floats) -> Alignment:
-        """Align the marks from where they start, (N, 2) px; those that have left are not seen."""
+        """Align the marks from starting points (N, 2), px; rejected marks count as invisible."""
         found = self._templates.align(image, start)
         found.seen[self._evidence.left] = False
         return found
 
     def _join(self, image: NDArray[np.uint8]) -> bool:
-        """Take up marks of a frame at rest that the reference did not show; returns whether there are any."""
+        """Append marks of a frame at rest that the reference did not show; returns whether there are any."""
         try:
             radius = min(max(1.0, self._radius), min(self._shape) / 4)
             found = detect_markers(image, dot_radius=radius, polarity=self._polarity, valid=self._valid)
@@ -213,7 +212,7 @@ class MarkerTracker:
             return False
         centers, known = found.centers[joins], np.arange(self._count + int(joins.sum())) < self._count
         self._templates.add(to_gray(image).astype(np.float32), centers, _radii(found)[joins])
-        # Where they were in the reference: the marks around tell how the gel has moved since.
+        # Their positions in the reference follow from the motion of the marks around.
         origin = np.concatenate([self._origin, centers])
         placed = np.concatenate([self._position, centers])
         Interpolator(origin, self._pitch).place(placed, known)
@@ -226,11 +225,11 @@ class MarkerTracker:
         return True
 
     def _search(self, image: NDArray[np.uint8], found: Alignment, smooth: Flags) -> Alignment:
-        """Spots for the marks outside the largest smooth component of the field."""
+        """Assign spots to the marks outside the largest smooth component of the field, and align them."""
         gray = to_gray(image).astype(np.float32)
         spots, _ = find_peaks(gray, self._sigma, self._polarity, self._least)
         inliers = self._best_start(image, found, smooth, spots)
-        # Where a mark is seen without being an inlier is a spot like any other.
+        # The position of a visible mark that is not an inlier is a spot like any other.
         own = found.position[found.seen & ~inliers]
         spots = np.concatenate([spots, own[_are_apart(own, spots, REACH * self._pitch)]])
         spots = spots[_are_apart(spots, found.position[inliers], REACH * self._pitch)]
@@ -243,15 +242,15 @@ class MarkerTracker:
         return found
 
     def _best_start(self, image: NDArray[np.uint8], found: Alignment, smooth: Flags, spots: Floats) -> Flags:
-        """Align each grid from where most of its marks are inliers, in place; returns the inliers, (N,): the
+        """Align each grid from the start with the most inliers, in place; returns the inliers, (N,): the
         largest smooth component.
 
-        A grid that jumped by a pitch, or was let go from afar, is as smooth as before where it is not: what
-        tells is how many of its marks are there. So a grid that misses some may also be at its rest, or
-        displaced by what most pairs of a mark and a spot say.
+        A grid that was aligned a pitch off is as smooth as the correct one; only the number of its visible
+        marks reveals the error. So for a grid with missing marks, two more starts are tried: its rest
+        position, and the displacement that most pairs of a mark and a spot vote for.
         """
         inliers = self._graph.largest_component(found.seen, smooth)
-        # Whoever is a pitch off misses a row, which of N marks has about the root of N.
+        # A grid of N marks that is a pitch off misses a row, which has about sqrt(N) marks.
         torn = [grid for grid in self._graph.grids if 2 * np.count_nonzero(~inliers[grid]) > len(grid) ** 0.5]
         if not torn:
             return inliers
@@ -270,13 +269,13 @@ class MarkerTracker:
 
 
 def _radii(detection: Detection) -> Floats:
-    """(N,) of each mark, px."""
+    """Radius (N,) of each mark, px."""
     count, radii = len(detection.centers), detection.radii
     return np.full(count, detection.dot_radius) if radii is None else radii
 
 
 def _are_apart(points: Floats, others: Floats, distance: float) -> Flags:
-    """(n,) which points (n, 2) are farther than a distance, px, from all others (m, 2)."""
+    """Whether each point (n, 2) is farther than a distance, px, from all others (m, 2); (n,)."""
     if not (len(points) and len(others)):
         return np.ones(len(points), bool)
     return np.asarray(KDTree(others).query(points)[0] > distance)
