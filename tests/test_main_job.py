@@ -126,20 +126,6 @@ def test_a_subscriber_in_another_process_gets_every_message_of_a_run(
     assert json.loads(stats.read_text())["sinks"]["zmq"]["counters"]["serialised"] == 50
 
 
-def test_nothing_is_serialised_while_nobody_subscribes(tmp_path: Path) -> None:
-    stats = tmp_path / "stats.json"
-    words = [
-        *("run", str(PIPELINE), *ONLY_ZMQ, "--set", f"sinks.zmq.endpoint={free_endpoint()}", "--quiet"),
-        *("--source", "sim:press?frames=20", "--stats", str(stats)),
-    ]
-    assert main(words) == 0
-    read = json.loads(stats.read_text())
-    assert read["sinks"]["zmq"]["counters"]["serialised"] == 0
-    assert read["stages"]["hull"]["runs"] == 0, "nobody asked for the contact"
-    tracker = read["stages"]["tracker"]
-    assert tracker["runs"] + tracker["skips"].get("unchanged", 0) == 20, "a stateful stage misses no change"
-
-
 # -- exit codes -------------------------------------------------------------------------------------------
 
 

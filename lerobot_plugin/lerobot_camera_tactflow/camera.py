@@ -28,9 +28,8 @@ UNCHANGED = 128
 class TactflowCamera(Camera):
     """One output of a tactile sensor.
 
-    `result` is all that tactflow found in the frame that was returned last, and `capture_time` when it was
-    captured: Unix time, s, for a live source, from the start for a recording. After `connect`, `height` and
-    `width` are the first two lengths of what is returned.
+    `result` is tactflow's result of the frame that was returned last, or None; `result.t` is its capture
+    time. After `connect`, `height` and `width` are the first two lengths of what is returned.
 
     >>> camera = TactflowCamera(TactflowCameraConfig(source="sim:press", output="markers"))
     >>> with camera:
@@ -44,7 +43,7 @@ class TactflowCamera(Camera):
         self.config = config
         self.result: Result | None = None
         self._run: SharedRun | None = None
-        # Not the camera itself, which is disconnected when nobody refers to it any more.
+        # A key for the shared run that does not keep this camera alive: it disconnects when it is deleted.
         self._reader = object()
         self._shape: tuple[int, ...] = ()
         self._origins: NDArray[np.float64] | None = None
@@ -57,14 +56,9 @@ class TactflowCamera(Camera):
         """Whether the pipeline runs for this camera."""
         return self._run is not None
 
-    @property
-    def capture_time(self) -> float | None:
-        """When the frame that was returned last was captured, s; None before the first one."""
-        return None if self.result is None else self.result.t
-
     @staticmethod
     def find_cameras() -> list[dict[str, Any]]:
-        """The cameras of this machine; `id` is what to give as `source`."""
+        """The cameras of this machine; use `id` as `source`."""
         from tactflow.sources.cameras import list_cameras
 
         return [
@@ -78,8 +72,8 @@ class TactflowCamera(Camera):
 
         Raises
         ------
-        ConnectionError : the source cannot be opened, the pipeline is wrong or lacks what the output needs,
-            or no frame came in time. DeviceAlreadyConnectedError : as it says.
+        ConnectionError : the source cannot be opened, the pipeline is invalid or lacks what the output needs,
+            or no frame arrived in time. DeviceAlreadyConnectedError : it is connected already.
         """
         try:
             self._run, self._origins = SharedRun.join(self.config, self._reader), None
@@ -94,11 +88,11 @@ class TactflowCamera(Camera):
         logger.info("%s connected.", self)
 
     def _check_first_frame(self) -> None:
-        """Learn the shape of what is returned. The frame is not used up: the next read returns it too."""
+        """Determine the shape of the output. The next read returns this frame, too."""
         assert self._run is not None
         result = self._run.peek(self.config.timeout_s)
         if result is None:
-            raise TimeoutError(f"no frame came within {self.config.timeout_s:g} s")
+            raise TimeoutError(f"no frame arrived within {self.config.timeout_s:g} s")
         shape = self._output(result).shape
         for name, wanted, given in (("height", self.height, shape[0]), ("width", self.width, shape[1])):
             if wanted not in (None, given):
@@ -107,16 +101,16 @@ class TactflowCamera(Camera):
 
     @check_if_not_connected
     def read(self) -> NDArray[Any]:
-        """Return the next frame; as `async_read`, with ten seconds to come."""
+        """Return the next frame, as `async_read` with a timeout of ten seconds."""
         return self.async_read(READ_TIMEOUT_MS)
 
     @check_if_not_connected
     def async_read(self, timeout_ms: float = 200) -> NDArray[Any]:
-        """Return the newest frame that this camera has not returned yet; shapes are those of `Output`.
+        """Return the newest frame that this camera has not returned yet, in the shape given by `Output`.
 
         Raises
         ------
-        DeviceNotConnectedError : before `connect`. TimeoutError : no frame came in time.
+        DeviceNotConnectedError : before `connect`. TimeoutError : no frame arrived in time.
         RuntimeError : the source has ended, a stage failed, or the shape is not that of the first frame.
         """
         assert self._run is not None
@@ -130,11 +124,11 @@ class TactflowCamera(Camera):
 
     @check_if_not_connected
     def read_latest(self, max_age_ms: int = 500) -> NDArray[Any]:
-        """Return the newest frame at once, whether or not it was returned before.
+        """Return the newest frame immediately, even if it was returned before.
 
         Raises
         ------
-        DeviceNotConnectedError : before `connect`. TimeoutError : it came more than `max_age_ms` ago.
+        DeviceNotConnectedError : before `connect`. TimeoutError : it is older than `max_age_ms`.
         RuntimeError : there is none yet.
         """
         assert self._run is not None
@@ -150,7 +144,7 @@ class TactflowCamera(Camera):
         return self._returned(result)
 
     def disconnect(self) -> None:
-        """Stop the pipeline, if no other camera shows it. Raises DeviceNotConnectedError before `connect`."""
+        """Stop the pipeline unless other cameras use it. Raises DeviceNotConnectedError before `connect`."""
         if self._run is None:
             raise DeviceNotConnectedError(f"{self} not connected.")
         self._leave()
@@ -169,7 +163,7 @@ class TactflowCamera(Camera):
         return output
 
     def _output(self, result: Result) -> NDArray[Any]:
-        """What is returned of a result. Raises ValueError where the pipeline does not compute it."""
+        """The configured output of a result. Raises ValueError if the pipeline does not compute it."""
         match self.config.output:
             case Output.IMAGE:
                 return self._in_order(_required(result, "image", "a stage preprocess"))
@@ -187,13 +181,13 @@ class TactflowCamera(Camera):
                 columns = [markers.origin, markers.displacement, markers.status[:, None]]
                 if self._origins is None:
                     self._origins = markers.origin.copy()
-                # A dataset has one shape: markers that have joined those of the first frame are left out.
+                # A dataset has a fixed shape, so leave out markers that were added after the first frame.
                 count = len(self._origins)
-                joined = np.array_equal(markers.origin[:count], self._origins)
-                return np.hstack(columns).astype(np.float32)[: count if joined else None]
+                was_extended = np.array_equal(markers.origin[:count], self._origins)
+                return np.hstack(columns).astype(np.float32)[: count if was_extended else None]
 
     def _in_order(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A copy that the caller may write to, (H, W, 3), in the colors' order that is configured."""
+        """A writable copy (H, W, 3), in the configured order of colors."""
         rgb = self.config.color_mode is ColorMode.RGB
         return np.ascontiguousarray(image[:, :, ::-1]) if rgb else image.copy()
 

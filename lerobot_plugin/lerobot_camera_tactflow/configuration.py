@@ -1,4 +1,4 @@
-"""What can be set about the camera."""
+"""Settings of the camera."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Output(StrEnum):
 
     image : (H, W, 3) uint8, the processed frame.
     difference : (H, W, 3) uint8, 128 + half of the change against the untouched gel, without its dots.
-    depth : (H, W, 3) uint8, how far the gel is pushed in, grey: `depth_mm` or more is 255.
-    markers : (N, 5) float32, of each marker: its place x, y in the reference frame, its displacement dx, dy,
-        all in px, and its status: 0 tracked, 1 inferred, 2 lost.
+    depth : (H, W, 3) uint8, grey, depth of the indentation: `depth_mm` or more is 255.
+    markers : (N, 5) float32: x, y of each marker in the reference frame and its displacement dx, dy, px, and
+        its status: 0 tracked, 1 inferred, 2 lost.
     """
 
     IMAGE = "image"
@@ -31,17 +31,17 @@ class Output(StrEnum):
 class TactflowCameraConfig(CameraConfig):
     """A tactile sensor; `width` and `height`, if set, must be those of the output.
 
-    source : of frames, as `tactflow run --source`: a camera, a recording, `sim:press`.
+    source : as for `tactflow run --source`: a camera, a recording, `sim:press`.
     pipeline : a file, or the name of a shipped pipeline such as "mini"; None is tactflow's default.
-    output : what is returned, see `Output`.
-    settings : values of the pipeline file to replace, as `{"calibration": "left.yaml"}`.
+    output : what the camera returns, see `Output`.
+    settings : overrides of the pipeline file, such as `{"calibration": "left.yaml"}`.
     color_mode : order of the colors of `image` and `difference`.
-    depth_mm : depth that becomes 255, mm: the smaller, the finer are the steps.
-    realtime : whether a recording plays at its own pace, as a camera does. Without, its next frame waits
-        until the last one has been read, and none is dropped.
+    depth_mm : depth that becomes 255, mm; a smaller one gives finer steps.
+    realtime : play a recording at its own pace, like a camera. Otherwise the next frame waits until all
+        cameras have read the last one, and no frame is dropped.
     timeout_s : longest wait for the first frame, s; the very first run compiles for a minute.
 
-    Cameras with the same source, pipeline, settings and pace share one run, so that a sensor gives several
+    Cameras with the same source, pipeline, settings and pace share one run, so that a sensor can have several
     outputs.
     """
 

@@ -1,4 +1,4 @@
-"""A running pipeline, shared by all cameras that show one of its outputs."""
+"""A running pipeline, shared by the cameras that return its outputs."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from tactflow import Result, Sink, stream
 from tactflow.ports import Unmarked, Untouched
 
 REQUEST = "lerobot_camera_tactflow"
-"""Id of the sink that asks for the pictures of `difference`."""
+"""Id of the sink that requests the pictures of `difference`."""
 LEAVE_SECONDS = 2.0
-"""Longest wait for a run to end, s, as for LeRobot's own cameras: one whose camera hangs ends by itself."""
+"""Longest wait for a run to end, s, as for LeRobot's own cameras; a run that hangs is left to end later."""
 
 
 class AskForPictures(Sink):
-    """Needs both pictures of `difference`, so that they are in every result."""
+    """Requests both pictures of `difference`, so that they are in every result."""
 
     def write(self, unmarked: Unmarked | None, untouched: Untouched | None) -> None:
-        """Nothing is done with them here."""
+        """Ignore them."""
 
 
 class SharedRun:
     """The newest result of a pipeline, for several readers.
 
-    config : of the camera that comes first. `counter` is the number of results so far; `arrived` when the
-    last one came, on the monotonic clock, s; `failure` why no more will come, empty while the run goes on.
+    config : of the first camera. counter : number of results so far. arrived : monotonic time of the last
+    one, s. failure : why there will be no more results; empty while the run goes on.
     """
 
     _running: ClassVar[dict[str, SharedRun]] = {}
@@ -36,7 +36,7 @@ class SharedRun:
 
     @classmethod
     def join(cls, config: TactflowCameraConfig, reader: object) -> SharedRun:
-        """Become a reader of the run of this configuration, which starts with its first reader."""
+        """Add a reader to the run of this configuration, which starts with its first reader."""
         with cls._registry_lock:
             run = cls._running.get(config.run_key)
             if run is None or run.failure:
@@ -68,7 +68,7 @@ class SharedRun:
         self._thread.start()
 
     def leave(self, reader: object) -> None:
-        """Read no more; the run ends with its last reader."""
+        """Remove a reader; the run ends with its last one."""
         with self._registry_lock:
             with self.changed:
                 self._seen.pop(reader, None)
@@ -80,11 +80,9 @@ class SharedRun:
             self._thread.join(LEAVE_SECONDS)
 
     def peek(self, timeout_s: float) -> Result | None:
-        """The newest result, once there is one, which stays unread; None if none came in time.
+        """Wait for a result, and return the newest without marking it as read; None after the timeout.
 
-        Raises
-        ------
-        RuntimeError : there will be none.
+        Raises RuntimeError if there will be none.
         """
         with self.changed:
             self.changed.wait_for(lambda: self.latest is not None or self.failure, timeout_s)
@@ -93,11 +91,9 @@ class SharedRun:
             return self.latest
 
     def read(self, reader: object, timeout_s: float) -> Result | None:
-        """The newest result, once it is one that this reader has not seen; None if none came in time.
+        """Wait for a result that this reader has not seen, and return the newest; None after the timeout.
 
-        Raises
-        ------
-        RuntimeError : no more will come.
+        Raises RuntimeError if there will be no more.
         """
         with self.changed:
             self.changed.wait_for(lambda: self.counter > self._seen[reader] or self.failure, timeout_s)
@@ -123,7 +119,7 @@ class SharedRun:
             self.changed.notify_all()
 
     def _publish(self, result: Result) -> bool:
-        """Show a result to the readers; whether they want another one."""
+        """Hand a result to the readers; returns whether to go on."""
         with self.changed:
             self.latest, self.arrived = result, time.monotonic()
             self.counter += 1

@@ -18,9 +18,10 @@ from tactflow.adapters.lerobot import DatasetWriter
 from tactflow.cli.main import main
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message.episodes import MarkerOrder
 from tactflow.message.result import Result
 from tactflow.sources import open_source
-from tactflow.vision.types import Contact, Depth, Flow, Force, Pose, Scale
+from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Pose, Scale
 from tests.adapters.lerobot_env import needs_datasets, run_with_lerobot
 from tests.messages import Results, result_of
 
@@ -31,6 +32,9 @@ import pyarrow.parquet as pq
 
 KEY = "observation.images.main"
 SPECS = ["sim:press?frames=40&noise=0", "sim:press?frames=30"]
+MARKERS = "sim:press?frames=100"
+ORIGIN = np.array([[10.0, 10.0], [30.0, 10.0], [50.0, 10.0], [10.0, 30.0], [30.0, 30.0], [50.0, 30.0]])
+MAIN = "observation.tactile.main"
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +44,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with redirect_stderr(StringIO()) as said:
         assert main(["export", "lerobot", *SPECS, *options]) == 0
     assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in said.getvalue()
+    return out
+
+
+@pytest.fixture(scope="module")
+def with_markers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("export") / "markers"
+    with redirect_stderr(StringIO()):
+        assert main(["export", "lerobot", MARKERS, "--out", str(out), "--pictures", "png"]) == 0
     return out
 
 
@@ -151,13 +163,67 @@ def test_a_recording_brings_its_calibration_into_the_dataset(tmp_path: Path) -> 
     assert any(row["observation.tactile.contact_mm"][0] for row in rows)
 
 
+def test_a_dataset_holds_the_markers_that_were_found(with_markers: Path) -> None:
+    results = list(tactflow.stream(source=MARKERS, settings={"sinks": {}}))
+    found = np.stack([r.markers.displacement for r in results if r.markers is not None])
+    status = np.stack([r.markers.status for r in results if r.markers is not None])
+    assert found.shape == (100, 80, 2)
+    assert np.abs(found).max() > 1
+
+    table = pq.read_table(with_markers / "data").to_pydict()
+    assert np.array_equal(np.array(table[f"{MAIN}.marker_offset"], np.float32), found.astype(np.float32))
+    assert np.array_equal(table[f"{MAIN}.marker_status"], status)
+
+
+def frames_of(*markers: Markers | None) -> list[Result]:
+    """A result for each, ten a second, of 64 x 48 pixels."""
+    image = np.zeros((48, 64, 3), np.uint8)
+    return [
+        result_of(Tick(Frame("main", index, index / 10, image)), Results(image, markers=found))
+        for index, found in enumerate(markers)
+    ]
+
+
+def moved(offset: tuple[float, float], origin: np.ndarray = ORIGIN, status: int = 0) -> Markers:
+    count = len(origin)
+    return Markers(origin, origin + offset, np.full(count, status, np.uint8), np.zeros(count))
+
+
+def test_markers_keep_their_place_in_recordings_that_found_others(tmp_path: Path) -> None:
+    fewer = ORIGIN[[5, 3, 2, 1, 0]] + 2.0
+    writer = DatasetWriter(tmp_path, 10, "press")
+    for markers in (moved((1.0, 0.0)), moved((3.0, 0.0), fewer)):
+        writer.add(frames_of(None, markers))
+    writer.finish()
+    table = pq.read_table(tmp_path / "data").to_pydict()
+    status = [[2] * 6, [0] * 6, [2] * 6, [0, 0, 0, 0, 2, 0]]
+    assert table[f"{MAIN}.marker_status"] == status
+    assert np.array_equal(np.array(table[f"{MAIN}.marker_offset"])[:, :, 0], np.outer([0, 1, 0, 3], [1] * 6))
+
+
+def test_a_gel_that_was_moved_is_refused() -> None:
+    order = MarkerOrder()
+    order.align(moved((0.0, 0.0)))
+    with pytest.raises(StageError, match="only 0 of 6 markers are where"):
+        order.align(moved((0.0, 0.0), ORIGIN + 10.5))
+    with pytest.raises(StageError, match="only 0 of 6"):
+        order.align(moved((0.0, 0.0), np.zeros((0, 2))))
+
+
+def test_a_recording_with_markers_after_one_without_is_refused(tmp_path: Path) -> None:
+    writer = DatasetWriter(tmp_path, 10, "press")
+    writer.add(frames_of(None))
+    with pytest.raises(StageError, match="has markers, and the recordings before have none"):
+        writer.add(frames_of(moved((0.0, 0.0))))
+
+
 OPENED = """
 import sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 dataset = LeRobotDataset("tactflow/press", root=sys.argv[1], video_backend="pyav")
 item = dataset[45]
-print(dataset.num_episodes, dataset.num_frames, dataset.fps, item["task"], tuple(item[sys.argv[2]].shape),
-    tuple(item["observation.tactile.contact"].shape), int(item["episode_index"]), sep="; ")
+print(dataset.num_episodes, dataset.num_frames, dataset.fps, item["task"], int(item["episode_index"]),
+    *(tuple(item[name].shape) for name in sys.argv[2:]), sep="; ")
 """
 
 
@@ -176,9 +242,11 @@ except OSError as error:
 
 
 @needs_datasets
-def test_lerobot_opens_it(dataset: Path) -> None:
-    opened = run_with_lerobot(OPENED, str(dataset), KEY)
-    assert opened == "2; 70; 60; press; (3, 400, 300); (5,); 1"
+def test_lerobot_opens_it(dataset: Path, with_markers: Path) -> None:
+    opened = run_with_lerobot(OPENED, str(dataset), KEY, "observation.tactile.contact")
+    assert opened == "2; 70; 60; press; 1; (3, 400, 300); (5,)"
+    opened = run_with_lerobot(OPENED, str(with_markers), f"{MAIN}.marker_offset", f"{MAIN}.marker_status")
+    assert opened == "1; 100; 60; touch; 0; (80, 2); (80,)"
 
 
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
