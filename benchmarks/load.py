@@ -189,7 +189,7 @@ def soak(frames: int, folder: Path) -> list[dict[str, float]]:
     sinks = {
         "zmq": {"endpoint": f"tcp://127.0.0.1:{PORT}"},
         "jsonl": {"path": "results.jsonl"},
-        "record": {"path": "recording.mcap", "rotate_size": 200},
+        "record": {"path": "recording.mcap", "rotate_after": 60},
         "images": {"folder": "images", "format": "jpg", "max_rate": 1},
         "video": {"path": "annotated.mkv", "fps": 60},
         "view": {"port": PORT + 1},

@@ -9,7 +9,7 @@ from pydantic import Field
 from tactflow.engine.contract import Output
 from tactflow.engine.control import Control
 from tactflow.message.lines import LineFile, LineStream
-from tactflow.message.result import Result, encode_message
+from tactflow.message.result import MessageParams, Result, encode_message
 from tactflow.outputs import AppendParams, OutputSink
 from tactflow.system.files import expanded, is_device
 
@@ -24,20 +24,13 @@ class Jsonl(OutputSink):
 
     queue_capacity = 16
 
-    class Params(AppendParams):
+    class Params(MessageParams, AppendParams):
         """Destination and content."""
 
         path: str = Field(
             "results.jsonl", min_length=1, description="file, relative to the current directory; - is stdout"
         )
         flush: float = Field(0.5, ge=0, description="longest time that lines are buffered, s; 0: not at all")
-        detail: bool = Field(
-            False,
-            description="also write confidence, rotation, divergence, shear, residual, standard errors",
-        )
-        field: bool = Field(
-            False, description="also write the displacement field of the stage field: some 100 kB a frame"
-        )
 
     def __init__(self, params: Params, control: Control | None = None) -> None:
         """Prepare; nothing is opened yet.

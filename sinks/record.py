@@ -38,8 +38,8 @@ class Record(OutputSink, Recorder):
     recording always includes the reference frames of its frames.
 
     A recording from the start is written to `path`, all others to numbered files, `press-001.mcap`, which
-    never replace a file. With `rotate_size` or `rotate_after`, a long recording continues in further numbered
-    files, each of which can be played by itself.
+    never replace a file. With `rotate_after`, a long recording continues in further numbered files, each of
+    which can be played by itself.
     """
 
     takes_references = True
@@ -53,26 +53,16 @@ class Record(OutputSink, Recorder):
         )
         trigger: Literal["start", "button", "contact"] | None = Field(
             None,
-            description="what starts a recording: the start of the run, the button of the view, or a contact "
-            "(a file for each); null: the button if there is a ring, else the start",
+            description="starts a recording: start of the run, button of the view, or each contact; "
+            "null: the button if there is a ring, else the start",
         )
         ring: float | None = Field(
-            None,
-            gt=0,
-            le=3600,
-            description="seconds kept in memory; the button saves them, and each recording of a contact "
-            "begins with them",
+            None, gt=0, le=3600, description="seconds kept in memory, with which a recording begins"
         )
         memory: int = Field(
-            2048,
-            ge=16,
-            description="memory limit of the ring, MB (30 s of 800 x 600 at 60 Hz take 1300); older frames "
-            "are dropped with a warning",
+            2048, ge=16, description="limit of the ring, MB (30 s of 800 x 600 at 60 Hz take 1300)"
         )
         after: float = Field(1.0, ge=0, description="seconds recorded after a contact has ended")
-        rotate_size: int | None = Field(
-            None, ge=1, description="size at which another numbered file begins, MB"
-        )
         rotate_after: float | None = Field(
             None, gt=0, description="time after which another numbered file begins, s"
         )
@@ -286,10 +276,8 @@ class Record(OutputSink, Recorder):
         self._counts["frames"] += 1
 
     def _is_full(self, file: RecordingWriter, entry: Entry) -> bool:
-        size, after = self.params.rotate_size, self.params.rotate_after
-        return (size is not None and file.bytes >= size * 1_000_000) or (
-            after is not None and entry.time - file.begins >= after * 1e9
-        )
+        after = self.params.rotate_after
+        return after is not None and entry.time - file.begins >= after * 1e9
 
     def _finish(self) -> None:
         file, self._file = self._file, None

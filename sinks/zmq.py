@@ -11,20 +11,18 @@ import orjson
 from pydantic import Field, field_validator, model_validator
 
 from tactflow.drawing.jpeg import encode_jpeg
-from tactflow.engine.contract import Publication, Sink, StageParams
+from tactflow.engine.contract import Publication, Sink
 from tactflow.engine.control import Control
 from tactflow.engine.rate import RateLimit
-from tactflow.message.result import Result, encode_message
+from tactflow.message.result import MessageParams, Result, encode_message
 from tactflow.network.address import Address
-from tactflow.network.commands import Commands, ControlSocket
+from tactflow.network.commands import ControlSocket
 from tactflow.network.publisher import Publisher
 from tactflow.ports import Image
 
 log = logging.getLogger("tactflow")
 
 STATS_TOPIC = b"tactflow.stats "
-LARGEST = 2**31 - 1
-"""Largest number of ZeroMQ, which uses C's `int`."""
 
 
 class Zmq(Sink):
@@ -47,62 +45,37 @@ class Zmq(Sink):
     threaded = True
     when_live = "latest"
 
-    class Params(StageParams):
+    class Params(MessageParams):
         """Address, queue, and access of subscribers and of commands."""
 
         endpoint: str = Field(
             "tcp://127.0.0.1:5556",
-            description="address to bind: tcp://127.0.0.1:PORT for this machine only (* picks a free port), "
-            "ipc:///path, or tcp://*:PORT for the network, which requires keys",
+            description="address: tcp://127.0.0.1:PORT (* picks a free port) or ipc:///PATH on this machine, "
+            "tcp://*:PORT for the network, which requires keys",
         )
         keys: str | None = Field(
             None,
             min_length=1,
-            description="the publisher's folder that tactflow keys new makes, relative to the current "
-            "directory: only subscribers with a key in it are admitted, and all is encrypted",
+            description="publisher's folder of tactflow keys new: only its subscribers are admitted",
         )
-        open_to_all: bool = Field(
-            False, description="publish to other machines without keys, so that everybody there may read"
-        )
+        open_to_all: bool = Field(False, description="let everybody on other machines read, without keys")
         backlog: int = Field(
             32,
             ge=1,
-            le=LARGEST,
-            description="messages queued for each subscriber (32: half a second at 60 Hz); more bridge "
-            "longer pauses, fewer are fresher",
+            le=2**31 - 1,
+            description="messages queued for each subscriber; more bridge longer pauses, fewer are fresher",
         )
-        linger: float = Field(
-            1.0, ge=0, le=60, description="time to deliver the last messages at the end of a run, s"
-        )
-        wait_for_subscriber: float = Field(
-            0.0, ge=0, description="wait at most this long for a subscriber before the first frame, s"
-        )
-        detail: bool = Field(
-            False,
-            description="also send confidence, rotation, divergence, shear, residual, standard errors",
-        )
-        field: bool = Field(
-            False, description="also publish the displacement field of the stage field: some 100 kB a frame"
-        )
-        stats_every: float = Field(
-            1.0,
-            ge=0,
-            le=3600,
-            description="interval of statistics (topic tactflow.stats), s; 0: none",
-        )
+        linger: float = Field(1.0, ge=0, le=60, description="time to deliver the last messages, s")
+        wait_for_subscriber: float = Field(0.0, ge=0, description="longest wait for a first subscriber, s")
+        stats_every: float = Field(1.0, ge=0, le=3600, description="interval of tactflow.stats, s; 0: none")
         pictures: float = Field(
-            0.0,
-            ge=0,
-            le=240,
-            description="rate of pictures and depth maps for subscribers to tactflow_picture.<sensor> or "
-            "tactflow_depth.<sensor>, Hz; 0: none",
+            0.0, ge=0, le=240, description="rate of tactflow_picture and tactflow_depth, Hz; 0: none"
         )
         quality: int = Field(80, ge=1, le=100, description="of the pictures; higher is sharper and larger")
         control: str | None = Field(
             None,
             min_length=1,
-            description="address for commands (tactflow control), such as tcp://127.0.0.1:5557; one that "
-            "other machines can reach requires keys; null: no commands",
+            description="address for commands, such as tcp://127.0.0.1:5557; null: none",
         )
         control_keys: str | None = Field(
             None, min_length=1, description="folder of keys for commands; null: same as keys"
@@ -138,10 +111,7 @@ class Zmq(Sink):
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is bound yet.
 
-        Parameters
-        ----------
-        sensor : names the topic.
-        control : the run, for statistics and commands; or None.
+        sensor : names the topic. control : the run, for statistics and commands; or None.
         """
         super().__init__(params)
         self.endpoint = params.endpoint
@@ -194,8 +164,7 @@ class Zmq(Sink):
         self.description = f"{self._topic.decode().strip()} on {self.endpoint}"
         log.info("publishing %s", self.description)
         if p.control is not None:
-            commands = Commands(self._control)
-            self._commands = ControlSocket(p.control, p.commanders, self._sensor, commands)
+            self._commands = ControlSocket(p.control, p.commanders, self._sensor, self._control)
             log.info("taking commands on %s", self.control_endpoint)
         self.wait_for_subscriber(p.wait_for_subscriber)
         if self._control is not None and p.stats_every:

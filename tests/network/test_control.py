@@ -16,7 +16,7 @@ from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
 from tactflow.engine.control import Control
 from tactflow.engine.run import Runner
-from tactflow.network.commands import Commands, ControlSocket
+from tactflow.network.commands import ControlSocket
 from tactflow.network.remote_control import RemoteControl
 from tactflow.sinks.record import Record
 from tactflow.sinks.zmq import Zmq
@@ -36,7 +36,7 @@ sinks:
 @pytest.fixture
 def bare() -> Iterator[ControlSocket]:
     """The socket of a run that can do nothing."""
-    socket = ControlSocket(ANY_PORT, None, "main", Commands(None))
+    socket = ControlSocket(ANY_PORT, None, "main", None)
     yield socket
     socket.close()
 
@@ -109,7 +109,7 @@ def test_a_command_that_fails_is_answered_and_ends_nothing(caplog: pytest.LogCap
         def snapshot(self) -> dict[str, object]:
             return {"counters": object()}
 
-    socket = ControlSocket(ANY_PORT, None, "main", Commands(cast(Control, Broken())))
+    socket = ControlSocket(ANY_PORT, None, "main", cast(Control, Broken()))
     try:
         with RemoteControl(socket.endpoint, PATIENCE) as run:
             with pytest.raises(RuntimeError, match="no space left"):

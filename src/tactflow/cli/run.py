@@ -212,12 +212,11 @@ def add_arguments_record(parser: argparse.ArgumentParser) -> None:
     add_overwrite(existing, "FILE.mcap")
     existing.add_argument("--number", action="store_true", help="if it exists, record to FILE-001.mcap, ...")
     parser.add_argument(
-        "--rotate-size",
-        type=int,
-        metavar="MB",
-        help="continue in FILE-001.mcap, ... when a file has this size",
+        "--rotate-after",
+        type=float,
+        metavar="SECONDS",
+        help="continue in FILE-001.mcap, ... when a file has this length",
     )
-    parser.add_argument("--rotate-after", type=float, metavar="SECONDS", help="... or this length")
 
 
 def run_record(args: argparse.Namespace) -> int:
@@ -245,6 +244,4 @@ def _recording_options(args: argparse.Namespace, out: Path) -> dict[str, Any]:
         raise ConfigError(
             f"--out: {out} already exists; give --overwrite to replace it or --number to record beside it"
         )
-    rotation = {"rotate_size": args.rotate_size, "rotate_after": args.rotate_after}
-    chosen = {key: value for key, value in rotation.items() if value is not None}
-    return {"path": str(out), "overwrite": args.overwrite, **chosen}
+    return {"path": str(out), "overwrite": args.overwrite, "rotate_after": args.rotate_after}

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, Self, get_type_hints
 
 import numpy as np
 import orjson
+from pydantic import Field
 
 from tactflow.engine.check import read_only
+from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import NO_PICTURE, Frame, Tick
 from tactflow.message.decoding import decode_values
 from tactflow.message.encoding import SCHEMA, encode
@@ -154,6 +156,13 @@ class Result(Tick):
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise ValueError(f"required a message {SCHEMA}: {type(error).__name__}: {error}") from None
         return result
+
+
+class MessageParams(StageParams):
+    """Parameters of a sink that writes or publishes messages: the options of `encode_message`."""
+
+    detail: bool = Field(False, description="also confidence, rotation, divergence, shear, standard errors")
+    field: bool = Field(False, description="also the displacement field: some 100 kB a frame")
 
 
 def _is_picture(value: Any) -> bool:

@@ -122,12 +122,12 @@ class Commands:
 class ControlSocket(BoundSocket):
     """Serves the commands of a run over ZeroMQ, in a thread of its own, until it is closed.
 
-    endpoint, keys, Raises : as for `BoundSocket`. sensor : name in replies. commands : executes them.
+    endpoint, keys, Raises : as for `BoundSocket`. sensor : name in replies. control : handle on the run.
     """
 
-    def __init__(self, endpoint: str, keys: str | None, sensor: str, commands: Commands) -> None:
+    def __init__(self, endpoint: str, keys: str | None, sensor: str, control: Control | None) -> None:
         self._sensor = sensor
-        self._commands = commands
+        self._commands = Commands(control)
         self._closing = threading.Event()
         # A REP socket would stop replying once a client leaves in the middle of a request.
         super().__init__(zmq.ROUTER, endpoint, _HINT, {}, keys)
