@@ -148,15 +148,28 @@ def test_a_second_run_to_the_same_output_is_refused(kind: str, existing: str | N
     seen: list[Seen] = []
 
     def run_again(_: Runner) -> None:
-        changed = {
-            id_: {**settings, **({existing: True} if existing else {})} for id_, settings in sinks.items()
-        }
-        seen.append(run(other, changed, source=source)[1])
+        (settings,) = sinks.values()
+        again = settings | ({existing: True} if existing else {})
+        seen.append(run(other, {kind.split()[0]: again}, source=source)[1])
 
     _, first = run(tmp_path, sinks, run_again, source=source)
     seen[0].must_be(3, f"{output}: another run is writing to it; end that run, or give another path")
     first.must_be(0)
     assert KINDS[kind].look(output).startswith(f"{FRAMES} ")
+
+
+@pytest.mark.parametrize("kind", ["jsonl", "images", "video .avi", "record", "parquet"])
+def test_existing_output_is_replaced_only_when_asked(kind: str, tmp_path: Path) -> None:
+    output, source = tmp_path / KINDS[kind].output, str(array(tmp_path, 9))
+    sinks = settings_of(kind, output)
+    for _ in range(2):
+        _, seen = run(tmp_path, sinks, source=source)
+    seen.must_be(3, "(this file exists|already holds).* set overwrite: true")
+    assert KINDS[kind].look(output).startswith("9 ")
+    (settings,) = sinks.values()
+    _, seen = run(tmp_path, {kind.split()[0]: settings | {"overwrite": True}}, source=source, max_frames=5)
+    seen.must_be(0)
+    assert KINDS[kind].look(output).startswith("9 " if kind == "images" else "5 ")
 
 
 def test_a_second_export_to_the_same_folder_is_refused(

@@ -339,16 +339,6 @@ def test_mistakes_are_told_before_anything_starts(
     assert [file.name for file in tmp_path.iterdir()] == ["pipeline.yaml"]
 
 
-def test_an_address_that_is_taken_is_told(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    with zmq.Context() as context, context.socket(zmq.REP) as taken:
-        port = taken.bind_to_random_port("tcp://127.0.0.1")
-        assert main(["run", "--set", f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}'}}"]) == 3
-    assert "is in use" in capsys.readouterr().err
-
-
 def test_check_reports_each_mistake_of_all_sensors_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

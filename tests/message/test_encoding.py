@@ -148,23 +148,6 @@ def test_every_attribute_is_in_the_detailed_message_and_read_back(port: str, par
     assert short.keys() <= message[port].keys()
 
 
-def test_a_pose_has_its_errors_and_in_detail_their_covariance() -> None:
-    message = build_message(TICK, Results(PROCESSED, CONTACT, pose=POSE))
-    assert message["pose"] == {
-        "status": "tracked",
-        "since": 12,
-        "center": [0.5, -1.0, -0.4],
-        "translation": [0.1, 0.0, -0.2],
-        "rotation": [0.0, 1.5, 4.0],
-        "stderr": [1, 2, 3, 4, 5, 6],
-    }
-    detailed = build_message(TICK, Results(PROCESSED, CONTACT, pose=POSE), detail=True)
-    assert detailed["pose"]["covariance"][7] == 4
-    read = Result.from_message(message).pose
-    assert read is not None
-    np.testing.assert_array_equal(read.covariance, POSE.covariance)
-
-
 def test_a_force_has_its_errors_and_null_where_a_component_is_unknown() -> None:
     force = Force((None, None, 2.5), (None, None, 0.2), True)
     message = build_message(TICK, Results(PROCESSED, CONTACT, force=force))

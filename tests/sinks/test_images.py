@@ -7,9 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 
-from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.images import Images
 
@@ -48,13 +46,3 @@ def test_jpg_files_are_smaller_with_less_quality(tmp_path: Path) -> None:
         run(folder, [7], format="jpg", quality=quality)
         sizes.append((folder / "frame-000007.jpg").stat().st_size)
     assert sizes[1] < sizes[0]
-
-
-@pytest.mark.parametrize("suffix", ["png", "jpg"])
-def test_a_folder_that_holds_frames_is_refused_unless_asked(suffix: str, tmp_path: Path) -> None:
-    (tmp_path / f"frame-000000.{suffix}").write_bytes(b"precious")
-    with pytest.raises(StageError, match=rf"frame-000000\.{suffix}.*overwrite: true"):
-        run(tmp_path, [0])
-    assert (tmp_path / f"frame-000000.{suffix}").read_bytes() == b"precious"
-    run(tmp_path, [0], overwrite=True)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "frame-000000.png")), picture(0))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
 from tactflow.sinks.jsonl import Jsonl
@@ -55,14 +54,6 @@ def test_lines_wait_for_the_interval_or_the_end(tmp_path: Path) -> None:
     write(at_once, range(3, 4))
     assert seqs_in(path) == [0, 1, 2, 3]
     at_once.close()
-
-
-def test_an_existing_file_is_neither_replaced_nor_touched_unasked(tmp_path: Path) -> None:
-    path = tmp_path / "r.jsonl"
-    path.write_text('{"seq":7}\n')
-    with pytest.raises(StageError, match=r"r\.jsonl: this file exists.*overwrite: true.*append: true"):
-        opened(path)
-    assert seqs_in(path) == [7]
 
 
 def test_standard_output_gets_every_line_at_once(capfdbinary: pytest.CaptureFixture[bytes]) -> None:

@@ -82,16 +82,6 @@ def test_the_pace_can_be_given(tmp_path: Path) -> None:
     assert play(tmp_path / "film.avi")[1] == pytest.approx(7.5)
 
 
-def test_an_existing_file_is_replaced_only_when_asked(tmp_path: Path) -> None:
-    path = tmp_path / "film.avi"
-    path.write_text("precious")
-    with pytest.raises(StageError, match=r"film\.avi: this file exists; set overwrite: true"):
-        film(path, pictures(2))
-    assert path.read_text() == "precious"
-    film(path, pictures(2), overwrite=True)
-    assert len(play(path)[0]) == 2
-
-
 def test_without_any_frame_there_is_no_file(tmp_path: Path) -> None:
     film(tmp_path / "film.avi", [])
     assert list(tmp_path.iterdir()) == []
@@ -102,14 +92,7 @@ def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
         film(tmp_path / "film.avi", [*pictures(2), *pictures(1, 48, 62)])
 
 
-@pytest.mark.parametrize(
-    ("params", "expected"),
-    [
-        ({"path": "film"}, "required a path that ends in"),
-        ({"path": "film.gif"}, "required a path that ends in"),
-        ({"fps": 0}, "greater than 0"),
-    ],
-)
-def test_wrong_parameters_are_refused(params: dict[str, Any], expected: str) -> None:
-    with pytest.raises(ValidationError, match=expected):
-        Video.Params(**params)
+@pytest.mark.parametrize("name", ["film", "film.gif"])
+def test_another_extension_is_refused(name: str) -> None:
+    with pytest.raises(ValidationError, match="required a path that ends in"):
+        Video.Params(path=name)

@@ -171,17 +171,6 @@ def test_an_ipc_address_takes_no_file_and_no_other_runs_place(opened: Open, tmp_
     opened(endpoint=f"ipc://{place}")
 
 
-def test_opening_can_wait_for_a_subscriber(opened: Open, subscribe: Subscribe) -> None:
-    reserved = opened(wait_for_subscriber=0.05)
-    assert not reserved.wants()
-    reserved.close()
-    socket = subscribe(reserved.endpoint)
-    sink = opened(endpoint=reserved.endpoint, wait_for_subscriber=WAIT / 1000)
-    assert sink.wants()
-    write(sink, range(1))
-    assert receive(socket)[1]["seq"] == 0
-
-
 def test_asking_who_listens_is_safe_while_another_thread_sends(opened: Open, subscribe: Subscribe) -> None:
     sink = opened()
     socket = subscribe(sink)
