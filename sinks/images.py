@@ -32,14 +32,10 @@ class Images(Sink):
     class Params(StageParams):
         """Destination and format."""
 
-        folder: str = Field(
-            "images", min_length=1, description="folder, relative to the current directory; created"
-        )
+        folder: str = Field("images", min_length=1, description="relative to the current directory; created")
         format: Literal["png", "jpg"] = Field("png", description="png is lossless, jpg is small and fast")
         quality: int = Field(95, ge=1, le=100, description="of a jpg; 100 is the best and largest")
-        overwrite: bool = Field(
-            False, description="write into a folder that already holds frame-*.png or .jpg"
-        )
+        overwrite: bool = Field(False, description="write into a folder that already holds frames")
 
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is written yet."""

@@ -46,7 +46,7 @@ class View(Sink):
             "127.0.0.1",
             min_length=1,
             description="address of this machine to serve on; any but loopback needs a token, and sends it "
-            "unencrypted (from afar, ssh -L 8780:localhost:8780 is safer)",
+            "unencrypted (ssh -L 8780:localhost:8780 is safer)",
         )
         port: int = Field(8780, ge=0, le=65535, description="port, or the next free one; 0: any")
         token: str | None = Field(
@@ -56,18 +56,9 @@ class View(Sink):
             description="a secret required of every page, as in http://HOST:PORT/?token=...",
         )
         max_fps: float = Field(30.0, gt=0, le=240, description="maximum number of frames per second")
-        quality: int = Field(
-            85, ge=1, le=100, description="of the JPEG pictures; higher is sharper and larger"
-        )
-        max_size: int = Field(
-            1280,
-            ge=64,
-            description="maximum length of the longer side of pictures, px; larger ones are reduced",
-        )
-        neighbours: str | None = Field(
-            None,
-            description="folder in which the views of several sensors publish their ports; set by such a run",
-        )
+        quality: int = Field(85, ge=1, le=100, description="of the pictures; higher is sharper and larger")
+        max_size: int = Field(1280, ge=64, description="longer side of pictures, px; larger ones are reduced")
+        neighbours: str | None = Field(None, description="folder shared by several sensors; set by their run")
 
         @model_validator(mode="after")
         def _guarded(self) -> View.Params:
@@ -81,10 +72,7 @@ class View(Sink):
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is served yet.
 
-        Parameters
-        ----------
-        sensor : names the tab.
-        control : handle on the run, for the statistics and the buttons.
+        sensor : names the tab. control : handle on the run, for the statistics and the buttons.
         """
         super().__init__(params)
         self._sensor = sensor

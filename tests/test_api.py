@@ -393,21 +393,10 @@ def test_nested_settings_of_stages_are_merged_with_those_of_the_file() -> None:
     assert nested.nodes["hull"].params.min_area == 7  # type: ignore[attr-defined]
 
 
-@pytest.mark.usefixtures("folder")
-def test_settings_may_be_paths_texts_and_numbers_and_arrays_of_numpy() -> None:
-    settings = {
-        "stages.capture.source": Path("\N{HERB}.npy"),
-        "skipping": np.bool_(False),
-        "stages.hull.min_area": np.float32(5),
-        "stages.preprocess.downsample": np.int64(1),
-        "stages.preprocess.crop": np.array([0, 0, 400, 300]),
-    }
-    pipeline = tactflow.load(settings=settings)
-    assert not pipeline.skipping
-    assert pipeline.source.params.source == "\N{HERB}.npy"  # type: ignore[attr-defined]
-    preprocess, hull = (pipeline.nodes[id_].params.model_dump() for id_ in ("preprocess", "hull"))
-    assert (preprocess["downsample"], list(preprocess["crop"])) == (1, [0, 0, 400, 300])
-    assert hull["min_area"] == 5
+def test_settings_may_be_numbers_of_numpy() -> None:
+    settings = {"skipping": np.bool_(False), "stages.hull.min_area": np.float32(5)}
+    pipeline = tactflow.load("default", settings=settings)
+    assert (pipeline.skipping, pipeline.nodes["hull"].params.min_area) == (False, 5)  # type: ignore[attr-defined]
 
 
 def test_a_loaded_pipeline_can_be_streamed_twice(folder: Path) -> None:

@@ -22,17 +22,17 @@ def entry() -> None:
     # Before anything else is imported, which takes a while.
     command = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
     is_endless = command in ENDLESS
-    # Nothing is raised, which an import might swallow, or show.
+    # Exit rather than raise: an import might swallow or print an exception.
     on_ending(lambda _number, _frame: os._exit(0 if is_endless else INTERRUPTED))
     from tactflow.cli.main import main
     from tactflow.system.files import LossyStream, discard_output
 
-    # A service may be started without them.
+    # A service may be started without standard streams.
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the end)
     sys.stderr = LossyStream(sys.stderr)
-    # File names may have characters that the terminal, or UTF-8, has not.
+    # File names may contain characters that the terminal or UTF-8 cannot represent.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -44,7 +44,7 @@ def entry() -> None:
         discard_output(sys.stdout)
         code = 0
         if not isinstance(error, BrokenPipeError):
-            # Without a name, only the question which folder is the current one fails.
+            # An error without a file name comes from asking for the current folder.
             unnamed = "the current folder" if isinstance(error, FileNotFoundError) else "standard output"
             print(f"tactflow: {error.filename or unnamed}: {error.strerror or error}", file=sys.stderr)
             code = 3
@@ -56,8 +56,7 @@ def entry() -> None:
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
     if code != 0 and threading.active_count() > 1:
-        # A run that was not allowed to finish has threads in OpenCV, which would abort the process while
-        # Python ends.
+        # Threads of an aborted run may be in OpenCV, which would abort the process while Python ends.
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)

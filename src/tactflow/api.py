@@ -115,9 +115,9 @@ def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:
 
 
 def check(pipeline: str | Path | None = None, *, settings: Settings | None = None) -> list[str]:
-    """Every mistake in a pipeline file, each a text with its place; empty if it can be run.
+    """All mistakes in a pipeline file, each with its position; empty if it can be run.
 
-    pipeline, settings : as for `load`, whose errors are what it returns; it raises none.
+    pipeline, settings : as for `load`.
 
     Examples
     --------
@@ -147,9 +147,8 @@ def run(
 
     Parameters
     ----------
-    pipeline : what `load` returned, or what it takes.
-    source, settings, sensor, realtime : as for `load`; only where `pipeline` is not loaded yet.
-    max_frames : stop after so many.
+    pipeline, source, settings, sensor, realtime : as for `load`; or a loaded pipeline.
+    max_frames : stop after this many frames.
 
     Returns
     -------
@@ -159,8 +158,8 @@ def run(
     ------
     ConfigError : the pipeline file is wrong; nothing was started.
     TactflowError : a stage, a sink or the source failed.
-    KeyboardInterrupt : Ctrl-C; the run has ended, without what was under way. A second one leaves the part
-        that is being closed as it is; the others are closed.
+    KeyboardInterrupt : Ctrl-C: the run has ended without its pending frames. After a second one, the part that
+        is being closed is left as it is.
 
     Examples
     --------
@@ -182,7 +181,7 @@ def run(
 def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
     """A run of a pipeline; loops are compiled, and OpenCV has the threads that the pipeline sets.
 
-    options : of `Runner`.
+    options : passed to `Runner`.
     """
     compiled.load()
     if pipeline.opencv_threads is not None:
@@ -194,14 +193,14 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
 def ended_by_signals(runner: Runner) -> Iterator[Sequence[int]]:
     """One Ctrl-C, SIGTERM or SIGHUP drains the pipeline; a second one ends it at once; a third is not caught.
 
-    Gives those that came.
+    Yields the numbers of the signals received so far.
     """
     caught: list[int] = []
 
     def handle(number: int, _: FrameType | None) -> None:
         caught.append(number)
         if len(caught) == 1:
-            # In any case: Python drops what is raised while it frees an object or imports a module.
+            # Stop rather than raise: Python swallows exceptions while it frees an object or imports a module.
             runner.stop("signal")
             return
         on_ending(signal.SIG_DFL)
@@ -226,8 +225,8 @@ def stage(use: str | type[Stage], /, **params: Any) -> Any:
 
     Returns
     -------
-    The stage, opened. Its `process` takes and returns what `tactflow stages NAME` says; where that includes
-    `frame`, it may be left out, and is then made of the picture. The first picture is the reference.
+    The stage, opened. Its `process` takes and returns the ports listed by `tactflow stages NAME`, except that
+    `frame` may be left out: it is then made from the picture, and the first picture is the reference.
 
     Raises
     ------
@@ -258,13 +257,6 @@ def _with_frames_made(process: Callable[..., Any], inputs: Sequence[Port]) -> Ca
 
     Positional arguments are the other inputs, in order; the frame is created from the first array among them.
     A stage whose only input is the frame takes the picture instead.
-
-    process : of a stage. inputs : its ports.
-
-    >>> def process(frame: Frame) -> tuple[int, ...]:
-    ...     return frame.image.shape
-    >>> _with_frames_made(process, [Port("frame", Frame)])(np.zeros((4, 6, 3), np.uint8))
-    (4, 6, 3)
     """
     frame = next((port.name for port in inputs if port.annotation is Frame), None)
     if frame is None:

@@ -38,7 +38,7 @@ Picture = Annotated[NDArray[np.uint8], ArrayPort("annotated", ("H", "W", 3), "ui
 """The processed frame with the results drawn on it."""
 
 Gradients = Annotated[NDArray[np.float32], ArrayPort("gradients", ("H", "W", 2), "float32", "slope")]
-"""How much deeper the gel is pushed in to the right and down, mm per mm, for each pixel."""
+"""Slope of the indentation to the right and down, mm per mm, for each pixel."""
 
 Normals = Annotated[NDArray[np.float32], ArrayPort("normals", ("H", "W", 3), "float32", "unit vectors")]
 """Normals of the gel's surface out of the gel, x right, y down; (0, 0, 1) where it is at rest."""
