@@ -158,8 +158,8 @@ def run(
     ------
     ConfigError : the pipeline file is wrong; nothing was started.
     TactflowError : a stage, a sink or the source failed.
-    KeyboardInterrupt : Ctrl-C: the run has ended without its pending frames. After a second one, the part that
-        is being closed is left as it is.
+    KeyboardInterrupt : Ctrl-C: the run has ended without its pending frames. After a second one, the part
+        that is being closed is left as it is.
 
     Examples
     --------

@@ -175,9 +175,9 @@ def test_existing_output_is_replaced_only_when_asked(kind: str, tmp_path: Path) 
 def test_a_second_export_to_the_same_folder_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("h5py", reason="the extra hdf5 is not installed")
+    pytest.importorskip("av", reason="the extra lerobot is not installed")
     out = tmp_path / "out"
-    words = ["export", "hdf5", "sim:press?frames=3", "--pipeline", "mini", "--out", str(out)]
+    words = ["export", "lerobot", "sim:press?frames=3", "--pipeline", "mini", "--out", str(out)]
     with locked_folder(out):
         assert main(words) == 3
         assert "another run is writing to it" in capsys.readouterr().err
