@@ -112,9 +112,7 @@ def test_a_kernel_does_what_its_loops_and_their_helpers_say() -> None:
 
 
 def test_a_kernel_refuses_types_that_its_signature_does_not_name() -> None:
-    sums = np.empty(4)
-    sums.setflags(write=False)
-    for wrong in (sums, np.empty(8)[::2], np.empty(4, np.float32)):
+    for wrong in (np.empty(8)[::2], np.empty(4, np.float32)):
         with pytest.raises(TypeError):
             _running_sum(np.arange(4.0), wrong)
 
@@ -124,7 +122,7 @@ def test_what_was_compiled_once_is_read_from_disk_without_a_word(
 ) -> None:
     second = run(compiled)
     assert first.stdout == f"3 3 {RESULTS}"
-    assert first.stderr.startswith("tactflow: compiling loops for this processor, once: 1 of 3 are done\n")
+    assert first.stderr.count("tactflow: compiling 3 loops for this processor, once") == 1
     assert (second.stdout, second.stderr) == (f"3 0 {RESULTS}", "")
 
 
@@ -136,16 +134,6 @@ def test_damaged_files_are_replaced(compiled: Path) -> None:
             file.write_bytes(content)
         assert run(compiled).stdout == f"3 2 {RESULTS}"
     assert run(compiled).stdout == f"3 0 {RESULTS}"
-
-
-def test_machine_code_with_flipped_bits_is_made_anew_with_a_line(compiled: Path) -> None:
-    for file in (compiled / "kept").rglob("loops.t*.nbc"):
-        code = np.frombuffer(file.read_bytes(), np.uint8).copy()
-        code[len(code) // 4 :: 97] ^= 0x10
-        file.write_bytes(code.tobytes())
-    second, third = run(compiled), run(compiled)
-    assert (second.stdout, third.stdout, third.stderr) == (f"3 2 {RESULTS}", f"3 0 {RESULTS}", "")
-    assert "loops.twice: its compiled code on disk is damaged" in second.stderr
 
 
 def test_where_nothing_can_be_kept_loops_are_compiled_in_each_run(folder: Path) -> None:
