@@ -26,8 +26,11 @@ class Depth(Stage):
     def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
         """Prepare. calibration : the file."""
         super().__init__(params)
-        self._known = None if calibration is None else Calibration.load(calibration)
-        self._surface: tuple[Scale, bool, Surface | DarkSurface] | None = None
+        known = None if calibration is None else Calibration.load(calibration)
+        photometric = None if known is None else known.photometric
+        self._known = known
+        self._errors = None if photometric is None else photometric.errors()
+        self._darkness = None if known is None or known.darkness is None else known.darkness.model()
         self._rest: tuple[Untouched, Rest] | None = None
 
     def process(
@@ -46,18 +49,8 @@ class Depth(Stage):
             return Absent("no_contact")
         if self._rest is None or self._rest[0] is not untouched:
             self._rest = untouched, Rest(untouched)
-        given = gradients is not None
-        if self._surface is None or self._surface[0] is not scale or self._surface[1] != given:
-            self._surface = scale, given, _surface_of(known, scale, given)
-        surface = self._surface[2]
-        if isinstance(surface, Surface):
-            return surface.depth(unmarked, self._rest[1], contact_mask, gradients)
-        return surface.depth(unmarked, self._rest[1], contact_mask)
-
-
-def _surface_of(known: Calibration, scale: Scale, by_network: bool) -> Surface | DarkSurface:
-    """What makes the height maps of a calibration. by_network : whether slopes are given."""
-    if known.darkness is not None and not by_network:
-        return DarkSurface(known.darkness.model(), scale, known.darkness.stderr)
-    photometric = known.photometric
-    return Surface(known.slopes, scale, None if photometric is None else photometric.errors())
+        rest = self._rest[1]
+        if known.darkness is not None and self._darkness is not None and gradients is None:
+            dark = DarkSurface(self._darkness, scale, known.darkness.stderr)
+            return dark.depth(unmarked, rest, contact_mask)
+        return Surface(known.slopes, scale, self._errors).depth(unmarked, rest, contact_mask, gradients)

@@ -9,7 +9,7 @@ from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Unmarked, Untouched
-from tactflow.vision.force import BY_CHANGE, BY_DEPTH, LightChange, seen
+from tactflow.vision.force import LightChange, seen
 from tactflow.vision.types import Contact, Depth, Flow, Scale
 from tactflow.vision.types import Force as ForceOnGel
 
@@ -27,17 +27,8 @@ class Force(Stage):
     def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
         """Prepare. calibration : the file."""
         super().__init__(params)
-        known = None if calibration is None else Calibration.load(calibration).force
-        if known is not None and not any(
-            known.press.stiffness.keys() <= {*features} for features in (BY_DEPTH, BY_CHANGE)
-        ):
-            logger.warning(
-                "force: %s has a force that an earlier version fitted; run `tactflow calibrate force` again",
-                calibration,
-            )
-            known = None
-        self._entry = known
-        self._model = None if known is None else known.model()
+        self._entry = None if calibration is None else Calibration.load(calibration).force
+        self._model = None if self._entry is None else self._entry.model()
         self._light: LightChange | None = None
         self._warned = False
 

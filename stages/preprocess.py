@@ -53,10 +53,6 @@ class Homography(StageParams):
 
 logger = logging.getLogger("tactflow")
 
-_SHRUNK = {2: "halved", 4: "quartered", 8: "shrunk 8 times", 16: "shrunk 16 times"}
-"""Description of `downsample` for messages, by its factor."""
-
-
 FEWEST_PIXELS = 160
 """Shorter side of a processed picture, px, below which a message warns of `downsample`. Chosen by hand: the
 smallest pictures of the sensors with shipped pipelines."""
@@ -104,22 +100,18 @@ class Preprocess(Stage):
         return Preprocessed(self._preprocessor(frame.image), self._preprocessor.mapping)
 
     def _report(self, before: tuple[int, int], after: tuple[int, int]) -> None:
-        """Log the steps once. before, after : (width, height), px."""
-        params = self.params
-        steps = [
-            *(["straightened"] if params.undistort else []),
-            *(["rectified"] if params.homography else []),
-            *(["cut"] if params.crop else []),
-            *([f"turned by {params.rotate} degrees"] if params.rotate else []),
-            *([_SHRUNK[params.downsample]] if params.downsample > 1 else []),
-        ]
+        """Log the sizes once, if any step changes the picture. before, after : (width, height), px."""
+        steps = self.params.model_dump(exclude_defaults=True).keys() - {"method"}
         if steps:
-            hint = (
-                "; dots may be lost: try downsample: 1"
-                if params.downsample > 1 and min(after) < FEWEST_PIXELS
-                else ""
+            small = self.params.downsample > 1 and min(after) < FEWEST_PIXELS
+            hint = "; dots may be lost: try downsample: 1" if small else ""
+            logger.info(
+                "%d x %d becomes %d x %d by %s: stages.preprocess%s",
+                *before,
+                *after,
+                joined(sorted(steps)),
+                hint,
             )
-            logger.info("%d x %d %s to %d x %d: stages.preprocess%s", *before, joined(steps), *after, hint)
 
     def _build(self, width: int, height: int) -> Preprocessor:
         params = self.params

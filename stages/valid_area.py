@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -11,7 +10,6 @@ from pydantic import Field
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.ports import Image, Valid
-from tactflow.sources.files import load_image
 from tactflow.vision.geometry.valid_area import polygon_mask, valid_area
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -26,18 +24,14 @@ class ValidArea(Stage):
     class Params(StageParams):
         """The area, if it is known."""
 
-        area: Polygon | str = Field(
+        area: Polygon | Literal["auto", "all"] = Field(
             "auto",
-            min_length=1,
             description="auto finds it in the reference frame; all is the whole picture; or its corners "
-            "[[x, y], ...], processed px; or an image file of the processed frame's size, black where "
-            "there is no gel",
+            "[[x, y], ...], processed px",
         )
 
-    def __init__(self, params: Params, directory: Path | None = None) -> None:
-        """Prepare. directory : searched for relative paths after the current directory."""
+    def __init__(self, params: Params) -> None:
         super().__init__(params)
-        self._directory = directory
         self._valid: Valid | None = None
 
     def reset(self) -> None:
@@ -57,17 +51,7 @@ class ValidArea(Stage):
             return valid_area(image)
         if area == "all":
             return np.full((height, width), 255, np.uint8)
-        if not isinstance(area, str):
-            try:
-                return polygon_mask(area, width, height)
-            except ValueError as problem:
-                raise StageError(f"area: {problem}") from None
-        mask = np.where(load_image(area, self._directory).any(axis=2), 255, 0).astype(np.uint8)
-        if mask.shape != (height, width):
-            raise StageError(
-                f"area: {area} is {mask.shape[1]} x {mask.shape[0]} pixels; required {width} x {height}, the "
-                "size of the processed frame"
-            )
-        if not mask.any():
-            raise StageError(f"area: {area} is black everywhere, so there would be no gel")
-        return mask
+        try:
+            return polygon_mask(area, width, height)
+        except ValueError as problem:
+            raise StageError(f"area: {problem}") from None

@@ -134,7 +134,7 @@ def test_a_scale_asks_for_no_presses_and_a_live_source_ends_by_itself(terminal: 
     assert "press 1" not in output
     assert "--set calibration=film.yaml" in output
     assert terminal("calibrate", "check", "film.yaml", "--from", "sim:ball?frames=2") == 0
-    assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in terminal.err
+    assert "tactflow: INFO: 800 x 600 becomes 300 x 400" in terminal.err
     # As a camera, for ten minutes, unless it ends when it knows what it needs.
     live = ["--from", "sim:idle?frames=36000", "--realtime", "--pitch", "1.724", "--out", "camera.yaml"]
     assert terminal("calibrate", *live) == 0

@@ -84,17 +84,6 @@ def test_what_is_no_gel_does_not_count() -> None:
     assert LightChange(gel)(flicker) == pytest.approx(0, abs=1)
 
 
-@pytest.mark.parametrize("stiffness", [{"change": 0.1}, {"root_change": 0.1, "area": 0.5}])
-def test_a_force_of_an_earlier_version_is_not_used(
-    stiffness: dict[str, float], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    old = BY_CHANGE.model_copy(update={"stiffness": stiffness})
-    with caplog.at_level(logging.WARNING, "tactflow"):
-        force = stage(tmp_path, old)
-    assert "run `tactflow calibrate force` again" in caplog.text
-    assert force.process(CONTACT, SCALE, GEL, GEL) == Absent("no_calibration")
-
-
 def test_nothing_is_said_without_a_calibration_or_without_the_heights_it_needs(tmp_path: Path) -> None:
     assert Force(StageParams()).process(CONTACT, SCALE, GEL, GEL) == Absent("no_calibration")
     assert stage(tmp_path, BY_DEPTH).process(CONTACT, SCALE, GEL, GEL) == Absent("no_depth")

@@ -57,11 +57,11 @@ def test_a_real_wedge_is_rectified_to_the_full_picture(shared_data: Path) -> Non
     [
         (
             {"crop": [0, 0, 40, 20]},
-            "80 x 60 cut to 40 x 20: stages.preprocess",
+            "80 x 60 becomes 40 x 20 by crop: stages.preprocess",
         ),
         (
             {"crop": [0, 0, 40, 20], "rotate": 180, "downsample": 4},
-            "80 x 60 cut, turned by 180 degrees and quartered to 10 x 5: stages.preprocess; "
+            "80 x 60 becomes 10 x 5 by crop, downsample and rotate: stages.preprocess; "
             "dots may be lost: try downsample: 1",
         ),
         ({}, None),

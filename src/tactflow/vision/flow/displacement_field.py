@@ -15,7 +15,6 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats, Mask, Points, check_mask
 from tactflow.vision.compiled import helper, kernel
@@ -487,38 +486,13 @@ def _covered(mask: Mask, box: Sequence[int], places: Floats, spacing: float) -> 
     box : (left, top, width, height), bounding box of the mask. spacing : of the places, px; the side of the
     squares is the nearest odd number.
     """
-    left, top, width, height = box
-    sums = np.asarray(cv2.integral(mask[top : top + height, left : left + width]), np.int32)
-    share = np.empty(places.shape[:2])
-    average_squares(sums, places - (left, top), 2 * round((spacing - 1) / 2) + 1, share)
-    return share
-
-
-@kernel("void(int32[:, ::1], float64[:, :, ::1], int64, float64[:, ::1])")
-def average_squares(sums: NDArray[np.int32], centers: Floats, side: int, means: Floats) -> None:
-    """Mean over squares of a picture that is 0 or 255, 0 to 1; a pixel that is cut counts by its part inside.
-
-    sums : (h + 1, w + 1), of the pixels above and to the left. They may overflow: differences are right.
-    centers : (r, c, 2), px. side : px. means : (r, c), filled. `cv2.boxFilter` takes three times as long.
-    """
-    height, width = sums.shape[0] - 1, sums.shape[1] - 1
-    for row in range(means.shape[0]):
-        for column in range(means.shape[1]):
-            means[row, column] = 0.0
-            x, y = centers[row, column, 0] + 0.5 - 0.5 * side, centers[row, column, 1] + 0.5 - 0.5 * side
-            if not (-side < x < width and -side < y < height):
-                continue
-            left, top = math.floor(x), math.floor(y)
-            for down in range(2):
-                upper, lower = min(max(top + down, 0), height), min(max(top + down + side, 0), height)
-                for across in range(2):
-                    first, last = min(max(left + across, 0), width), min(max(left + across + side, 0), width)
-                    above, below = (
-                        sums[upper, last] - sums[upper, first],
-                        sums[lower, last] - sums[lower, first],
-                    )
-                    part = abs(1 - down - (y - top)) * abs(1 - across - (x - left))
-                    means[row, column] += part * np.int32(below - above) / (255.0 * side * side)
+    side = 2 * round((spacing - 1) / 2) + 1
+    left, top = max(box[0] - side, 0), max(box[1] - side, 0)
+    part = mask[top : box[1] + box[3] + side, left : box[0] + box[2] + side]
+    means = cv2.blur(part, (side, side), borderType=cv2.BORDER_CONSTANT)
+    now = (places - (left, top)).astype(np.float32)
+    shares = cv2.remap(means, now, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+    return np.asarray(shares, np.float64) / 255
 
 
 def matern(distance: Floats) -> Floats:
