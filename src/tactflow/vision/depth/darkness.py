@@ -78,10 +78,8 @@ class DarkSurface:
         at_rest = rest.around(image, mask)
         window = surroundings(mask, rest.window, at_rest.margin).window
         low = self._model(-colour_change(image, rest, window, at_rest.light).mean(axis=2))
-        return measured(low, window, mask, self._scale, self._errors)
-
-    def _errors(self, greatest: float, volume: float) -> tuple[float | None, float | None]:
-        if self._stderr is None or not 0 < greatest < self._model.deepest:
-            return None, None
+        greatest, relative_error = float(low.max()), None
         # Errors of the curve are common to all pixels.
-        return self._stderr, volume * self._stderr / greatest
+        if self._stderr is not None and 0 < greatest < self._model.deepest:
+            relative_error = self._stderr / greatest
+        return measured(low, window, mask, self._scale, relative_error)

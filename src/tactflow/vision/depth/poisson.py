@@ -1,4 +1,4 @@
-"""The surface that has given slopes."""
+"""The surface with measured slopes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ where it goes on, upside down where it is at rest."""
 
 
 def integrate(slope: Floats32, step: tuple[float, float], sides: OpenSides = AT_REST) -> Floats32:
-    """Heights whose slopes come closest to the given ones, in least squares.
+    """Heights whose slopes are closest to the measured ones, in least squares.
 
     Poisson's equation, solved by cosine and sine transforms. Where all sides are open the mean height is 0.
 
@@ -56,7 +56,9 @@ def integrate(slope: Floats32, step: tuple[float, float], sides: OpenSides = AT_
     """
     across, across_back, across_type, first_across = _TRANSFORMS[sides.left, sides.right]
     down, down_back, down_type, first_down = _TRANSFORMS[sides.top, sides.bottom]
-    spectrum = across(_divergence(slope, step, sides), across_type, axis=1, norm="ortho", overwrite_x=True)
+    divergence = _rise(slope[0].T, step[0], (sides.left, sides.right)).T
+    divergence = divergence + _rise(slope[1], step[1], (sides.top, sides.bottom))
+    spectrum = across(divergence, across_type, axis=1, norm="ortho", overwrite_x=True)
     spectrum = down(spectrum, down_type, axis=0, norm="ortho", overwrite_x=True)
     height, width = spectrum.shape
     eigenvalues = np.add.outer(_eigenvalues(height, first_down), _eigenvalues(width, first_across))
@@ -73,25 +75,16 @@ def _eigenvalues(count: int, first: float) -> Floats32:
     return np.asarray(2 * np.cos(np.pi * (np.arange(count) + first) / count) - 2, np.float32)
 
 
-def _divergence(slope: Floats32, step: tuple[float, float], sides: OpenSides) -> Floats32:
-    """(h, w): by how much more the surface rises behind each pixel than before it.
+def _rise(slope: Floats32, step: float, open_sides: tuple[bool, bool]) -> Floats32:
+    """(h, w): by how much more the surface rises behind each pixel than before it, down the rows.
 
+    slope : (h, w), growth down. step : from a row to the next. open_sides : of the first and last row.
     Between two pixels it rises by the mean of their slopes; beyond an open side not at all, and at a side at
     rest from its mirror image on.
     """
-    slope_x, slope_y = slope
-    height, width = slope_x.shape
-    across, down = np.zeros((height, width + 1), np.float32), np.zeros((height + 1, width), np.float32)
-    np.add(slope_x[:, 1:], slope_x[:, :-1], across[:, 1:-1])
-    np.add(slope_y[1:], slope_y[:-1], down[1:-1])
-    across *= np.float32(step[0] / 2)
-    down *= np.float32(step[1] / 2)
-    if not sides.left:
-        across[:, 0] = slope_x[:, 0] * np.float32(step[0])
-    if not sides.right:
-        across[:, -1] = slope_x[:, -1] * np.float32(step[0])
-    if not sides.top:
-        down[0] = slope_y[0] * np.float32(step[1])
-    if not sides.bottom:
-        down[-1] = slope_y[-1] * np.float32(step[1])
-    return across[:, 1:] - across[:, :-1] + down[1:] - down[:-1]
+    rise = np.empty((len(slope) + 1, slope.shape[1]), np.float32)
+    np.add(slope[1:], slope[:-1], rise[1:-1])
+    rise[1:-1] *= np.float32(step / 2)
+    for end, is_open in zip((0, -1), open_sides, strict=True):
+        rise[end] = 0.0 if is_open else slope[end] * np.float32(step)
+    return np.asarray(np.diff(rise, axis=0))

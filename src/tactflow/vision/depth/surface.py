@@ -8,7 +8,6 @@ where the picture ends.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import cv2
@@ -104,10 +103,6 @@ class Surface:
     """
 
     def __init__(self, model: SlopeModel | None, scale: Scale, errors: SurfaceErrors | None = None) -> None:
-        # Only here: runs without a calibration need not wait 0.15 s for SciPy.
-        from tactflow.vision.depth.poisson import integrate
-
-        self._integrate = integrate
         self._model = model
         self._scale = scale
         self._errors = errors
@@ -116,21 +111,15 @@ class Surface:
         """The height map of a frame.
 
         image : (H, W, 3) uint8, BGR, without markers. mask : (H, W) uint8, 255 in contact; not all 0.
-        gradients : (H, W, 2), `tactflow.ports.Gradients`, in place of those by the model; then no errors are
+        gradients : (H, W, 2), `tactflow.ports.Gradients`, instead of those of the model; then no errors are
         known.
         """
         slope, steep, window = self._slopes(image, rest, mask, gradients)
-        low = self._integrated(slope, window, rest.window)
-
-        def errors(greatest: float, volume: float) -> tuple[float | None, float | None]:
-            if self._errors is None or gradients is not None:
-                return None, None
+        low, relative = self._integrated(slope, window, rest.window), None
+        if self._errors is not None and gradients is None:
             unexplained = UNEXPLAINED * self._unexplained(slope, low, mask[window.whole])
-            steep_error = STEEP_ERROR * math.sqrt(steep)
-            relative = math.hypot(unexplained, steep_error, self._errors.between, ROUNDED)
-            return relative * greatest, relative * volume
-
-        return measured(low, window, mask, self._scale, errors)
+            relative = math.hypot(unexplained, STEEP_ERROR * math.sqrt(steep), self._errors.between, ROUNDED)
+        return measured(low, window, mask, self._scale, relative)
 
     def heights(self, image: Bytes, rest: Rest, mask: Bytes) -> Floats32:
         """(h, w) float32: how far the gel is pushed in, mm >= 0, at half resolution; see `depth`."""
@@ -176,9 +165,12 @@ class Surface:
         return slope, steep, window
 
     def _integrated(self, slope: Floats32, window: Window, whole: Window) -> Floats32:
-        # Two processed pixels a step. Slopes rise towards the camera, where the gel is pushed to.
+        # Only here: runs without a calibration do not need SciPy's transforms.
+        from tactflow.vision.depth.poisson import integrate
+
+        # A step is two processed pixels. Slopes rise towards the camera, into which the gel is pushed.
         sides = window.cut_by(whole)
-        heights = self._integrate(slope, (-2 * self._scale.x, -2 * self._scale.y), sides)
+        heights = integrate(slope, (-2 * self._scale.x, -2 * self._scale.y), sides)
         if all(sides):
             # The picture shows no border at rest; most of its border lies outside the contact.
             border = np.concatenate([heights[0], heights[-1], heights[:, 0], heights[:, -1]])
@@ -202,16 +194,10 @@ class Surface:
         return left / total if total else 0.0
 
 
-def measured(
-    low: Floats32,
-    window: Window,
-    mask: Bytes,
-    scale: Scale,
-    errors: Callable[[float, float], tuple[float | None, float | None]],
-) -> Depth:
+def measured(low: Floats32, window: Window, mask: Bytes, scale: Scale, relative_error: float | None) -> Depth:
     """Height map, greatest depth and volumes, from heights (h, w) of a window at half resolution, mm.
 
-    mask : (H, W) uint8, 255 in contact. errors : standard errors of greatest depth and volume, from these.
+    mask : (H, W) uint8, 255 in contact. relative_error : standard error of depth and volume; None: unknown.
     """
     heights = np.zeros(mask.shape, np.float32)
     size = (2 * window.width, 2 * window.height)
@@ -219,8 +205,9 @@ def measured(
     greatest, cell = float(low.max()), scale.area(4.0)
     volume = float(low.sum()) * cell
     pressed = float(low[mask[window.whole][::2, ::2] > 0].sum()) * cell
-    depth_error, volume_error = errors(greatest, volume)
-    return Depth(heights, greatest, depth_error, volume, volume_error, pressed)
+    if relative_error is None:
+        return Depth(heights, greatest, None, volume, None, pressed)
+    return Depth(heights, greatest, relative_error * greatest, volume, relative_error * volume, pressed)
 
 
 def _steep_part(slope: Floats32, steepest: float | None) -> float:
