@@ -47,7 +47,7 @@ def test_every_listed_command_is_there(name: str, terminal: Terminal) -> None:
         (["run", "--max-fames=6"], "unrecognized arguments: --max-fames=6; did you mean --max-frames?"),
         (["check", "a.yaml", "b.yaml"], "unrecognized arguments: b.yaml"),
         (["run", "x.yaml", "--source", "1.png", __file__, "3.png"], "quote the pattern: --source 'FOLDER"),
-        (["listen", "--timeout", "0"], "required a time such as 90s, 2min or 1h, got '0'"),
+        (["listen", "--timeout", "0"], "required a number of seconds, such as 2.5, got '0'"),
         (["stages", "hul"], "there is no stage or sink 'hul'; did you mean hull?"),
         (["stages", "./nowhere.py:A"], "cannot read ./nowhere.py"),
         (["warmup", "nowhere.yaml"], "there is no file nowhere.yaml"),

@@ -36,18 +36,6 @@ class Lens(BaseModel):
     fisheye: bool = Field(False, description="wide angle")
 
 
-class Move(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    by: tuple[float, float] = Field(description="px")
-
-
-class Turn(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    angle: float = Field(description="degrees")
-
-
 class Prepare(Stage):
     memory = "pure"
 
@@ -58,7 +46,6 @@ class Prepare(Stage):
         size: tuple[int, int] | None = Field(None, description="px")
         lens: Lens | None = Field(None, description="undistortion")
         method: Literal["area", "pyramid"] = Field("area", description="of downsampling")
-        shift: Move | Turn | None = Field(None, description="afterwards")
 
         @model_validator(mode="after")
         def _size_needs_corners(self) -> Prepare.Params:

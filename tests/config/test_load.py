@@ -93,11 +93,9 @@ def test_the_nearest_stage_above_wins_and_sinks_take_the_last(load: Load) -> Non
 
 def test_in_names_outputs_and_can_take_an_optional_one_away(load: Load) -> None:
     text = BODY.replace("sinks:", "  invert: {use: './parts.py:Invert'}\nsinks:")
-    for reference, expected in (
-        ("prepare", Ref("prepare", "image")),
-        ("prepare.image", Ref("prepare", "image")),
-    ):
-        assert load(text, f"sinks.out.in.image={reference}").nodes["out"].inputs["image"] == expected
+    for reference, stage in (("image", "invert"), ("prepare.image", "prepare")):
+        inputs = load(text, f"sinks.out.in.image={reference}").nodes["out"].inputs
+        assert inputs["image"] == Ref(stage, "image")
     assert load(text, "sinks.out.in.image=null").nodes["out"].inputs["image"] is None
 
 

@@ -234,7 +234,7 @@ def test_a_stage_that_no_sink_needs_is_not_built_and_the_user_is_told(toy_runner
 
 
 def test_an_absent_value_skips_who_requires_it_with_the_same_reason(toy_runner: MakeRunner) -> None:
-    stages = {"rare": {"use": "Rare"}, "heavy": {"in": {"level": "rare"}}, "gated": {"when": []}}
+    stages = {"rare": {"use": "Rare"}, "heavy": {"in": {"level": "rare.number"}}, "gated": {"when": []}}
     runner = toy_runner(stages)
     result = ran(runner)
     assert seen(runner, "heavy") == [i for i in range(20) if i % 3]
@@ -383,7 +383,7 @@ def test_what_cannot_be_opened_is_named_with_its_line(toy_runner: MakeRunner) ->
 
 
 def test_inputs_cannot_be_written_to_under_check(toy_runner: MakeRunner) -> None:
-    vandal = {"vandal": {"use": "Vandal"}, "heavy": {"in": {"level": "vandal"}}, "gated": {"when": []}}
+    vandal = {"vandal": {"use": "Vandal"}, "heavy": {"in": {"level": "vandal.number"}}, "gated": {"when": []}}
     result = toy_runner(vandal, check=True).run()
     assert result.exit_code == 3
     assert "read-only" in str(result.error)
@@ -392,10 +392,10 @@ def test_inputs_cannot_be_written_to_under_check(toy_runner: MakeRunner) -> None
 def test_a_wrong_shape_is_caught_under_check(toy_runner: MakeRunner) -> None:
     stages = {
         "bad": {"use": "BadShape"},
-        "vandal": {"use": "Vandal", "in": {"grid": "bad"}},
+        "vandal": {"use": "Vandal", "in": {"grid": "bad.half"}},
         "gated": {"when": []},
     }
-    runner = toy_runner({**stages, "heavy": {"in": {"level": "vandal"}}}, check=True)
+    runner = toy_runner({**stages, "heavy": {"in": {"level": "vandal.number"}}}, check=True)
     result = runner.run()
     assert result.exit_code == 3
     assert "port half: required shape (H, W) with H = 4, W = 6, got (2, 6)" in str(result.error)

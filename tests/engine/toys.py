@@ -118,6 +118,26 @@ class LevelPorts(NamedTuple):
     grid: Grid
 
 
+class HeavyPorts(NamedTuple):
+    heavy: Number
+
+
+class GatedPorts(NamedTuple):
+    gated: Number
+
+
+class TotalPorts(NamedTuple):
+    total: Number
+
+
+class DoubtfulPorts(NamedTuple):
+    doubtful: Number
+
+
+class JoinPorts(NamedTuple):
+    joined: Number
+
+
 class Level(Counted, Stage):
     def process(self, frame: Frame) -> LevelPorts:
         self.saw(frame.seq)
@@ -151,18 +171,10 @@ class Even(Counted, Stage):
         return both(frame.seq % 2 == 0)
 
 
-class HeavyPorts(NamedTuple):
-    heavy: Number
-
-
 class Heavy(Counted, Stage):
     def process(self, level: Number) -> HeavyPorts:
         self.saw(int(level.value))
         return HeavyPorts(Number(level.value**2))
-
-
-class GatedPorts(NamedTuple):
-    gated: Number
 
 
 class Gated(Counted, Stage):
@@ -183,10 +195,6 @@ class Watcher(Counted, Stage):
         return LevelPorts(Number(float(frame.seq)), frame.image[:, :, 0].copy())
 
 
-class TotalPorts(NamedTuple):
-    total: Number
-
-
 class Total(Counted, Stage):
     memory = "stateful"
     value = 0.0
@@ -199,14 +207,6 @@ class Total(Counted, Stage):
     def reset(self) -> None:
         self.value = 0.0
         self.resets += 1
-
-
-class DoubtfulPorts(NamedTuple):
-    doubtful: Number
-
-
-class JoinPorts(NamedTuple):
-    joined: Number
 
 
 class Doubtful(Counted, Stage):
@@ -293,19 +293,6 @@ class References(Counted, Sink):
 class ThreadedCollect(Collect):
     threaded = True
     when_live = "latest"
-
-
-class Archive(Collect):
-    """What it keeps is looked at later."""
-
-    threaded = True
-    when_live = "block"
-
-
-class Onlooker(Collect):
-    threaded = True
-    when_live = "latest"
-    observer = True
 
 
 class OnlyLevel(Counted, Sink):

@@ -59,8 +59,8 @@ class Entry(Part):
     inputs: Annotated[dict[str, str | None], _EMPTY] = Field(
         {},
         alias="in",
-        description="input -> the output it takes, as stage.port, or as stage where that has one output; "
-        "null: an optional input takes nothing; by default the nearest output of its name above",
+        description="input -> the output it takes, as stage.port or port; null: an optional input takes "
+        "nothing; by default the nearest output of its name above",
     )
     when: str | list[str] | None = Field(
         None, description="the signals that must all be true for it to run: bool ports, as port or stage.port"

@@ -83,7 +83,7 @@ def report(
     keys : path of the validated mapping. also : its valid keys besides those of the model.
     """
     named = {field.alias or name: field for name, field in model.model_fields.items()}
-    groups: dict[Keys, list[tuple[ErrorDetails, Keys]]] = {}
+    groups: dict[Keys, list[ErrorDetails]] = {}
     for detail in error.errors(include_url=False):
         place, rest = _place(document, keys, detail)
         kind, name = detail["type"], str(place[-1]) if place else ""
@@ -98,9 +98,9 @@ def report(
         elif rest == ("[key]",):
             document.report(place, f"{_message(detail)}, got {shown(name)}")
         else:
-            groups.setdefault(place, []).append((detail, rest))
-    for place, members in groups.items():
-        document.report(place, _words(members, document.get(*place)))
+            groups.setdefault(place, []).append(detail)
+    for place, details in groups.items():
+        document.report(place, _words(details, document.get(*place)))
 
 
 def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, Keys]:
@@ -117,16 +117,15 @@ def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, 
     return place, tuple(rest)
 
 
-def _words(members: Sequence[tuple[ErrorDetails, Keys]], value: Any) -> str:
+def _words(details: Sequence[ErrorDetails], value: Any) -> str:
     """One message for the errors of a value; a union has one for each of its members."""
-    texts, choices, got = [], [], ""
-    for detail, rest in members:
-        texts.append("".join(f"{key}: " for key in rest[1:]) + _message(detail))
+    choices, got = [], ""
+    for detail in details:
         if detail["type"] == "literal_error":
             choices += re.findall("'([^']*)'", detail["ctx"]["expected"])
         if detail["type"] not in _WITHOUT_VALUE:
             got = f", got {described(value)}"
-    first, *more = dict.fromkeys(texts)
+    first, *more = dict.fromkeys(map(_message, details))
     text = " or ".join([first, *(alternative.removeprefix("should be ") for alternative in more)]) + got
     guess = closest(value, choices) if isinstance(value, str) else None
     return f"{text}; did you mean {guess}?" if guess else text

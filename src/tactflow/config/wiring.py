@@ -117,9 +117,15 @@ class _Wiring:
                 if ref is None and not port.optional and self._complete:
                     document.report(place, self._dangling(port, draft))
             if ref is not None:
-                self._check_type(ref, port, mark, place)
                 draft.inputs[port.name] = ref
                 draft.edges.append((ref, mark))
+                output, producer = self._output(ref), self._by_id[ref.node].mark
+                if not fits(output, port):
+                    document.report_at(
+                        mark,
+                        f"{dotted(place)}: the input {port.name} takes {describe_type(port.annotation)}, but "
+                        f"{ref} ({producer}) gives {describe_type(output.annotation)}",
+                    )
 
     def connect_gates(self, draft: Draft, component: Component) -> None:
         place: Keys = (*draft.keys, "when")
@@ -133,47 +139,37 @@ class _Wiring:
         for index, signal in enumerate(when if isinstance(when, list) else [when]):
             self._gate(signal, (*place, index) if isinstance(when, list) else place, draft)
 
-    def _reference(self, text: Any, place: Keys, user: Draft, by_port: bool = False) -> Ref | None:
-        """The output named by `stage.port`, `stage`, or (with `by_port`) the name of a port."""
+    def _reference(self, text: Any, place: Keys, user: Draft) -> Ref | None:
+        """The output named by `stage.port`, or by the name of a port: that of the nearest stage above."""
         if not isinstance(text, str):
             # Reported by the model of the file.
             return None
-        document = self._document
         stage, dot, port = text.partition(".")
-        if by_port and not dot:
+        if not dot:
             ref = self._nearest(text, user)
-            if ref is not None:
-                return ref
+            if ref is None and self._complete:
+                self._document.report(place, self._unknown(text))
+            return ref
         producer = self._by_id.get(stage)
         if producer is None:
-            # An unknown signal may be that of an unresolved stage.
-            if self._complete or dot or not by_port:
-                document.report(place, self._unknown(text, user, by_port))
-        elif producer.section == "sinks":
-            document.report(place, f"{stage} is a sink and gives nothing")
+            hint = did_you_mean(stage, [draft.id for draft in self._stages], "stages: ")
+            self._document.report(place, f"there is no stage {stage!r}{hint}")
+        elif port in producer.outputs:
+            return Ref(stage, port)
         elif producer.component is not None:
-            outputs = list(producer.outputs)
-            if dot and port not in outputs:
-                hint = did_you_mean(port, outputs, "it gives ")
-                document.report(place, f"{stage} ({producer.mark}) has no output {port!r}{hint}")
-            elif not dot and len(outputs) > 1:
-                refs = ", ".join(f"{stage}.{name}" for name in outputs)
-                document.report(place, f"{stage} has several outputs; name one of {refs}")
-            else:
-                return Ref(stage, port if dot else outputs[0])
+            hint = did_you_mean(port, producer.outputs, "it gives ")
+            self._document.report(place, f"{stage} ({producer.mark}) has no output {port!r}{hint}")
         return None
 
-    def _unknown(self, text: str, user: Draft, by_port: bool) -> str:
-        stage, dot, _ = text.partition(".")
-        ids = [draft.id for draft in self._stages if draft is not user]
-        ports = {name: Ref(draft.id, name) for draft in self._stages for name in draft.outputs}
-        if text in ports:
-            where = "of no stage above" if by_port else "not a stage"
-            return f"{text!r} is a port, {where}; write {ports[text]}"
-        if by_port and not dot:
-            signals = [name for name, ref in ports.items() if self._signal(ref) is not None]
-            return f"there is no signal {text!r}{did_you_mean(text, signals, 'signals: ')}"
-        return f"there is no stage {stage!r}{did_you_mean(stage, ids, 'stages: ')}"
+    def _unknown(self, name: str) -> str:
+        """Why no stage above gives a port."""
+        ports = {port: f"{draft.id}.{port}" for draft in self._stages for port in draft.outputs}
+        if name in ports:
+            return f"no stage above gives {name}; write {ports[name]}"
+        if name in self._by_id:
+            outputs = " or ".join(f"{name}.{port}" for port in self._by_id[name].outputs)
+            return f"{name} is the name of a stage; required an output, {outputs}"
+        return f"no stage gives {name!r}{did_you_mean(name, ports, 'there are ')}"
 
     def _above(self, user: Draft) -> list[Draft]:
         """The stages whose outputs an input may take by name, nearest first."""
@@ -183,19 +179,12 @@ class _Wiring:
     def _nearest(self, port: str, user: Draft) -> Ref | None:
         return next((Ref(draft.id, port) for draft in self._above(user) if port in draft.outputs), None)
 
-    def _signal(self, ref: Ref) -> SignalPort | None:
-        kind = port_type(self._by_id[ref.node].outputs[ref.port].annotation)
-        return kind if isinstance(kind, SignalPort) else None
+    def _output(self, ref: Ref) -> Port:
+        return self._by_id[ref.node].outputs[ref.port]
 
-    def _check_type(self, ref: Ref, port: Port, mark: Mark, place: Keys) -> None:
-        producer = self._by_id[ref.node]
-        output = producer.outputs[ref.port]
-        if not fits(output, port):
-            self._document.report_at(
-                mark,
-                f"{dotted(place)}: the input {port.name} takes {describe_type(port.annotation)}, but {ref} "
-                f"({producer.mark}) gives {describe_type(output.annotation)}",
-            )
+    def _signal(self, ref: Ref) -> SignalPort | None:
+        kind = port_type(self._output(ref).annotation)
+        return kind if isinstance(kind, SignalPort) else None
 
     def _dangling(self, port: Port, user: Draft) -> str:
         where = "" if user.section == "sinks" else " above"
@@ -210,15 +199,14 @@ class _Wiring:
         return f"{text}; {known}" + (f"; it comes from the stage {' or '.join(makers)}" if makers else "")
 
     def _gate(self, text: Any, place: Keys, draft: Draft) -> None:
-        ref = self._reference(text, place, draft, by_port=True)
+        ref = self._reference(text, place, draft)
         if ref is None:
             return
         signal = self._signal(ref)
         if signal is None:
-            producer = self._by_id[ref.node]
-            kind = describe_type(producer.outputs[ref.port].annotation)
+            kind, producer = describe_type(self._output(ref).annotation), self._by_id[ref.node].mark
             needed = "a gate takes a signal (a bool port such as touching)"
-            self._document.report(place, f"{needed}, but {ref} ({producer.mark}) gives {kind}")
+            self._document.report(place, f"{needed}, but {ref} ({producer}) gives {kind}")
             return
         draft.gates.append((ref, self._meaning(ref, signal)))
         draft.edges.append((ref, self._document.mark(*place)))

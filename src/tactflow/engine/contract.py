@@ -95,8 +95,7 @@ class Part:
 
 
 class Declared(NamedTuple):
-    """The result of `Stage.declare`: ports, in the order of the arguments of `process` and of the tuple that
-    it returns, and memory."""
+    """The result of `Stage.declare`: ports in the order of the arguments of `process` and of its results."""
 
     inputs: Sequence[Port]
     outputs: Sequence[Port]
@@ -106,12 +105,10 @@ class Declared(NamedTuple):
 class Stage(Part):
     """Computes outputs from inputs, frame by frame.
 
-    Its ports are the annotations of `process`, which every stage defines:
-
-    - each parameter is an input of its name; `X | None` marks an input that may be absent.
-    - the output is named after the returned type; each field of a NamedTuple is an output (a number is a
-      field such as `brightness: float`). `process` may return `Absent("reason")` instead; `None` means
-      `Absent("none")`.
+    Its ports are the annotations of `process`, which every stage defines. Each parameter is an input of its
+    name; `X | None` marks one that may be absent. The output is named after the returned type; each field of
+    a NamedTuple is an output, such as `brightness: float`. `process` may return `Absent("reason")` instead;
+    `None` means `Absent("none")`.
 
     A stage must not modify its inputs, nor its outputs after returning them.
 
@@ -153,16 +150,6 @@ class Stage(Part):
         """Ports and memory, if they depend on the parameters.
 
         None, the default: the ports are the annotations of `process`, the memory is that of the class.
-
-        >>> class Mean(Stage):
-        ...     memory = "pure"
-        ...     class Params(StageParams):
-        ...         port: str = "image"
-        ...     @classmethod
-        ...     def declare(cls, params: Params) -> Declared:
-        ...         return Declared([Port(params.port, Any)], [Port(f"{params.port}_mean", float)], "pure")
-        ...     def process(self, *inputs: Any) -> tuple[float]:
-        ...         return (float(inputs[0].mean()),)
         """
         return None
 
