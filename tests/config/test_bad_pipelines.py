@@ -33,7 +33,7 @@ CASES = [
     ("file", "sensor: §!!python/object/apply:os.getcwd []", "!!python/object/apply:os.getcwd .. not allowed"),
     ("file", "§stages: &all\n  capture: *all", "nested too deeply"),
     ("file", 'sensor: "a§\x01b"', "#x0001 .. not allowed .. UTF-8"),
-    ("top", "sensor: a\n§sensor: b", "sensor: duplicate key .. line 1, column 1"),
+    ("top", "sensor: a\n§sensor: b", "sensor: duplicate key .. line 1"),
     ("source", "  §yes: {}", "a key must be text .. quotes"),
     ("file", "§sensor: main", "stages: required, but not given .. id -> stage"),
     ("file", "§stages:\n  - capture\nSINK", "stages: should be a mapping .. got a list"),

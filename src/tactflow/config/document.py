@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -143,11 +144,14 @@ def read_document(path: Path) -> Document:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"cannot read {path}: {reason}{hint}") from None
-    document = Document(str(path), line=1)
     # YAML does not allow the characters that bytes other than UTF-8 become.
     text = data.decode("utf-8-sig", "surrogateescape")
+    document = Document(str(path), line=1)
     document.lines = text.splitlines()
-    if not _parse(text, document):
+    try:
+        document.root, document.marks = _parse(text, str(path))
+    except _InvalidYamlError as error:
+        document.report_at(*error.args)
         document.raise_if_mistaken()
     return document
 
@@ -162,58 +166,41 @@ def parse_value(text: str) -> Any:
     >>> parse_value("[1, 2e-3]")
     [1, 0.002]
     """
-    document = Document("", line=1)
-    _parse(text, document)
-    if document.mistakes:
-        raise ConfigError(*[message for _, message in document.mistakes])
-    return document.root
+    try:
+        return _parse(text, "")[0]
+    except _InvalidYamlError as error:
+        raise ConfigError(error.args[1]) from None
 
 
-class _Loader(yaml.SafeLoader):
-    """Plain YAML values; dates stay text, and 1e-3 is a number as in YAML 1.2."""
+class _InvalidYamlError(Exception):
+    """Arguments: the location and the message."""
 
 
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, regexp) for tag, regexp in resolvers if not tag.endswith((":timestamp", ":value"))]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
-
-_TAG = "tag:yaml.org,2002:"
-_SCALARS = frozenset(_TAG + name for name in ("null", "bool", "int", "float", "str"))
-
-
-def _parse(text: str, document: Document) -> bool:
-    """Fill a document from YAML. Returns False, and records the error, if it cannot be parsed."""
-    file = document.mark().file
+def _parse(text: str, file: str) -> tuple[Any, dict[Keys, Mark]]:
+    """The values of a YAML text, and the location of each."""
+    line = column = 0
     try:
         loader = _Loader(text)
-        node = loader.get_single_node()
-        if node is not None:
-            values = _Values(loader, document)
-            document.marks[()] = values.mark(node)
-            document.root = values.value(node, ())
-        return True
+        root = loader.document()
+        marks = {keys: Mark(file, at.line + 1, at.column + 1) for keys, at in loader.places.items()}
+        return root, {(): Mark(file, 1, 1)} | marks
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
-        mark = Mark(file, before.count("\n") + 1, len(before) - before.rfind("\n"))
-        what = f"the character #x{error.character:04x} is not allowed in YAML"
-        document.report_at(mark, f"{what}; save the file as UTF-8 text")
+        line, column = before.count("\n"), len(before) - before.rfind("\n") - 1
+        message = f"the character #x{error.character:04x} is not allowed in YAML; save the file as UTF-8 text"
     except yaml.MarkedYAMLError as error:
         where = error.problem_mark or error.context_mark
-        mark = Mark(file, where.line + 1, where.column + 1) if where else Mark(file, 1, 1)
-        document.report_at(mark, _yaml_message(error, text))
+        if where is not None:
+            line, column = where.line, where.column
+        message = _advice(error, [*text.splitlines(), ""][line][: column + 1])
     except RecursionError:
-        document.report_at(Mark(file, 1, 1), "not a pipeline: values are nested too deeply")
-    return False
+        message = "not a pipeline: values are nested too deeply"
+    raise _InvalidYamlError(Mark(file, line + 1, column + 1), message)
 
 
-def _yaml_message(error: yaml.MarkedYAMLError, text: str) -> str:
-    """PyYAML's message, with advice for common mistakes."""
-    where = error.problem_mark
-    if where is not None and "\t" in [*text.splitlines(), ""][where.line][: where.column + 1]:
+def _advice(error: yaml.MarkedYAMLError, before: str) -> str:
+    """PyYAML's message, with advice for common mistakes. before : the line up to the error."""
+    if "\t" in before:
         return "a tab character; YAML is indented with blanks"
     around = ""
     if error.context and error.context_mark:
@@ -222,56 +209,64 @@ def _yaml_message(error: yaml.MarkedYAMLError, text: str) -> str:
     return f"not valid YAML: {around}{error.problem}{hint}"
 
 
-class _Values:
-    """Converts PyYAML's nodes to values and records their locations; aliases are expanded."""
+_TAG = "tag:yaml.org,2002:"
+_SCALARS = frozenset(_TAG + name for name in ("null", "bool", "int", "float", "str"))
 
-    def __init__(self, loader: _Loader, document: Document) -> None:
-        self._loader = loader
-        self._document = document
 
-    def value(self, node: yaml.Node, keys: Keys) -> Any:
-        """The plain value of a node at a path."""
-        self._document.marks.setdefault(keys, self.mark(node))
+class _Loader(yaml.SafeLoader):
+    """Loads plain values; dates stay text, and 1e-3 is a number as in YAML 1.2. Aliases are expanded.
+
+    places : path of a value -> location of its key, or of the item of a list.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.places: dict[Keys, yaml.Mark] = {}
+
+    def document(self) -> Any:
+        """The value of the text."""
+        node = self.get_single_node()
+        return None if node is None else self._value(node, (), node)
+
+    def _value(self, node: yaml.Node, keys: Keys, key: yaml.Node) -> Any:
+        self.places[keys] = key.start_mark
         if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
-            return self._mapping(node, keys)
+            self._merge(node)
+            return {key.value: self._value(value, (*keys, key.value), key) for key, value in node.value}
         if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
-            return [self.value(part, (*keys, index)) for index, part in enumerate(node.value)]
-        if not isinstance(node, yaml.ScalarNode) or node.tag not in _SCALARS:
-            self._report(node, f"the tag {node.tag.replace(_TAG, '!!')} is not allowed; write plain values")
-            return None
-        try:
-            return self._loader.construct_object(node)
-        except (ValueError, LookupError):
-            self._report(node, f"{node.value!r} is not a valid {node.tag.removeprefix(_TAG)}")
-            return None
+            return [self._value(part, (*keys, index), part) for index, part in enumerate(node.value)]
+        with suppress(ValueError, LookupError):
+            if isinstance(node, yaml.ScalarNode) and node.tag in _SCALARS:
+                return self.construct_object(node)
+        raise _invalid(node, f"{node.tag.replace(_TAG, '!!')} is not allowed here; write plain values")
 
-    def _mapping(self, node: yaml.MappingNode, keys: Keys) -> dict[str, Any]:
-        first: dict[str, yaml.Mark] = {}
-        for key_node, _ in node.value:
-            if key_node.tag == _TAG + "merge":
-                continue
-            key, mark = key_node.value, key_node.start_mark
-            if key_node.tag != _TAG + "str":
-                hint = f"; put {key} in quotes" if isinstance(key, str) else ""
-                self._report(key_node, f"a key must be text{hint}")
-            elif (earlier := first.setdefault(key, mark)) is not mark:
-                where = f"line {earlier.line + 1}, column {earlier.column + 1}"
-                self._report(key_node, f"{key}: duplicate key; it is already in {where}")
-        self._loader.flatten_mapping(node)
+    def _merge(self, node: yaml.MappingNode) -> None:
+        """Check the keys of a mapping, and insert those of `<<`."""
+        lines: dict[str, int] = {}
+        for key, _ in node.value:
+            if key.tag == _TAG + "str":
+                line = key.start_mark.line + 1
+                if key.value in lines:
+                    raise _invalid(
+                        key, f"{key.value}: duplicate key; it is already in line {lines[key.value]}"
+                    )
+                lines[key.value] = line
+            elif key.tag != _TAG + "merge":
+                hint = f"; put {key.value} in quotes" if isinstance(key, yaml.ScalarNode) else ""
+                raise _invalid(key, f"a key must be text{hint}")
+        self.flatten_mapping(node)
         # Merged keys come first. Remove overridden ones, which are no duplicates for an alias of this node.
-        node.value = list(
-            {key.value: (key, value) for key, value in node.value if isinstance(key.value, str)}.values()
-        )
-        values = {}
-        for key_node, value_node in node.value:
-            place: Keys = (*keys, key_node.value)
-            self._document.marks[place] = self.mark(key_node)
-            values[key_node.value] = self.value(value_node, place)
-        return values
+        node.value = list({key.value: (key, value) for key, value in node.value}.values())
 
-    def _report(self, node: yaml.Node, message: str) -> None:
-        self._document.report_at(self.mark(node), message)
 
-    def mark(self, node: yaml.Node) -> Mark:
-        """The location of a node."""
-        return Mark(self._document.mark().file, node.start_mark.line + 1, node.start_mark.column + 1)
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, regexp) for tag, regexp in resolvers if not tag.endswith((":timestamp", ":value"))]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    _TAG + "float", re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def _invalid(node: yaml.Node, problem: str) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
