@@ -35,7 +35,6 @@ class Visualize(Stage):
             "height map instead of the picture; normals: those of the stage normals; need a calibration",
         )
         deepest: float = Field(1.0, gt=0, le=100, description="view depth: height of the lightest colour, mm")
-        ellipse: bool = Field(False, description="whether the fitted ellipse is drawn")
         field: bool = Field(False, description="whether the displacement between the markers is drawn")
         text: bool = Field(True, description="whether numbers are written")
         dilate: float = Field(
@@ -55,7 +54,6 @@ class Visualize(Stage):
         self._annotator = Annotator(
             arrow_scale=params.arrow_scale,
             view=params.view,
-            ellipse=params.ellipse,
             text=params.text,
             dilate=params.dilate,
             deepest=params.deepest,

@@ -42,7 +42,6 @@ def test_everything_but_the_image_may_be_absent() -> None:
         {"arrow_scale": 10.0},
         {"view": "contact"},
         {"view": "contact", "dilate": 0},
-        {"ellipse": True},
         {"text": False},
     ],
     ids=str,

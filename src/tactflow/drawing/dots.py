@@ -1,4 +1,4 @@
-"""A picture of what detection found and why, for people."""
+"""A picture of the detected dots and of what else might be dots, for people."""
 
 from __future__ import annotations
 
@@ -14,19 +14,13 @@ from tactflow.drawing.results import DARK, GRAY, GREEN, MAGENTA, WHITE, YELLOW, 
 from tactflow.vision.markers import Candidate, Detection
 
 SHORTEST_SIDE: Final = 480
-"""Shorter side of the drawn frame, px, at least: smaller frames are enlarged. Chosen by hand."""
-
-TEXT: Final = 15
-"""Size of the letters, px. Chosen by hand."""
-
-LINE_SPACING: Final = 21
-"""Distance of two lines of text, px. Chosen by hand."""
-
+"""Smaller frames are enlarged until their shorter side is at least this long, px. Chosen by hand."""
+TEXT, LINE_SPACING = 15, 21
+"""Size of the letters, and distance of two lines of text, px. Chosen by hand."""
 LETTER_WIDTH: Final = 0.52
-"""Width of a letter on average, over the letters' size: where lines are broken. Chosen by hand."""
-
+"""Mean width of a letter over the letters' size: where lines are broken. Chosen by hand."""
 _SHIFT: Final = 4
-"""Binary digits after the point in drawing coordinates: they are exact to 1/16 px. Chosen by hand."""
+"""Binary digits after the point in drawing coordinates, which are exact to 1/16 px."""
 
 
 def draw_detection(
@@ -37,13 +31,11 @@ def draw_detection(
     rival: Candidate | None = None,
     valid: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
-    """The frame with the marks, their neighbours, what else might be marks, and a caption below.
+    """Draw the marks, their neighbours, what else might be marks, and a caption below the frame.
 
     image : (H, W, 3) or (H, W) uint8. marks : drawn as yellow circles of their radii and green links.
-    caption : lines. rival : drawn as thin magenta circles. valid : (H, W) uint8, where it is 0 the frame is
-    dim.
-
-    Returns (h, w, 3) uint8, a new picture, enlarged by a whole factor where the frame is small.
+    caption : lines. rival : drawn as thin magenta circles. valid : (H, W) uint8, 0 where the frame is
+    darkened. Returns a new picture, (h, w, 3) uint8, enlarged by a whole factor if the frame is small.
 
     >>> gel = np.full((240, 320, 3), 120, np.uint8)
     >>> draw_detection(gel, None, "0 marks")[0, 0].tolist()

@@ -20,29 +20,21 @@ log = logging.getLogger("tactflow")
 
 CODECS = {".avi": "MJPG", ".mkv": "mp4v", ".mp4": "mp4v", ".m4v": "mp4v", ".mov": "mp4v"}
 FRAMES_TO_MEASURE_RATE = 12
-"""Frames held back at the start, because their rate is not known before. Chosen by hand."""
+"""Frames held back at the start to measure their rate. Chosen by hand."""
 MIN_FREE_BYTES = 16 << 20
-"""Free space, bytes, at which the disk counts as full: what is under way and the index still fit. By hand."""
+"""Free space at which the disk counts as full, bytes: pending frames and the index still fit. By hand."""
 
 
 class Film:
     """A video file that is being written.
 
-    Pictures with an odd side get one more row or column, a copy of the last: otherwise the encoder would cut
-    it off.
+    Pictures with an odd side are padded by a copy of the last row or column, which the encoder would
+    otherwise cut off.
 
-    Parameters
-    ----------
-    path : the file; its extension chooses the codec. fps : frames per second, or None, the rate of the first
-    frames. overwrite : replace an existing file.
+    path : the file; its extension chooses the codec. fps : frames per second; None: the rate of the first
+    frames. overwrite : replace an existing file. frames : written so far.
 
-    Raises
-    ------
-    StageError : the file exists or cannot be written, or OpenCV cannot encode it; from every method.
-
-    Attributes
-    ----------
-    frames : written so far.
+    Every method raises StageError if the file exists or cannot be written, or OpenCV cannot encode it.
     """
 
     def __init__(self, path: Path, *, fps: float | None = None, overwrite: bool = False) -> None:
@@ -96,7 +88,7 @@ class Film:
 
     def _start(self, width: int, height: int) -> None:
         rate = self._fps or _rate([t for t, _ in self._held])
-        # FFmpeg would wait for ever for the reader of a pipe in its place.
+        # If a pipe has taken its place, FFmpeg would wait for ever for a reader.
         refuse_interference(self._path, self._ours, "nothing was written")
         writer = cv2.VideoWriter(
             str(self._path),
@@ -115,7 +107,6 @@ class Film:
 
     def _write(self, writer: cv2.VideoWriter, picture: NDArray[np.uint8]) -> None:
         if shutil.disk_usage(self._path.parent).free < MIN_FREE_BYTES:
-            # Its end still fits.
             self._writer = None
             writer.release()
             problem = film_problem(self._path, self.frames) if self.frames else None
@@ -127,9 +118,9 @@ class Film:
 
 
 def film_problem(path: Path, frames: int) -> str | None:
-    """What keeps a film from being read to its last frame, or None.
+    """Why a film cannot be read to its last frame, or None.
 
-    frames : how many there are to be. A file that was cut off may still claim all of them.
+    frames : expected number. A truncated file may still claim all of them, so the last one is read.
     """
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:

@@ -8,20 +8,11 @@ from numpy.typing import NDArray
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """A JPEG file.
+    """Encode a picture, (H, W, 3) uint8 BGR or (H, W) uint8, as a JPEG file.
 
-    Parameters
-    ----------
-    image : (H, W, 3) uint8, BGR, or (H, W) grey levels.
-    quality : 1 to 100; higher is sharper and larger.
+    quality : 1 to 100; higher is sharper and larger. Raises ValueError if JPEG cannot hold the image: it is
+    empty, or longer than 65500 pixels.
 
-    Raises
-    ------
-    ValueError
-        If JPEG cannot hold the image: it is empty, or longer than 65500 pixels.
-
-    Examples
-    --------
     >>> encode_jpeg(np.zeros((4, 6, 3), np.uint8), 80)[:2].hex()
     'ffd8'
     """

@@ -29,18 +29,12 @@ class Lettering:
     """
 
     def __init__(self, strokes: bool = False) -> None:
-        """Choose the letters.
-
-        strokes : use OpenCV 4's even where OpenCV 5 is installed.
-        """
+        """strokes : use the letters of OpenCV 4 even where OpenCV 5 is installed."""
         face = None if strokes else getattr(cv2, "FontFace", None)
         self._font: Any = None if face is None else face("sans")
 
     def size(self, picture: NDArray[np.uint8], text: str, size: int) -> tuple[int, int]:
-        """Width and height of a text, px.
-
-        picture : (H, W, 3) uint8 that it is to be written into. size : of the letters, px.
-        """
+        """Width and height, px, of a text in `picture`, (H, W, 3) uint8. size : of the letters, px."""
         if self._font is None:
             (wide, tall), _ = cv2.getTextSize(text.translate(_PLAIN), _STROKES, size * _STROKE_SCALE, 1)
             return wide, tall

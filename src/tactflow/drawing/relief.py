@@ -20,18 +20,11 @@ RISE: Final = 3.0
 
 
 def relief(heights: NDArray[np.float32], scale: Scale, deepest: float) -> NDArray[np.uint8]:
-    """A height map as it looks from the camera's side: what is pushed in rises towards the viewer.
+    """A height map as seen from the camera: what is pushed in rises towards the viewer.
 
-    Parameters
-    ----------
     heights : (H, W) float32, mm >= 0. scale : mm per px. deepest : height of the lightest colour, mm > 0.
+    Returns (H, W, 3) uint8, BGR: from violet at 0 over green to yellow (viridis).
 
-    Returns
-    -------
-    (H, W, 3) uint8, BGR: from violet at 0 over green to yellow (viridis).
-
-    Examples
-    --------
     >>> heights = np.zeros((40, 60), np.float32)
     >>> heights[10:30, 20:40] = 1
     >>> picture = relief(heights, Scale(0.1, 0.1, (0, 0), (0, 0)), 1.0)

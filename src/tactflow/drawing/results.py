@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.drawing.lettering import Lettering
 from tactflow.drawing.relief import colour_bar, normals_picture, relief
 from tactflow.vision.flow import DisplacementField, inside_mask
-from tactflow.vision.types import Contact, Depth, Ellipse, Flow, Markers, MarkerStatus, Scale
+from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus, Scale
 
 View = Literal["frame", "contact", "depth", "normals"]
 Colour = tuple[int, int, int]
@@ -29,51 +29,42 @@ DARK: Final[Colour] = (25, 25, 25)
 """Colours, blue, green, red."""
 
 _SHIFT: Final = 4
-"""Binary digits after the point in drawing coordinates: they are exact to 1/16 px. Chosen by hand."""
+"""Binary digits after the point in drawing coordinates, which are exact to 1/16 px."""
 _FAR: Final = 1e5
-"""Largest drawing coordinate, px: far outside any picture, and within 32 bits with `_SHIFT` digits. Chosen
-by hand."""
+"""Largest drawing coordinate, px: far outside any picture, and within 32 bits with `_SHIFT` digits."""
 _UNIT_SIDE: Final = 300
-"""Shorter side of a picture, px, up to which everything is drawn at the sizes below; in larger pictures they
-grow with it. It and all sizes below are chosen by hand, by how the pictures look."""
+"""Shorter side of a picture, px, up to which everything is drawn at the sizes below; they grow with larger
+pictures. It and all sizes below are chosen by how the pictures look."""
 _DIM: Final = 3
 """How many times darker a place without gel is shown."""
-_LINE: Final = 1.2
-"""Width of lines, px."""
-_DARK_LINE: Final = 2.6
-"""Width of the dark line below a coloured one, px."""
-_HALO: Final = 1.4
-"""How much wider than the coloured one the dark arrow below it is, px."""
+_LINE, _DARK_LINE, _HALO = 1.2, 2.6, 1.4
+"""Widths of a line and of the dark line below it, and by how much the dark arrow is wider, px."""
 _SHORTEST_ARROW: Final = 2.0
-"""Length, px, below which an arrow is a dot."""
+"""Length below which an arrow is a dot, px."""
 _HEAD: Final = (0.45, 5.0)
-"""Length of an arrow's head: as a fraction of the arrow, and at most, px."""
+"""Length of an arrow's head as a fraction of the arrow, and its maximum, px."""
 _OVERHANG: Final = 14
 """Length of the principal axis beyond the hull, px."""
 _CENTROID: Final = (4.0, 2.8)
 """Radii of the dark and of the coloured dot on the centroid, px."""
-_DASHES: Final = 12
-"""Dashes of an ellipse; they are as long as the gaps between them."""
-_TEXT: Final = 11
-"""Size of the text, px."""
-_LINE_SPACING: Final = 14
-"""Distance of two lines of text, px."""
+_TEXT, _LINE_SPACING = 11, 14
+"""Size of the text, and distance of its lines, px."""
 _BAR: Final = (70, 6)
 """Width and height of the bar that explains the colours of heights, px."""
 _BETWEEN: Final = 12.0
-"""Distance of the arrows of a field, px, at least."""
+"""Minimum distance of the arrows of a field, px."""
 _STATUS_COLOURS: Final = (
     (MarkerStatus.LOST, GRAY),
     (MarkerStatus.INFERRED, WHITE),
     (MarkerStatus.TRACKED, YELLOW),
 )
-"""Colours of the arrows, in the order in which they are drawn: what is known best comes last, on top."""
+"""Colours of the arrows, in drawing order: the most certain ones are on top."""
 
 
 def dimmed(image: NDArray[np.uint8], valid: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture, (H, W, 3) uint8, dark where no gel is: where `valid`, (H, W) uint8, is 0.
+    """The picture, (H, W, 3) uint8, darkened where `valid`, (H, W) uint8, is 0: where there is no gel.
 
-    The same array where gel is everywhere. Raises ValueError if `valid` is not of the picture's size.
+    Returns the same array if gel is everywhere. Raises ValueError if `valid` is not of the picture's size.
 
     >>> dimmed(np.full((1, 2, 3), 90, np.uint8), np.array([[255, 0]], np.uint8))[0, :, 0].tolist()
     [90, 30]
@@ -91,7 +82,6 @@ class Annotator:
     arrow_scale : length of an arrow over the displacement it shows; 1 ends it where the marker is now.
     view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black;
         "depth" the height map instead of the picture.
-    ellipse : whether the fitted ellipse is drawn.
     text : whether numbers are written.
     dilate : px, for the "contact" view: how far outside the contact the picture and its arrows reach.
     deepest : mm, for the "depth" view: height of the lightest colour.
@@ -114,22 +104,19 @@ class Annotator:
         *,
         arrow_scale: float = 3.0,
         view: View = "frame",
-        ellipse: bool = False,
         text: bool = True,
         dilate: float = 8.0,
         deepest: float = 1.0,
     ) -> None:
-        if not (arrow_scale >= 0 and math.isfinite(arrow_scale)):
-            raise ValueError(f"required arrow_scale >= 0, got {arrow_scale}")
         if view not in get_args(View):
             raise ValueError(f"required view to be one of {', '.join(get_args(View))}, got {view!r}")
-        if not (dilate >= 0 and math.isfinite(dilate)):
-            raise ValueError(f"required dilate >= 0 px, got {dilate}")
-        if not (deepest > 0 and math.isfinite(deepest)):
-            raise ValueError(f"required deepest > 0 mm, got {deepest}")
+        if not (0 <= arrow_scale < math.inf and 0 <= dilate < math.inf and 0 < deepest < math.inf):
+            raise ValueError(
+                "required finite arrow_scale >= 0, dilate >= 0 px and deepest > 0 mm, "
+                f"got {arrow_scale}, {dilate} and {deepest}"
+            )
         self._arrow_scale = arrow_scale
         self._view = view
-        self._ellipse = ellipse
         self._text = text
         self._dilate = dilate
         self._deepest = deepest
@@ -173,9 +160,8 @@ class Annotator:
             picture = (image if valid is None else dimmed(image, valid)).copy()
         unit = max(1.0, min(image.shape[:2]) / _UNIT_SIDE)
         if contact is not None and len(contact.hull):
-            draw_polygon(picture, contact.hull, GREEN, unit)
-            if self._ellipse and contact.ellipse is not None:
-                draw_ellipse(picture, contact.ellipse, MAGENTA, unit)
+            _strokes(picture, [contact.hull], DARK, _DARK_LINE * unit, closed=True)
+            _strokes(picture, [contact.hull], GREEN, _LINE * unit, closed=True)
         if field is not None:
             between = field_arrows(field, _BETWEEN * unit)
             if self._view == "contact":
@@ -203,7 +189,7 @@ class Annotator:
         return relief(depth.heights, scale, self._deepest)
 
     def _bar(self, picture: NDArray[np.uint8], unit: float) -> None:
-        """Which colour is which height, in the lower left corner."""
+        """The colour scale of heights, in the lower left corner."""
         width, height = (round(side * unit) for side in _BAR)
         left, bottom = round(6 * unit), picture.shape[0] - round(6 * unit)
         if left + width >= picture.shape[1] or bottom - height < 0:
@@ -254,12 +240,8 @@ class Annotator:
         if flow is not None and flow.mean is not None:
             right, down = flow.mean
             plural = "" if flow.count == 1 else "s"
-            lines.append(
-                (
-                    f"flow {_signed(right, 2)}, {_signed(down, 2)} px  ({flow.count} marker{plural})",
-                    YELLOW,
-                )
-            )
+            mean = f"flow {_signed(right, 2)}, {_signed(down, 2)} px"
+            lines.append((f"{mean}  ({flow.count} marker{plural})", YELLOW))
             if flow.rotation is not None and flow.divergence is not None:
                 twist = f"twist {_signed(flow.rotation, 1)}°"
                 lines.append((f"{twist}  spread {_signed(100 * flow.divergence, 1)} %", YELLOW))
@@ -360,45 +342,6 @@ def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0
                 _strokes(picture, heads, paint, extra, closed=True)
             _fill(picture, heads, paint)
             _dots(picture, tail[~long], paint, _LINE * unit + extra / 2)
-
-
-def draw_polygon(
-    picture: NDArray[np.uint8], vertices: NDArray[np.float64], colour: Colour = GREEN, unit: float = 1.0
-) -> None:
-    """Draw a closed outline into `picture`, to 1/16 px.
-
-    picture : (H, W, 3) uint8, changed. vertices : (N, 2) float64, px. unit : line width, px.
-
-    >>> picture = np.zeros((40, 60, 3), np.uint8)
-    >>> draw_polygon(picture, np.array([[10.0, 10], [50, 10], [50, 30]]))
-    >>> bool(picture[10, 30].any())
-    True
-    """
-    _strokes(picture, [vertices], DARK, _DARK_LINE * unit, closed=True)
-    _strokes(picture, [vertices], colour, _LINE * unit, closed=True)
-
-
-def draw_ellipse(
-    picture: NDArray[np.uint8], ellipse: Ellipse, colour: Colour = MAGENTA, unit: float = 1.0
-) -> None:
-    """Draw an ellipse into `picture`, dashed, to 1/16 px.
-
-    picture : (H, W, 3) uint8, changed. unit : line width, px.
-
-    >>> picture = np.zeros((40, 60, 3), np.uint8)
-    >>> draw_ellipse(picture, Ellipse((30.0, 20.0), (40.0, 20.0), 0.0))
-    >>> bool(picture[20, 50].any())
-    True
-    """
-    theta = math.radians(ellipse.angle or 0.0)
-    turn = np.array([[math.cos(theta), -math.sin(theta)], [math.sin(theta), math.cos(theta)]])
-    # Of eight parts for each dash, four are drawn; the ends of both axes lie in the middle of a dash.
-    step = np.arange(_DASHES)[:, None] * 8 + np.arange(-2, 3)
-    around = step.ravel() * (2 * math.pi / (8 * _DASHES))
-    outline = np.column_stack([np.cos(around) * ellipse.axes[0] / 2, np.sin(around) * ellipse.axes[1] / 2])
-    dashes = (outline @ turn + ellipse.center).reshape(_DASHES, 5, 2)
-    _strokes(picture, dashes, DARK, _DARK_LINE * unit)
-    _strokes(picture, dashes, colour, _LINE * unit)
 
 
 def _fixed(points: NDArray[Any]) -> NDArray[np.int32]:
