@@ -78,10 +78,3 @@ def test_the_command_prints_a_table(data: Path, capsys: pytest.CaptureFixture[st
     assert "simulated" in printed
     assert "100.0 %" in printed
     assert "Pictures without dots: 1, with some found: 0" in printed
-
-
-def test_a_folder_without_the_recordings_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--data", str(tmp_path)]) == 2
-    assert "none of the recordings" in capsys.readouterr().err

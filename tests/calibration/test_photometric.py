@@ -74,19 +74,6 @@ def test_heights_of_other_contacts_are_right_to_a_few_hundredths_of_the_depth(
         assert abs(found.greatest - sunk.max()) < found.greatest_stderr < 0.15 * sunk.max()
 
 
-def test_normals_are_those_of_the_ball_to_two_degrees(learned: Photometry) -> None:
-    others = session_of(open_scene("ball?frames=120&seed=9"))
-    surface, rest = Surface(learned.model, SCALE), Rest(others.untouched)
-    y, x = np.mgrid[: others.untouched.shape[0], : others.untouched.shape[1]]
-    for press in others.presses:
-        normals = surface.normals(press.image, rest, press.mask)
-        middle = np.hypot(x - press.center[0], y - press.center[1]) < 0.7 * press.radius
-        to_middle = np.stack([press.center[0] - x, press.center[1] - y], axis=2)[middle] * SCALE.x / BALL
-        upright = np.sqrt(1 - (to_middle**2).sum(axis=1))
-        cosine = (normals[middle, :2] * to_middle).sum(axis=1) + normals[middle, 2] * upright
-        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 2
-
-
 def test_heights_are_right_where_one_of_the_lights_does_not_reach_every_slope() -> None:
     learned = fit_photometry(session_of(open_scene("ball?frames=260&light=dark_channel")), SCALE, BALL)
     shown = open_scene("cable?seed=11&frames=200&light=dark_channel")

@@ -21,7 +21,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 from tactflow.sim.light import LIGHTS
 from tactflow.vision.depth.slopes import SlopeModel
-from tests.calibration.ball_presses import BALL, scale, session_of
+from tests.calibration.ball_presses import BALL, noisy, scale, session_of
 from tests.terminal import Terminal
 
 SCALE = scale()
@@ -98,15 +98,7 @@ def test_presses_that_are_no_ball_are_refused(base: Calibration, other: Session)
     swapped = [replace(p, image=np.ascontiguousarray(p.image[..., ::-1])) for p in other.presses]
     with pytest.raises(ConfigError, match="the object is not a ball, nothing touches the gel"):
         refine_photometry(replace(other, presses=swapped[:3]), SCALE, BALL, base)
-    noise = np.random.default_rng(0)
-    idle = [
-        replace(
-            p, image=np.clip(other.untouched + noise.normal(0, 1, p.image.shape), 0, 255).astype(np.uint8)
-        )
-        for p in other.presses
-    ]
-    with pytest.raises(ConfigError, match="nothing touches the gel"):
-        refine_photometry(replace(other, presses=idle[:3]), SCALE, BALL, base)
+    idle = [replace(p, image=noisy(other.untouched, p.seq)) for p in other.presses]
     with pytest.raises(ConfigError, match="nothing touches the gel"):
         fit_photometry(replace(other, presses=idle), SCALE, BALL)
 

@@ -18,18 +18,6 @@ def scene() -> Scene:
     return open_scene("slide?frames=12")
 
 
-def test_an_interrupted_export_leaves_nothing_behind(scene: Scene, tmp_path: Path) -> None:
-    def stop(done: int) -> None:
-        if done == 3:
-            raise KeyboardInterrupt
-
-    for name in ("a.npy", "a.jsonl"):
-        write = export.write_truth if name == "a.jsonl" else export.write_frames
-        with pytest.raises(KeyboardInterrupt):
-            write(scene, tmp_path / name, stop)
-        assert list(tmp_path.iterdir()) == []
-
-
 def test_truth_as_json_lines_is_the_truth(scene: Scene, tmp_path: Path) -> None:
     export.write_truth(scene, tmp_path / "a.jsonl")
     lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]

@@ -16,15 +16,6 @@ def frame_noise(seed: int, index: int) -> np.ndarray:
     return sensor_noise(seed, index, SHAPE).astype(np.float64) / NOISE_UNIT
 
 
-def test_noise_has_mean_zero_and_deviation_one() -> None:
-    drawn = frame_noise(7, 3)
-    # Derived: standard errors 1 / sqrt(1.44e6) = 8e-4 and 6e-4; five of them.
-    assert abs(drawn.mean()) < 5 * COUNT**-0.5
-    assert abs(drawn.std() - 1) < 5 * (2 * COUNT) ** -0.5
-    # Excess kurtosis of a normal is 0, with standard error sqrt(24 / n) = 4e-3.
-    assert abs((drawn**4).mean() / drawn.var() ** 2 - 3) < 5 * (24 / COUNT) ** 0.5
-
-
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (0, 2), (5, 6), (10, 299), (0, 1000), (3, 99_999)])
 def test_frames_are_independent_at_every_pixel_and_at_small_shifts(first: int, second: int) -> None:
     one, other = frame_noise(7, first), frame_noise(7, second)

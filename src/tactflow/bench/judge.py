@@ -1,11 +1,11 @@
-"""How well pipelines find contacts on recordings of real sensors, lab by lab.
+"""Compare the contacts that pipelines find in recordings of real sensors with outlines, lab by lab.
 
     python -m tactflow.bench.judge --data RECORDINGS
     python -m tactflow.bench.judge --data RECORDINGS --labels mine.json default mine.yaml
 
-Frames were outlined by a person (`python -m tactflow.bench.label`): `outlines.json` beside this file has
-those of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of separate
-presses run one after the other, behind their reference.
+A person outlined the contacts (`python -m tactflow.bench.label`); `outlines.json` beside this file has
+outlines of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of
+separate presses run one after the other, after their reference.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 
 OUTLINES: Final = Path(__file__).with_name("outlines.json")
-"""Outlines that were drawn for the package, see `label_file`, and frames at rest."""
+"""Outlines drawn for the package, and frames at rest, see `label_file`."""
 PLAIN: Final = (
     "gels/9dtact_1",
     "gels/digit_fots",
@@ -48,19 +48,16 @@ PLAIN: Final = (
     "wedge_grasp",
     "wedge_grip",
 )
-"""Recordings of gels without dots among those of `OUTLINES`: `default` gives way to `markerless` there."""
-WORST: Final = 20
-ACROSS: Final = 5
-"""Frames of a picture of the worst ones, and its columns."""
-TILE: Final = 240
-"""Side of each of them, px."""
+"""Recordings in `OUTLINES` of gels without dots: `default` is replaced by `markerless` there."""
+WORST, ACROSS, TILE = 20, 5, 240
+"""The picture of the worst frames: their number, its columns, and the side of a frame, px."""
 GREEN, RED, WHITE, GRAY = (0, 255, 0), (0, 0, 255), (255, 255, 255), 64
 LARGE: Final = 500
-"""px: pictures with a longer side are halved, as the documentation advises."""
+"""Pictures with a longer side, px, are halved, as the documentation advises."""
 Pictures = list[NDArray[np.uint8]]
 """(H, W, 3) BGR each."""
 RESAMPLES: Final = 1000
-"""For the intervals: as many as give their bounds two digits."""
+"""Bootstrap samples: enough for two digits of the bounds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +65,11 @@ class Judged:
     """What a pipeline found in a frame, compared with its label.
 
     lab, recording : of the label. touched, found : whether something touches, by label and by pipeline.
-    hull : overlap (IoU) of the convex hulls, 0..1; 0 for a missed contact. region : the same of the regions
-        themselves. Both, and all that follows, are NaN where the label has no outline.
+    hull, region : overlap (IoU) of the convex hulls and of the regions, 0..1; 0 for a missed contact. These
+    and all that follow are NaN where the label has no outline.
     center : distance of the regions' centroids, px of the processed frame. angle : between their axes,
-        degrees; NaN where the outline is less than twice as long as wide. area : of the region found over
-        that of the outline. These three are NaN for a missed contact.
+    degrees; NaN where the outline is less than twice as long as wide. area : of the region found over that of
+    the outline. These three are NaN for a missed contact.
     """
 
     lab: str
@@ -87,7 +84,7 @@ class Judged:
 
 
 def compare(label: FrameLabel, result: Result) -> Judged:
-    """Compare what was found in a frame with its label, which says whether something touches."""
+    """Compare the result of a frame with its label, which says whether something touches."""
     contact, mapping = result.contact, result["mapping"]
     assert isinstance(mapping, PixelMapping)
     judged = Judged(label.lab, label.recording, bool(label.contact), contact is not None)
@@ -114,7 +111,7 @@ def compare(label: FrameLabel, result: Result) -> Judged:
 def judge(
     pipeline: str, labels: Iterable[FrameLabel], data: Path, report: Callable[[str], None] = say
 ) -> Iterator[Judged]:
-    """Run every recording that is there, and compare its labelled frames; as for `labelled`.
+    """Run each recording, and compare its labelled frames; arguments and errors as for `labelled`.
 
     Frames that a failing pipeline did not reach count as missed contacts.
     """
@@ -132,13 +129,12 @@ def labelled(
     report: Callable[[str], None] = say,
     images: bool = False,
 ) -> Iterator[tuple[FrameLabel, Result | None]]:
-    """Run every recording that is there: its labels, and results of these frames.
+    """Run each recording that exists, and return its labels and the results of these frames.
 
-    pipeline : a file or the name of a shipped pipeline. "default" is replaced by "markerless" for the
-        recordings in `PLAIN`.
-    labels : those with `contact` None are left out. data : folder that holds the recordings.
-    report : called with what could not be judged, and why. Frames that a failing pipeline did not reach have
-        no result. images : whether the results hold the pictures.
+    pipeline : a file or the name of a shipped pipeline; see `PLAIN` for "default". labels : those with
+    `contact` None are left out. data : folder that holds the recordings. report : called with what could not
+    be judged, and why; frames that a failing pipeline did not reach have no result. images : whether the
+    results hold the pictures.
 
     Raises
     ------
@@ -173,7 +169,7 @@ def labelled(
 def draw_worst(
     pipeline: str, labels: Sequence[FrameLabel], data: Path, path: Path, blank: bool = False
 ) -> None:
-    """Write a picture of the frames whose hulls overlap least with the outlines: these green, hulls red.
+    """Draw the frames whose hulls (red) overlap least with the outlines (green).
 
     blank : leave the frames themselves out.
     Raises ConfigError if there are no outlined frames, or the file cannot be written.
@@ -226,12 +222,12 @@ def outlined(label: FrameLabel, mapping: PixelMapping) -> NDArray[np.uint8]:
 
 
 def _run(label: FrameLabel) -> tuple[str, str]:
-    """What is run at once: a video, or the pictures with the same reference."""
+    """Labels with an equal key are run together: a video, or pictures with the same reference."""
     return label.recording, label.reference if isinstance(label.reference, str) else ""
 
 
 def _picture(folder: Path, name: str) -> NDArray[np.uint8]:
-    """A picture by its name without the suffix; it may stand in a folder beside."""
+    """A picture by its name without the suffix, which may include a path relative to the folder."""
     path = folder / name
     files = sorted(path.parent.glob("*")) if path.parent.is_dir() else []
     found = next((file for file in files if file.stem == path.name), None)
@@ -300,9 +296,9 @@ def _median(values: Sequence[float] | NDArray[np.float64]) -> float:
 
 
 def interval(judged: Sequence[Judged], confidence: float = 0.95) -> tuple[float, float]:
-    """Bounds of the median overlap of hulls, by resampling whole recordings (bootstrap, Efron 1979).
+    """Confidence interval of the median overlap of hulls; NaN without outlines.
 
-    Frames of a recording resemble each other, and do not count as so many. NaN without outlines.
+    Bootstrap (Efron 1979) over whole recordings, because frames of one recording are not independent.
     """
     groups: dict[str, list[float]] = {}
     for one in judged:
@@ -323,7 +319,7 @@ def _by_lab(judged: Sequence[Judged]) -> Iterator[tuple[str, list[Judged]]]:
 
 
 def scatter(labels: Iterable[FrameLabel]) -> list[float]:
-    """Overlap of each frame's outlines that were drawn in round 1 and again in round 2, 0..1."""
+    """Overlap, 0..1, of the outlines of rounds 1 and 2 of each frame that has both."""
     rounds = {(label.recording, label.frame, label.round): label for label in labels if label.outlines}
     overlaps = []
     for (recording, frame, number), label in rounds.items():

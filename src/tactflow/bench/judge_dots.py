@@ -1,11 +1,11 @@
-"""How well the dots of a gel are found, and where none are.
+"""Compare detected dots with those that a person marked on gels, and count false ones on gels without.
 
     python -m tactflow.bench.judge_dots --data RECORDINGS
 
-Dots were marked by eye in frames of recordings of real sensors (as with `python -m tactflow.bench.label
---dots`); `dots.json` beside this file has them, and frames of gels without dots. A dot that was marked in
-only one of two rounds is uncertain: it need not be found, and is not false where it is. So is what the border
-may cut. Positions were refined by the detector of the package: this judges which dots are found, not where.
+Dots were marked by eye in recordings of real sensors (as with `python -m tactflow.bench.label --dots`);
+`dots.json` beside this file has them, and frames of gels without dots. A dot marked in only one of two rounds
+is uncertain, and so is one that the border may cut: finding it is neither required nor wrong. Positions were
+refined by the package's detector, so this judges which dots are found, not where.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ Finder = Callable[[Picture], Floats]
 
 @dataclass(frozen=True, slots=True)
 class FoundDots:
-    """lab : of the label. dots : that have to be found. found : of these. false : found where there is none.
+    """lab : of the label. dots : required ones. found : of these. false : detections that are not dots.
 
-    kind : how the picture was changed; empty as it is.
+    kind : how the picture was changed; empty if it was not.
     """
 
     lab: str
@@ -61,7 +61,7 @@ class FoundDots:
 
 
 def find(picture: Picture) -> Floats:
-    """The centres (N, 2) that the package finds; none where it says that there are none."""
+    """The centres (N, 2) that the package finds."""
     try:
         return detect_markers(picture).centers
     except NoMarkersError:
@@ -69,10 +69,10 @@ def find(picture: Picture) -> Floats:
 
 
 def compare(lab: str, found: Floats, dots: Floats, uncertain: Floats, size: tuple[int, int]) -> FoundDots:
-    """Assign what was found, (N, 2), to what a person marked, so that the sum of distances is least.
+    """Compare detections (N, 2) with the marked dots, by the assignment with the least sum of distances.
 
-    dots, uncertain : (M, 2), (K, 2), px. size : of the picture (width, height): what is nearer to its border
-    than `BORDER` is uncertain, too.
+    dots, uncertain : (M, 2), (K, 2), px. size : of the picture (width, height); dots nearer to its border
+    than `BORDER` are uncertain, too.
     """
     if not len(dots):
         return FoundDots(lab, 0, 0, len(found))
@@ -84,8 +84,8 @@ def compare(lab: str, found: Floats, dots: Floats, uncertain: Floats, size: tupl
 
 
 def assign(found: Floats, dots: Floats, uncertain: Floats, size: tuple[int, int]) -> tuple[Indices, Flags]:
-    """For each one found, (N,): the number of the marked dot that it is, uncertain ones last, or -1; and
-    whether it is far enough from the border to be judged. Arguments as of `compare`."""
+    """For each detection, (N,): index of its marked dot, uncertain ones last, or -1; and whether it is far
+    enough from the border to be judged. Arguments as of `compare`."""
     marked, pitch = np.concatenate([dots, uncertain]), _pitch(dots)
     apart = nearest(dots, 1)[0][:, 0] if len(dots) > 1 else np.full(1, pitch)
     reach = TOLERANCE * np.concatenate([apart, np.full(len(uncertain), pitch)])
@@ -115,9 +115,9 @@ def judge(
     report: Callable[[str], None] = say,
     kinds: Iterable[str] | None = None,
 ) -> Iterator[FoundDots]:
-    """Look for dots in each labelled frame, as it is and changed; in frames without dots only as they are.
+    """Detect dots in each labelled frame, as it is and changed; in frames without dots only as they are.
 
-    report : called with the recordings that are not there. kinds : keys of `CHANGES`; None for all.
+    report : called with missing recordings. kinds : keys of `CHANGES`; None for all.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def _points(points: Iterable[tuple[float, float]]) -> Floats:
 
 
 def _agreed(first: Floats, second: Floats) -> tuple[Floats, Floats]:
-    """The dots of both rounds, and those of only one: within a pixel they are the same."""
+    """The dots of both rounds, and those of only one; two marks within a pixel are the same dot."""
     both = np.asarray(KDTree(second).query(first)[0]) < 1
     rest = np.asarray(KDTree(first).query(second)[0]) >= 1
     return first[both], np.concatenate([first[~both], second[rest]])
@@ -207,8 +207,8 @@ CHANGES: Final[Mapping[str, Callable[[Picture], tuple[Picture, Floats]]]] = {
     "dark": lambda picture: (np.asarray(picture * 0.5, np.uint8), _SAME),
     "JPEG 30": lambda picture: (_jpeg(picture, 30), _SAME),
 }
-"""What changes nothing about where dots are: name -> the changed picture, and the matrix (2, 3) that maps
-points to it."""
+"""Name of a change -> function that returns the changed picture and the matrix (2, 3) that maps points to
+it."""
 
 
 def summary(judged: Sequence[FoundDots]) -> Iterator[str]:

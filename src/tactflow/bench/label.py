@@ -55,13 +55,10 @@ def read_items(
     """Read the frames of a recording that are to be labelled.
 
     spec : what `open_source` takes, except cameras and streams. recording : its name in the labels.
-    reference : the untouched gel: the name of a picture without its suffix, or an index; None is the first
-    frame. frames : which to label, by name or index; empty for one of every `every`, without the reference.
+    reference : the untouched gel: the name of a picture without its suffix, or an index; None: the first
+    frame. frames : which to label, by name or index; empty: every `every`-th one except the reference.
 
-    Raises
-    ------
-    ConfigError : there is no such frame, or it is not a recording.
-    SourceError : the recording cannot be read.
+    Raises ConfigError if there is no such frame, or it is not a recording, SourceError if it cannot be read.
     """
     with closing(open_source(spec)) as reader:
         if reader.live:
@@ -135,12 +132,10 @@ class LabelServer(ThreadingHTTPServer):
     def change(self, label: FrameLabel, remove: bool) -> None:
         """Replace the label of the same frame and round, or remove it; all else in the file stays.
 
-        Raises
-        ------
-        ConfigError, StageError : the file of labels is broken by now, or cannot be written.
+        Raises ConfigError or StageError if the file of labels is broken by now, or cannot be written.
         """
         with self._saving:
-            # Read again: another page or program may have changed it.
+            # Another page or program may have changed it.
             labels = self._load()
             place = next((i for i, other in enumerate(labels) if other.key == label.key), len(labels))
             labels[place : place + 1] = [] if remove else [label]

@@ -28,10 +28,10 @@ Point = tuple[FiniteFloat, FiniteFloat]
 class FrameLabel(BaseModel):
     """What a person sees in one frame, compared with a reference frame of the untouched gel.
 
-    recording : its path relative to a folder that whoever shares the file names, or its name.
+    recording : its name, or its path relative to a folder of recordings.
     frame, reference : an index from 0, or the name of a picture's file without its suffix.
-    lab : where the label comes from. round : 1 for first labels; 2 for labelling again without a look at
-    them, to measure the scatter.
+    lab : where the recording comes from. round : 1 for first labels; 2 for independent second ones, which
+    measure the scatter.
     contact : whether something touches the gel; None if the person cannot tell.
     outlines : of the contact, each of 3 points (x, y) or more, raw px; only where contact is True.
     dots : centres (x, y) of all markers, raw px; None if nobody marked them.
@@ -78,10 +78,8 @@ _LABELS = TypeAdapter(list[FrameLabel])
 def load_labels(path: Path) -> list[FrameLabel]:
     """Read a file of labels, in its order.
 
-    Raises
-    ------
-    ConfigError : the file cannot be read, is not JSON, an entry is wrong, or a frame has two labels of one
-        round. The message names the entry, counted from 1, and the key.
+    Raises ConfigError if the file cannot be read or is not JSON, an entry is wrong, or a frame has two labels
+    of one round. The message names the entry, counted from 1, and the key.
     """
     try:
         labels = _LABELS.validate_json(path.read_bytes(), strict=True)
@@ -105,28 +103,14 @@ def load_labels(path: Path) -> list[FrameLabel]:
 
 
 def save_labels(path: Path, labels: Sequence[FrameLabel]) -> None:
-    """Write a file of labels, one line each; it replaces what is there only when it is complete.
+    """Write a file of labels, one line each.
 
-    Raises
-    ------
-    StageError : the file cannot be written; an earlier one is still there.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> label = FrameLabel(
-    ...     recording="left", frame=7, reference=0, contact=True, outlines=[[(1, 2), (9, 2), (5, 8)]]
-    ... )
-    >>> with TemporaryDirectory() as folder:
-    ...     save_labels(Path(folder, "labels.json"), [label])
-    ...     load_labels(Path(folder, "labels.json")) == [label]
-    True
+    Raises StageError if the file cannot be written; an earlier one is then unchanged.
     """
-    lines = [json.dumps(_entry(label), ensure_ascii=False) for label in labels]
+    entries = [label.model_dump(exclude={"dots"} if label.dots is None else None) for label in labels]
+    lines = [json.dumps(entry, ensure_ascii=False) for entry in entries]
     try:
         with completed(path) as partial:
             partial.write_text("[\n" + ",\n".join(lines) + "\n]\n", encoding="utf-8")
     except OSError as error:
         raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
-
-
-def _entry(label: FrameLabel) -> dict[str, object]:
-    return label.model_dump(exclude={"dots"} if label.dots is None else None)

@@ -63,12 +63,8 @@ class LockstepPipeline:
     def block(self, frames: int = BLOCK) -> list[TimedResult]:
         """Run a number of further frames without a pause between them, and return their results.
 
-        Returns fewer where the recording ends or the pipeline fails; the call after that returns none.
-
-        Raises
-        ------
-        TactflowError
-            If the pipeline failed and there is nothing left to return.
+        Returns fewer where the recording ends or the pipeline fails. The next call then returns an empty
+        list, or raises TactflowError if the pipeline failed.
         """
         if self._outcome is None:
             self._turns.put(frames)
@@ -146,16 +142,11 @@ def take_turns(
 ) -> tuple[dict[str, Times], dict[str, str]]:
     """Run pipelines in turns of a few frames until all recordings are over.
 
-    Parameters
-    ----------
-    pipelines : name -> pipeline, each with its recording.
-    observe : called with (name, result) for each frame, after its turn; returns the kind of frame its time
-        belongs to. The time of references is kept apart.
+    pipelines : name -> pipeline, each with its recording. observe : called with (name, result) for each
+    frame, after its turn; returns the kind of frame its time belongs to, except for references.
     block : frames in a turn.
 
-    Returns
-    -------
-    times : name -> kind of frame -> CPU times, s. failures : name -> why it stopped.
+    Returns times : name -> kind of frame -> CPU times, s. failures : name -> why it stopped.
     """
     times: dict[str, Times] = {name: defaultdict(list) for name in pipelines}
     failures: dict[str, str] = {}

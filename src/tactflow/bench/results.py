@@ -99,11 +99,8 @@ class BenchResult:
 def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
     """Errors of a stored run: group/method/scene -> quantity -> error.
 
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is not a result of the bench, or one run is quick and the other is not:
-        they differ in their scenes.
+    Raises ConfigError if the file is not a result of the bench, or of a quick run while this one is full, or
+    the other way round, because their scenes differ.
     """
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""How deep a gel is pressed where it is darker, learned from presses of a ball; one is enough.
+"""Depth of a gel from its darkening, learned from one press of a ball or more.
 
 Inside a contact the surface is the ball: at a distance d from the middle of a ball of radius R whose contact
 has the radius c, the depth below the untouched gel is sqrt(R^2 - d^2) - sqrt(R^2 - c^2). Means over rings
@@ -93,7 +93,7 @@ def darkness_error(session: Session, entry: DarknessEntry, scale: Scale) -> floa
 
 
 def _rings(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> list[Ring]:
-    """Rings of a press, from the middle outwards; none if the contact is too large for the ball."""
+    """Rings of a press, from the middle outwards; empty if the contact is too large for the ball."""
     contact = press.radius * (scale.x * scale.y) ** 0.5
     if contact > TOO_LARGE * ball_radius:
         return []
@@ -143,10 +143,10 @@ def _curve(rings: Sequence[Ring], halves: tuple[int, ...]) -> tuple[Floats, Floa
 
 
 def _held_out(presses: Sequence[Sequence[Ring]]) -> Floats:
-    """(n,): RMS error of the depth of each press, mm, by a curve that has not seen it.
+    """(n,): cross-validated RMS error of the depth of each press, mm.
 
-    It is judged as deep as the other presses reach; where that is less than a few rings, each of its halves
-    is judged by the other.
+    It is judged down to the depth of the other presses; if that is less than a few rings, one half of it is
+    judged by the other.
     """
     errors = []
     for number, press in enumerate(presses):

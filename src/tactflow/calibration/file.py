@@ -1,7 +1,7 @@
-"""The calibration file: what is known about one sensor, as YAML that people read, with arrays beside it.
+"""The calibration file of a sensor: readable YAML, and arrays beside it.
 
-`left.yaml` says which sensor, when, from what, by which version, what was found and with which errors;
-`left.npz` has the arrays: what the untouched gel looked like, and the coefficients of the slopes.
+`left.yaml` has the sensor, its origin, and the fitted values with their errors; `left.npz` has the arrays: a
+small picture of the untouched gel, and the coefficients of the slopes.
 """
 
 from __future__ import annotations
@@ -32,21 +32,20 @@ from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
 
 LOOK: Final = (16, 12)
-"""Columns and rows of the small picture of the untouched gel that is kept. Chosen by hand."""
+"""Columns and rows of the stored picture of the untouched gel. Chosen by hand."""
 MOVED: Final = 1.0
 """Largest shift of a corner of the processed frame in the raw frame, raw px. Chosen by hand: rounding in a
 pipeline file shifts it less."""
 UNLIKE: Final = 0.1
-"""Difference of the untouched gel, relative to its brightness and after its light was scaled channel by
-channel, above which the gel counts as different. Chosen by hand: presses of one session differ by 0.01."""
-
+"""Largest difference of the untouched gel, see `Calibration.unlikeness`. Chosen by hand: presses of one
+session differ by 0.01."""
 UNLIKE_KIND: Final = 0.22
 """The same for sensors of one kind. Minis of three labs differ by 0.06 to 0.07, with dots by up to 0.21, and
 seven other kinds of gel from them by 0.24 to 1.1."""
 ASPECT: Final = 0.02
-"""Relative difference of width over height up to which frames have the same shape. Chosen by hand."""
+"""Largest relative difference of the aspect ratios of frames of the same shape. Chosen by hand."""
 ALIGNED: Final = 0.9
-"""Cosine of the angle between the axes of two frames above which they are turned alike."""
+"""Least cosine of the angle between the axes of frames with the same rotation."""
 TERMS: Final = PLACE_TERMS * COLOUR_TERMS
 """Coefficients of one part of the normal."""
 
@@ -77,7 +76,7 @@ class ScaleEntry(_Entry):
 
 
 class PhotometricEntry(_Entry):
-    """`photometric` of the file: what it was learned from, and its errors on presses it was not learned from.
+    """`photometric` of the file: the presses that it was learned from, and its cross-validated errors.
 
     ball_radius : mm. presses, rejected : how many. normal_error : mean angle, degrees. depth_stderr : of
     balls, relative; for people, since the errors of a height map are those of `SurfaceErrors`. between : the
@@ -100,9 +99,9 @@ class PhotometricEntry(_Entry):
 
 
 class DarknessEntry(_Entry):
-    """`darkness` of the file: depth of a gel that is darker the deeper it is pressed, see `DarknessModel`.
+    """`darkness` of the file: depth of a gel that darkens with it, see `DarknessModel`.
 
-    ball_radius : mm. presses : how many. darkening : relative. depth : mm, of each. stderr : of it, mm.
+    ball_radius : mm. presses : how many. darkening : relative. depth : of each darkening, mm. stderr : mm.
     """
 
     ball_radius: float = Field(gt=0)
@@ -117,10 +116,10 @@ class DarknessEntry(_Entry):
 
 
 class LinearForceEntry(_Entry):
-    """A force that is linear in features, and its errors on forces that the fit has not seen.
+    """A force that is linear in features, and its cross-validated errors.
 
     stiffness, greatest, error : see `LinearForce`. range : least and largest force of the fit, N.
-    rmse : RMS error, N. r2 : share of the variance that is explained.
+    rmse : RMS error, N. r2 : coefficient of determination.
     """
 
     stiffness: dict[str, float]
@@ -139,9 +138,8 @@ class ForceEntry(_Entry):
     """`force` of the file.
 
     press : of z. drag : of x and y; None where the reference had no such columns. change_at_rest : see
-    `ForceModel`. recordings : source -> by how much its frames' time is ahead of that of its CSV, s.
-    presses : in all of them. left_out : whether `rmse` is of objects, recordings or presses that the
-    fit has not seen.
+    `ForceModel`. recordings : source -> offset of its frames' time against that of its CSV, s. presses : in
+    all of them. left_out : what the errors are cross-validated over.
     """
 
     press: LinearForceEntry
@@ -163,14 +161,12 @@ class Calibration(_Entry):
     sensor, made, made_from, tactflow : its name, when (UTC), from which source, by which version.
     raw_size, size : (width, height) of the raw and of the processed frame, px.
     corners : (4, 2), where the corner pixels of the processed frame lie in the raw one, px.
-    scale_entry : millimetres per pixel. photometric, slopes : which slope has which colour, and how well;
-    None where that is not known. darkness : which darkening is which depth, in place of slopes, for gels in
-    white light. force : how the force follows from a contact; None where that is not known.
-    kind : the kind of sensor that it is the default of, for frames of the same shape and any size; None where
-    it is of one sensor.
+    scale_entry : millimetres per pixel. photometric, slopes : slopes from colours, and their errors.
+    darkness : depth from darkening, for gels in white light. force : from contacts. None if not known.
+    kind : of sensor that it is the default of, for frames of the same shape and any size; else None.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
-    information : (114, 114) float64, `Photometry.information`, with which it can be refined for another
-    sensor; None without slopes, and in files of earlier versions.
+    information : (114, 114) float64, `Photometry.information`, to refine it for another sensor; None without
+    slopes.
     """
 
     model_config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, populate_by_name=True)
@@ -262,7 +258,7 @@ class Calibration(_Entry):
         raise ConfigError(f"calibration {path}: {reason}; make a new one with `tactflow calibrate`")
 
     def misfit(self, mapping: PixelMapping) -> str | None:
-        """Why it cannot be used for frames of this geometry; None if it can."""
+        """Why it does not fit frames of this geometry; None if it does."""
         if self.kind is not None:
             return self._misfit_of_kind(mapping)
         origin = f"the calibration was made {self.made} from {self.made_from}"
@@ -285,10 +281,9 @@ class Calibration(_Entry):
         return None
 
     def unlikeness(self, untouched: NDArray[np.uint8]) -> float:
-        """How much an untouched gel without markers, (H, W, 3) uint8, differs from the one of the file.
+        """RMS difference of an untouched gel without markers, (H, W, 3) uint8, from the one of the file.
 
-        RMS, relative to the brightness, after each channel was scaled to its own mean: 0 is the same, see
-        `UNLIKE`.
+        It is relative to the brightness, after each channel was scaled to the stored mean; see `UNLIKE`.
         """
         now = small_picture(untouched)
         level = np.maximum(self.look.mean(axis=(0, 1)), 1)

@@ -15,29 +15,29 @@ from tactflow.vision.types import Scale
 FEWEST_PRESSES: Final = 8
 """Presses that a fit needs at least; 20 or more are advised. Chosen by hand."""
 SPREAD: Final = 0.15
-"""Part of the picture's width and height that the presses must span at least. Chosen by hand."""
+"""Least part of the picture's width and height that the presses span. Chosen by hand."""
 TOO_LARGE: Final = 2.0
-"""Radius of a contact, relative to that of the ball, that no ball can cause. Outlines are wider than the
-contact: the median is 0.46 to 1.55 on five gels."""
+"""Radius of a contact, relative to that of the ball, above which no ball can have caused it. Outlines are
+wider than the contact: the median is 0.46 to 1.55 on five gels."""
 LEAST_EXPLAINED: Final = 0.7
 """Median share of the slopes of presses that a fit to others must explain. Two faces of an edge can explain
-0.36 of the slopes of a ball, as (E|x|)^2 / E(x^2 + y^2) on a disc. Balls on five gels have 0.94 to 0.99,
-edges of a cube 0.53 by a fit of their own and 0.26 by that of a ball."""
+0.36 of the slopes of a ball, (E|x|)^2 / E(x^2 + y^2) on a disc. Balls on five gels have 0.94 to 0.99, edges
+of a cube 0.53 with their own fit and 0.26 with that of a ball."""
 LARGEST_ERROR: Final = 0.35
 """Relative error of depth above which a fit is refused. By hand: balls on five gels have 0.04 to 0.14."""
 SHALLOW: Final = 0.4
-"""Median radius of the contacts, relative to that of the ball, below which the user is asked whether the
-diameter was given. Balls on five gels have 0.46 to 1.55, and half of that if the diameter is given."""
+"""Median radius of the contacts over that of the ball, below which the user is asked whether the diameter was
+given. Balls on five gels have 0.46 to 1.55, half of that with the diameter."""
 OTHER_RADIUS: Final = 2**0.5
-"""Factor between the given radius and the one that another sensor of the kind measures, above which the user
+"""Factor between the given radius and the one measured with the calibration of the kind, above which the user
 is asked: half way to a diameter. Single presses on two Minis and a DIGIT have 0.9 to 1.3."""
 
 
 def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) -> None:
     """Raise ConfigError if the presses cannot give a calibration, with what was found and what to do.
 
-    radii : (n,) float64, mm, of the ball of each press. fewest : presses, from `FEWEST_PRESSES` on all over
-    the gel.
+    radii : (n,) float64, of the ball of each press, mm. fewest : presses; with at least `FEWEST_PRESSES` they
+    must be all over the gel.
     """
     presses = session.presses
     if not (np.isfinite(radii) & (radii > 0)).all():
@@ -54,7 +54,7 @@ def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) ->
         )
     span = np.ptp([press.center for press in presses], axis=0) / session.mapping.size
     if span.min() < SPREAD and fewest >= FEWEST_PRESSES:
-        # Rounded down, so as not to read as enough.
+        # Rounded down, so that the message cannot show the required value.
         wide, high = np.floor(1000 * span) / 10
         raise ConfigError(
             f"calibrate: the presses span {wide:g} % of the picture's width and "
@@ -70,7 +70,7 @@ def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) ->
 
 
 def check_explained(explained: float) -> None:
-    """Raise ConfigError if so little of the slopes of presses is explained that they are no ball's."""
+    """Raise ConfigError if too little of the slopes is explained for presses of a ball."""
     if explained < LEAST_EXPLAINED:
         raise ConfigError(
             f"calibrate: the colours explain {100 * explained:.0f} % of the slopes that a ball would "
@@ -80,7 +80,7 @@ def check_explained(explained: float) -> None:
 
 
 def check_error(found: PhotometricEntry) -> None:
-    """Raise ConfigError if the error of the depth is too large, with what may be wrong."""
+    """Raise ConfigError if the error of the depth is too large, with possible causes."""
     if found.depth_stderr > LARGEST_ERROR:
         raise ConfigError(
             f"calibrate: the error of the depth would be {100 * found.depth_stderr:.0f} % "
@@ -90,9 +90,9 @@ def check_error(found: PhotometricEntry) -> None:
 
 
 def doubt(session: Session, scale: Scale, ball_radius: float, apparent: float | None = None) -> str | None:
-    """A question about the radius of the ball; None where nothing raises it.
+    """A question to the user about the radius of the ball, or None.
 
-    ball_radius : mm, as given. apparent : mm, `apparent_radius`, where there is a calibration of the kind.
+    ball_radius : mm, as given. apparent : `apparent_radius`, mm, if there is a calibration of the kind.
     """
     ask = f"is {ball_radius:g} mm the radius of this ball, and not its diameter?"
     if apparent is not None:

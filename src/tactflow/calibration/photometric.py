@@ -1,17 +1,17 @@
 """Which colour of the gel is which slope, learned from presses of a ball.
 
 Where the ball touches, the surface is the ball: at a distance d from the middle of a ball of radius R the
-horizontal part of the unit normal is d / R, towards the middle. The outline gives the middle to some pixels
-only, so fit and centres take turns: with a model, each pixel of a press says where the middle would be, and
-the median of them is the press's new centre. What they lie off in common shows as a slope of the unchanged
-colour, which has none.
+horizontal part of the unit normal is d / R, towards the middle. The outline gives the middle to a few pixels
+only, so fit and centres alternate: with a model, each pixel of a press estimates the middle, and the median
+is the press's new centre. A common offset of the centres shows as a slope of the unchanged colour, which has
+none.
 
-Around the ball nothing is known of the slope but that it is the same all around and points to the middle: a
-gel that is pressed by a ball is as round as the ball. Colours that a shadow or a reflection gives one side
-alone would break this, and with it the heights, which are integrals of the slopes: so it is part of the fit.
-On wedge_ball it halves the RMS distance of the heights from the ball.
+Around the ball, all that is known of the slope is its symmetry: it is the same all around and points to the
+middle. Shadows and reflections on one side would break it, and with it the heights, which are integrals of
+the slopes, so the symmetry is part of the fit. On wedge_ball it halves the RMS distance of the heights from
+the ball.
 
-All of it is linear in the coefficients: a ridge regression with a few hundred unknowns.
+All of this is linear in the coefficients: a ridge regression with a few hundred unknowns.
 """
 
 from __future__ import annotations
@@ -32,31 +32,30 @@ from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel
 from tactflow.vision.types import Scale
 
 ROUND: Final = 0.05
-"""Weight of a pixel around the contact, where the surface is round, to one inside of it. Chosen on
-wedge_ball: 0.03 leaves 0.033 mm RMS and 0.1 flattens the ball."""
+"""Weight of a pixel around the contact relative to one inside. Chosen on wedge_ball: 0.03 leaves 0.033 mm RMS
+and 0.1 flattens the ball."""
 RIDGE: Final = 1e-6
 """Ridge penalty, as a part of a coefficient's own weight. Chosen by hand."""
 PLACE_RIDGE: Final = 1e-3
-"""The same of coefficients that change with the place, so that a colour means much the same where nothing was
-pressed. Chosen on the simulator: after 8 presses normals under `mixed` are 55 degrees off with 1e-6, 13 with
-1e-4, 7 with 1e-3; with 1e-2 heights of a box are off by 9 % after 26 presses, instead of 7."""
+"""The same for coefficients that depend on the position, so that a colour means much the same where nothing
+was pressed. Chosen on the simulator: after 8 presses normals under `mixed` are 55 degrees off with 1e-6, 13
+with 1e-4, 7 with 1e-3; with 1e-2 heights of a box are off by 9 % after 26 presses, instead of 7."""
 OUTLIER: Final = 4.0
 """Robust standard deviations above the median misfit at which a press is rejected. Chosen by hand."""
 LEAST_SCATTER: Final = 0.1
-"""Standard deviation of the misfits that is assumed at least, degrees. Chosen by hand."""
+"""Lower limit of the standard deviation of the misfits, degrees. Chosen by hand."""
 ROUNDS: Final = 2
-"""How often presses are judged: the second time by what was learned without the bad ones, beside which good
-ones look bad too."""
+"""How often outliers are rejected: a fit that includes bad presses makes good ones look bad, too."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Photometry:
     """A fit.
 
-    model : of the slopes. information : (114, 114) float64, Gram matrix of the terms over the pixels of a
-    press, mean of the presses: how well it determines the coefficients. found : numbers for the calibration
-    file. centers : (n, 2) float64, px, of the presses. kept : (n,) bool, which presses were not rejected.
-    misfit : (n,) float64, mean angle between the normals of each press and its ball, degrees.
+    model : of the slopes. information : (114, 114) float64, Gram matrix of the terms, mean of the presses:
+    how well a press determines the coefficients. found : numbers for the calibration file. centers : (n, 2)
+    float64, px, of the presses. kept : (n,) bool, which were not rejected. misfit : (n,) float64, mean angle
+    between the normals of each press and its ball, degrees.
     """
 
     model: SlopeModel
@@ -68,18 +67,13 @@ class Photometry:
 
 
 def fit_photometry(session: Session, scale: Scale, ball_radius: float | Sequence[float]) -> Photometry:
-    """Learn slopes from presses of a ball, or of several.
+    """Learn slopes from presses of one ball or several.
 
-    Presses that fit badly are rejected. The errors come from two fits to one half of the presses each, tried
-    on the other half.
+    Outliers are rejected. The errors are those of fits to one half of the presses on the other half.
 
-    Parameters
-    ----------
     session : what `PressFinder` found. scale : mm per px. ball_radius : mm, of all presses or of each.
 
-    Raises
-    ------
-    ConfigError : too few presses, all in one place, contacts larger than the ball, or of no ball.
+    Raises ConfigError if there are too few presses, all in one place, larger than the ball, or not of a ball.
     """
     radii = np.broadcast_to(np.asarray(ball_radius, np.float64), len(session.presses))
     check_presses(session, scale, radii, FEWEST_PRESSES)
@@ -112,7 +106,7 @@ def fit_photometry(session: Session, scale: Scale, ball_radius: float | Sequence
 
 
 def _fitting(misfit: Floats) -> NDArray[np.bool_]:
-    """(n,): which presses fit about as well as the others."""
+    """(n,): which presses are not outliers."""
     from scipy.stats import median_abs_deviation
 
     scatter = float(median_abs_deviation(misfit, scale="normal"))
@@ -131,9 +125,9 @@ def _fit(samples: Sequence[Sample], chosen: NDArray[np.intp]) -> tuple[Floats, F
 
 
 def _solve(presses: Sequence[tuple[Sample, Floats]]) -> tuple[Floats, Floats]:
-    """Coefficients (2, 114) for given centres, and how far all of these lie off in common, (2,) mm.
+    """Coefficients (2, 114) for given centres, and their common offset, (2,) mm.
 
-    The second comes from a constant beside the terms: where no change of colour would have a slope.
+    The offset is the coefficient of a constant beside the terms: the slope of the unchanged colour.
     """
     count = PLACE_TERMS * COLOUR_TERMS
     inside = np.zeros((count + 1, count + 1))
@@ -159,7 +153,8 @@ def _solve(presses: Sequence[tuple[Sample, Floats]]) -> tuple[Floats, Floats]:
 
 
 def _roundness(terms: NDArray[np.float32], dx: Floats, dy: Floats) -> Floats:
-    """(228, 228): quadratic form that is 0 for normals which point to the middle, the same all around."""
+    """(228, 228): quadratic form that is 0 for normals that point to the middle and are the same all
+    around."""
     distance = np.hypot(dx, dy)
     ux, uy = ((part / distance).astype(np.float32)[:, None] for part in (dx, dy))
     across = np.concatenate([-uy * terms, ux * terms], axis=1)

@@ -18,28 +18,25 @@ from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.types import Scale
 
 MAP_WEIGHT: Final = 0.3
-"""Weight of the prior of how normals of two sensors differ, in presses: they differ by some 10 %, and a press
-shows that to 5 or 6 %, the squared ratio of which is 0.3."""
+"""Weight of the prior of the difference between two sensors, in presses: normals differ by some 10 %, which a
+press shows to 5 or 6 %; the squared ratio is 0.3."""
 BASE_WEIGHT: Final = 3.0
-"""The same of the prior of the coefficients. With 1 to 10, errors after 1, 3 and 9 presses of two Minis
-differ by a tenth at most."""
+"""Weight of the prior of the coefficients. With 1 to 10, errors after 1, 3 and 9 presses of two Minis differ
+by a tenth at most."""
 
 
 def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: Calibration) -> Photometry:
     """Adapt the slopes of another sensor of the same kind to this one, by one press of a ball or more.
 
-    Bayesian linear regression, in two steps. Other lamps make slopes look steeper, or turn them: so first all
-    normals are mapped by one 2 x 2 matrix, which one press determines. Then the coefficients are fitted, with
-    the mapped ones as the mean of their prior, and its precision in proportion to the Gram matrix of the
-    presses that the base was learned from: with more presses, more of the place and the colour is learned.
+    Bayesian linear regression, in two steps. Other lamps scale or rotate the slopes, so first all normals are
+    mapped by one 2 x 2 matrix, which one press determines. Then the coefficients are fitted: the mean of
+    their prior is the mapped ones, and its precision is proportional to the Gram matrix of the presses that
+    the base was learned from, so more presses adapt more of the dependence on position and colour.
 
-    Presses that the base does not take for a ball are left out.
+    Presses that do not look like a ball to the base are left out. base : with slopes. The other parameters
+    are those of `fit_photometry`.
 
-    base : with slopes. The other parameters are those of `fit_photometry`.
-
-    Raises
-    ------
-    ConfigError : no presses, more of no ball than of one, or contacts larger than the ball.
+    Raises ConfigError without presses, if most are not of a ball, or contacts are larger than the ball.
     """
     if base.slopes is None or base.photometric is None or base.information is None:
         raise ConfigError("calibrate --refine: required a calibration with depth")
@@ -57,13 +54,13 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
     before, count = base.photometric, len(good)
     errors = []
     for number in good.tolist():
-        # A press alone is judged by what is refined on itself.
+        # There is nothing to cross-validate a single press with.
         others = [samples[i] for i in good if i != number or count == 1]
         errors += errors_on(session, samples, [number], _refined(others, start, base.information), scale)
     left_out = summary(errors)
 
     def with_base(name: str) -> float:
-        # What the base is known to be off by counts as one press more.
+        # The known error of the base counts as one press more.
         return float(np.sqrt((getattr(before, name) ** 2 + count * left_out[name] ** 2) / (1 + count)))
 
     found = PhotometricEntry(
@@ -104,10 +101,10 @@ def _refined(samples: Sequence[Sample], start: Floats, information: Floats) -> F
 
 
 def apparent_radius(session: Session, scale: Scale, ball_radius: float, base: Calibration) -> float:
-    """Radius of the pressed ball by the slopes of another sensor of the kind, mm, median of the presses.
+    """Radius of the ball according to the slopes of another sensor of the kind, mm, median of the presses.
 
-    The presses alone cannot tell it: with twice the radius all slopes are half as steep. ball_radius : mm, as
-    it was given. base : with slopes.
+    The presses alone do not determine it: with twice the radius all slopes are half as steep. ball_radius :
+    as given, mm. base : with slopes.
     """
     assert base.slopes is not None
     start, radii = flat(base.slopes), np.full(len(session.presses), ball_radius)
@@ -116,5 +113,5 @@ def apparent_radius(session: Session, scale: Scale, ball_radius: float, base: Ca
 
 
 def _by_base(sample: Sample, start: Floats) -> Misfit:
-    """How well the base alone, (2, 114), fits a press."""
+    """How well the coefficients of the base, (2, 114), fit a press."""
     return sample.misfit(sample.center(sample.start, start), start)

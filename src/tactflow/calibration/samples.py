@@ -1,4 +1,4 @@
-"""Presses of a ball, prepared for a fit of the slopes, and how far a fit is off on each of them."""
+"""Presses of a ball, prepared for a fit of the slopes, and the errors of a fit on each of them."""
 
 from __future__ import annotations
 
@@ -19,38 +19,36 @@ from tactflow.vision.depth.surroundings import Window, surroundings
 from tactflow.vision.types import Scale
 
 CLINGS: Final = 0.5**0.5
-"""Part of the radius of a contact, where the ball lies below the untouched gel, up to which a deep gel clings
-to it, and the surface is the ball's (Hertz); a thin layer clings to all of it. An outline that is wider than
-the ball counts as the ball's: with slopes of more than 45 degrees, caps on digit_fots and wedge_ball were 14
-and 7 % too deep."""
+"""Part of the radius of a contact up to which a deep gel clings to the ball (Hertz), so that the surface is
+the ball's; a thin layer clings to all of it. The radius is at most that of the ball: with slopes of more than
+45 degrees, caps on digit_fots and wedge_ball were 14 and 7 % too deep."""
 SMOOTHED: Final = 0.02
-"""Standard deviation of the Gaussian over which colours are averaged to be learned, in radii of the ball.
-Noise makes learned slopes too small: without it a box under `mixed` has errors of 8 % instead of 4. On
-wedge_ball 0.07 makes balls 1.5 % smaller than 0.03."""
+"""Standard deviation of the Gaussian blur of the colours for the fit, in radii of the ball. Noise biases
+slopes towards 0: without the blur a box under `mixed` has errors of 8 % instead of 4. On wedge_ball 0.07
+makes balls 1.5 % smaller than 0.03."""
 DARK: Final = 20.0
-"""Grey level below which a channel's light does not reach the surface, so that the slope shows in the two
-others alone. There colours are learned with their noise, which draws to the mean what it leaves open: with
-averages there, too, cables under `dark_channel` have errors of 5.6 % instead of 3.8."""
+"""Grey level below which the light of a channel does not reach the surface, so that only the two others show
+the slope. Colours are not blurred there, since noise regularises what is undetermined: with the blur, cables
+under `dark_channel` have errors of 5.6 % instead of 3.8."""
 TURNS: Final = 3
-"""How often fit and centres take turns; later ones move centres by less than 0.05 px on wedge_ball."""
+"""Iterations of fit and centres; later ones move centres by less than 0.05 px on wedge_ball."""
 FEWEST_PIXELS: Final = 12
 """Least number of pixels at half resolution inside a contact to judge its depth. Chosen by hand."""
 RIM: Final = 6
-"""Pixels at half resolution along the border of a press's window that roundness is not asked of. Chosen by
-hand."""
+"""Width of the border of a press's window where roundness is not required, pixels at half resolution. Chosen
+by hand."""
 
 
 def reach(press: Press, scale: Scale, ball_radius: float) -> float:
-    """Distance from the middle of a press up to which the surface is that of the ball for sure, mm."""
+    """Distance from the middle of a press within which the surface is certainly that of the ball, mm."""
     return CLINGS * min(press.radius * math.sqrt(scale.x * scale.y), ball_radius)
 
 
 class Misfit(NamedTuple):
-    """Normals by a fit against those of the ball that was pressed.
+    """Fitted normals against those of the ball.
 
     angle : mean between them, degrees; 180 where the press shows no ball. explained : share of the sum of
-    squares of their horizontal parts that the fit explains once it is scaled, 0 to 1. gain : the factor of
-    that scaling.
+    squares of their horizontal parts that the fit explains after scaling, 0 to 1. gain : the scaling factor.
     """
 
     angle: float
@@ -62,9 +60,8 @@ class Misfit(NamedTuple):
 class Sample:
     """A press, prepared: pixels (m) in its window at half resolution, in mm.
 
-    x, y : (m,), places, mm. terms : (m, 114) float32. hidden : (m,) bool. inner : (m,) bool, not too near the
-    border of the window. start : (x, y) of the outline, mm. reach : radius inside which it is the ball, mm.
-    ball_radius : mm.
+    x, y : (m,), positions, mm. terms : (m, 114) float32. hidden : (m,) bool. inner : (m,) bool, not too near
+    the border of the window. start : center (x, y) of the outline, mm. reach : see `reach`. ball_radius : mm.
     """
 
     x: Floats
@@ -83,11 +80,11 @@ class Sample:
         return np.asarray(near & ~self.hidden)
 
     def normals(self, weights: Floats, chosen: NDArray[np.bool_]) -> Floats:
-        """(k, 2): horizontal part of the normals at some pixels, by the fit."""
+        """(k, 2): horizontal part of the fitted normals at some pixels."""
         return np.asarray(self.terms[chosen] @ weights.T.astype(np.float32), np.float64)
 
     def center(self, start: Floats, weights: Floats) -> Floats:
-        """(2,), mm: the median of where pixels of the press say that the middle of the ball is."""
+        """(2,), mm: the median of the estimates of the ball's centre from single pixels."""
         center = start
         for _ in range(TURNS):
             ball = self.on_ball(center)
@@ -108,7 +105,7 @@ class Sample:
         return np.asarray(terms.T @ terms)
 
     def misfit(self, center: Floats, weights: Floats) -> Misfit:
-        """How far the normals by the fit are from those of the ball."""
+        """Compare the fitted normals with those of the ball."""
         ball = self.on_ball(center)
         found, true = self.normals(weights, ball), self.true_normals(center, ball)
         product, square = float((found * true).sum()), float((found**2).sum())
@@ -120,15 +117,12 @@ class Sample:
 
 
 def prepared(session: Session, scale: Scale, radii: Floats) -> list[Sample]:
-    """The presses of a session.
-
-    radii : (n,), mm, of the ball of each press.
-    """
+    """Prepare the presses of a session. radii : (n,), mm, of the ball of each press."""
     width = SMOOTHED * float(np.median(radii))
     across, down = width / scale.x, width / scale.y
 
     def smoothed(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        # Not rounded to grey levels again: that would be as much noise as a camera's.
+        # Rounding to grey levels would add as much noise as a camera has.
         return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), across, sigmaY=down), np.float32)
 
     rests = Rest(session.untouched), Rest(smoothed(session.untouched))
@@ -186,7 +180,7 @@ def press_errors(
 def errors_on(
     session: Session, samples: Sequence[Sample], chosen: Iterable[int], weights: Floats, scale: Scale
 ) -> list[list[float]]:
-    """The same for some presses, from the coefficients (2, 114). samples : of all presses of the session."""
+    """The same for chosen presses, from coefficients (2, 114). samples : of all presses of the session."""
     rest, surface = Rest(session.untouched), Surface(SlopeModel(shaped(weights)), scale)
     errors = []
     for number in chosen:

@@ -1,4 +1,4 @@
-"""Millimetres per pixel, from what is known about the gel or its picture."""
+"""Millimetres per pixel, from the pitch of the dots or the size of the picture."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from tactflow.vision.markers.lattice import nearest
 from tactflow.vision.types import Scale
 
 FEWEST_LINKS: Final = 8
-"""Distances between neighbouring dots in each direction at least, for a pitch and its error. By hand."""
+"""Least number of links between neighbouring dots in each direction. Chosen by hand."""
 POINTED: Final = 0.5
 """Standard error of an edge of the picture, px. Chosen by hand."""
 LONGER: Final = 1.35
-"""Largest distance between neighbours, relative to the typical one: less than the diagonal of a square,
-1.41."""
+"""Largest distance of neighbours over the typical one: less than the diagonal of a square, 1.41."""
 
 
 def centre(size: tuple[int, int]) -> tuple[float, float]:
@@ -32,26 +31,18 @@ def centre(size: tuple[int, int]) -> tuple[float, float]:
 def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Scale:
     """From dots that are printed in a square grid of known pitch.
 
-    The links between neighbours fall into two directions at right angles in mm; the scales of x and y are
-    those that make the mean link of each direction one pitch long. Where the grid stands so askew that this
-    cannot tell x from y, both get one scale.
+    The links between neighbours have two directions at right angles in mm; the scales of x and y are those
+    that make the mean link of each direction one pitch long. If the grid is rotated so far that this cannot
+    distinguish x from y, both get one scale.
 
-    Parameters
-    ----------
     dots : (N, 2), px, on the untouched gel. pitch : mm. size : (width, height) of the picture, px.
 
-    Returns
-    -------
-    The scale. Its standard errors come from the scatter of the links and from how far the dots are from a
-    square grid: by the difference of x and y, since the dots alone cannot tell a stretched picture from a
-    grid that is not square; and by the lengths of single links, which differ from their mean in rings.
+    The standard errors contain the scatter of the links and the deviation from a square grid: the difference
+    of x and y, since the dots alone cannot distinguish a stretched picture from a grid that is not square,
+    and the lengths of single links, which differ from their mean in rings.
 
-    Raises
-    ------
-    ValueError : too few dots in a grid, or a pitch that is not > 0.
+    Raises ValueError for too few dots in a grid, or a pitch that is not > 0.
 
-    Examples
-    --------
     >>> x, y = np.meshgrid(np.arange(6) * 20.0, np.arange(5) * 25.0)
     >>> scale = scale_from_pitch(np.column_stack([x.ravel(), y.ravel()]), 2.0, (120, 120))
     >>> round(scale.x, 6), round(scale.y, 6)
@@ -79,7 +70,7 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
     scattered = np.array([error[along[k], k] / abs(means[along[k], k]) for k in (0, 1)])
     lengths = np.array([np.median(np.hypot(*(group * (x, y)).T)) for group in groups])
     bent = lengths[along] / pitch - 1
-    # The scatter explains a part of the difference, which must not count twice.
+    # The part of the difference that the scatter explains must not count twice.
     apart = max((2 * (x - y) / (x + y)) ** 2 - float((scattered**2).sum()), 0.0) / 2
     relative = np.sqrt(scattered**2 + bent**2 + apart)
     return Scale(x, y, (float(x * relative[0]), float(y * relative[1])), centre(size))
@@ -100,9 +91,9 @@ def _square(means: NDArray[np.float64], pitch: float) -> tuple[float, float]:
 
 
 def scale_from_area(area: tuple[float, float], size: tuple[int, int]) -> Scale:
-    """From the width and height in mm of what a picture of size (width, height), px, shows.
+    """From the width and height, mm, of a whole picture of size (width, height), px.
 
-    The standard errors are those of edges that are known to half a pixel.
+    The standard errors are those of edges known to half a pixel.
 
     >>> scale = scale_from_area((24, 32), (240, 320))
     >>> scale.x, scale.y, round(scale.stderr[0], 6)
