@@ -19,50 +19,47 @@ from tactflow.vision.geometry.similarity import Complexes, as_complex, fit_simil
 from tactflow.vision.types import Slip
 
 WINDOW: Final = 0.1
-"""Time over which the speed is measured, s, at least a frame: as late as slip may be noticed."""
+"""Time over which the speed is measured, s, at least one frame: the largest acceptable delay."""
 SLID: Final = 0.04
-"""Motion against the gel within the window that counts as slip, and drag of the gel in its direction that
-friction causes then, relative to the RMS radius of the contact: gel strains by as much under a contact that
-sticks."""
+"""Threshold for the motion against the gel within the window, and for the drag of the gel in its direction by
+friction, relative to the RMS radius of the contact: gel under a contact that sticks strains by as much."""
 SPREAD: Final = np.array([5.0, 5.0, 5.0, 1.0, 0.3])
-"""Standard deviation of what an object does since a keyframe beside moving with the gel: shift, turn, and
+"""Prior standard deviation of the motion of an object against the gel since a keyframe: shift, turn and
 growth, cells, see `Registration`; relative change of contrast."""
 OVERLAP: Final = 0.7
-"""Share of the keyframe that is seen below which it is replaced."""
+"""A keyframe of which a smaller share is visible is replaced."""
 AGED: Final = 0.35
-"""Residual from which on the keyframe is replaced: the object shows another side."""
+"""A keyframe with a larger residual is replaced: the object shows another side."""
 PRESSED: Final = 0.3
-"""Growth of the contact, relative, from which on the keyframe is replaced: a larger picture shows better how
-it turns."""
+"""Relative growth of a contact above which its keyframe is replaced: a larger picture shows a turn better."""
 ROUNDS: Final = 3
-"""Of the search for the gel under a point: the field is smooth, so that each gains a digit."""
+"""Iterations of the search for the gel under a point: the field is smooth, so that each gains a digit."""
 LEAST_MOVED: Final = 1e-6
-"""Motion, px, that has no direction."""
+"""Smallest motion that is divided by, px."""
 EXCHANGED: Final = 0.15
-"""Share of the gel in contact that has come, or has left, from which on the stick ratio is measured anew:
-what presses harder or lets go moves the gel without slipping."""
+"""The stick ratio is measured anew once a larger share of the gel in contact has come or left: an object that
+is pressed harder, or released, moves the gel without slipping."""
 CORE: Final = 0.5
-"""Part of the contact, around its middle, whose motion is taken for that of the gel: slip begins at the
-edge. Chosen by hand."""
+"""Part of the contact, around its middle, whose motion counts as that of the gel: slip begins at the edge.
+Chosen by hand."""
 LAG: Final = 0.06
-"""How far gel may stay behind the motion of what sticks, relative to its RMS. Chosen on the simulator."""
+"""How far gel that sticks may stay behind the rigid motion, relative to its RMS. Chosen on the simulator."""
 UNSURE: Final = 6.0
-"""Standard errors of the field's markers that gel may stay behind at least."""
+"""Smallest such distance, in standard errors of the markers."""
 ASIDE: Final = 2.0
-"""How far gel may stay behind, relative to the RMS of how far it departs sideways: a press that spreads the
-gel does both alike, slip only the first. Chosen on the simulator."""
+"""The same, relative to the RMS of how far the gel departs sideways: a press that spreads the gel does both
+alike, slip only the first. Chosen on the simulator."""
 _ROUNDS: Final = 2
-"""Fits to the part that sticks, each to what the last one found to stick. Chosen by hand."""
+"""Fits of a rigid motion, each to the gel that sticks by the one before. Chosen by hand."""
 
 
 class _Key(NamedTuple):
-    """The frame that others are compared with: its picture and the gel in the middle of its contact.
+    """The frame that others are compared with: its picture, and the gel in the middle of its contact.
 
-    grid, cells : of the field, and (rows, columns), which of its cells. rest, before : (M,) complex, where
-    they are at rest, px, and how far they had moved; share : (M,), how they count, with the sum 1; number :
-    of them, by their shares.
-    slid, covariance : (3,), (3, 3), slip from the start to this frame, px and radians. grown : by how much
-    the contact has grown until then, natural logarithm.
+    grid : of the field. cells : (rows, columns), which of its cells. rest, before : (M,) complex, their
+    places at rest, and their displacements in this frame, px. share : (M,), their weights, with the sum 1.
+    number : sum of their shares in contact. slid, covariance : (3,), (3, 3), slip from the start to this
+    frame, px and radians. grown : natural logarithm of the growth of the contact until then.
     """
 
     template: Template
@@ -78,10 +75,10 @@ class _Key(NamedTuple):
 
 
 class _Moment(NamedTuple):
-    """What is known at a time, s.
+    """The state at a time, s.
 
-    gel : (3,), rigid motion of the gel under the object since it was at rest. slid, covariance : (3,),
-    (3, 3), slip until then, without what the growth of the contact may add; px and radians. grown : see
+    gel : (3,), rigid motion of the gel under the object since it was at rest. slid, covariance : (3,), (3,
+    3), slip until then, px and radians, without the uncertainty by the growth of the contact. grown : see
     `_Key`. error : of the registration.
     """
 
@@ -97,13 +94,13 @@ class _Moment(NamedTuple):
 class SlipTracker:
     """Measures how an object moves against the gel, frame by frame.
 
-    The picture of the contact is registered with that of a keyframe. Each point of the object then lies on
-    another bit of gel than in the keyframe, or on the same one where it sticks. The rigid motion that is
-    nearest to these displacements, over the gel at rest, is the slip. Keyframes are replaced as the object
-    moves on or is pressed otherwise, and the slips between them add up.
+    The picture of the contact is registered with that of a keyframe. Where the object sticks, each of its
+    points still lies on the same bit of gel. The rigid motion nearest to the displacements over the gel at
+    rest is the slip. Keyframes are replaced as the object moves on or is pressed differently, and the slips
+    between them add up.
 
-    What slides drags the gel along: friction does work. What rolls over the gel, or is pressed and leaves it,
-    also moves, but not in the direction of the gel's displacement.
+    An object that slides drags the gel along, by friction. One that rolls over the gel, or is pressed or
+    lifted, also moves, but not in the direction of the gel's displacement.
 
     Examples
     --------
@@ -130,7 +127,7 @@ class SlipTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing touches the gel: what comes is another contact."""
+        """Nothing touches the gel: the next contact is a new one."""
         self._key: _Key | None = None
         self._since, self._began = 0, 0.0
         self._last = np.zeros(5)
@@ -150,7 +147,7 @@ class SlipTracker:
             self.reset()
             return None
         if self._key is not None and self._key.grid != field.grid:
-            # Markers have joined: the field is another one.
+            # Markers have been added: the grid of the field has changed.
             self.reset()
         share, key, torn = field.share(mask), self._key, False
         found = None if key is None else self._registered(key, change, field)
@@ -182,7 +179,7 @@ class SlipTracker:
         return slip
 
     def _registered(self, key: _Key, change: Floats32, field: DisplacementField) -> Registration | None:
-        """How the picture has moved since the keyframe: nearly as in the last frame, or else with the gel."""
+        """How the picture has moved since the keyframe, starting from the last motion, or that of the gel."""
         moved = as_complex(field.displacement[key.cells]) - key.before
         x, y, turn = _rigid(key.rest + key.before - key.template.place, moved, key.share)[0].tolist()
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
@@ -198,14 +195,13 @@ class SlipTracker:
         return best
 
     def _torn(self, key: _Key | None, template: Template, time: float) -> bool:
-        """Whether a picture that has been followed for long enough has changed at once beyond any motion with
-        the gel, although the object presses on."""
+        """Whether the picture, after at least `WINDOW`, changed abruptly although the object presses on."""
         if key is None or time - self._began < WINDOW:
             return False
         return template.contrast > UNLIKE * key.template.contrast
 
     def _sticking(self, field: DisplacementField, share: Floats) -> float:
-        """The stick ratio, on the gel that was touched first, or that the contact has gone on to."""
+        """The stick ratio of the gel that was touched first, or that the contact has moved on to."""
         before, displacement = self._grip or (0 * share, field.displacement)
         came, left = (float(np.maximum(part, 0).sum()) for part in (share - before, before - share))
         if max(came, left) > EXCHANGED * float(share.sum()):
@@ -214,8 +210,8 @@ class SlipTracker:
         return stick_ratio(before, share, field.grid.points, field.displacement - displacement, field.noise)
 
     def _slip(self, gel_stderr: float, outline_stderr: float, torn: bool) -> Slip:
-        """The slip up to now. gel_stderr, outline_stderr : of the mean displacement of the gel, and what the
-        outline does to it, px. torn : whether the picture has changed at once."""
+        """The slip up to now. gel_stderr, outline_stderr : standard errors of the mean displacement of the
+        gel, from the markers and from the outline, px. torn : whether the picture has changed abruptly."""
         then, now = self._recent[0], self._recent[-1]
         key, radius = now.key, now.key.template.radius * PX
         gel_variance = gel_stderr**2 * np.array([1.0, 1.0, 2 / radius**2])
@@ -233,13 +229,13 @@ class SlipTracker:
                 covariance *= 1 - _correlation(now.error, then.error)
             covariance += _of_growth(key, now.grown - then.grown) + np.diag(gel_variance)
             covariance *= np.outer(lever, lever)
-            # What errors alone may make counts less: a smooth ball does not show how it turns.
+            # Uncertain components count less: a smooth ball does not show how it turns.
             shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLID * radius) ** 2)
             moved = shrink @ ((now.slid - then.slid) * lever)
             length = float(np.linalg.norm(moved))
             way = moved / max(length, LEAST_MOVED)
             error = math.sqrt(float(way @ shrink @ covariance @ way)) + LEAST_MOVED
-            # Gel around the contact that counts as gel in contact stays behind what sticks.
+            # Gel outside the contact that counts as inside stays behind gel that sticks.
             strained = OUTLINE * float(np.linalg.norm((now.gel - then.gel) * lever))
             slides = _normal((length - strained - SLID * radius) / error)
             dragged = float(way @ (now.gel * lever)) - SLID * radius
@@ -267,7 +263,7 @@ def _keyframe(
     covariance: Floats,
     grown: float,
 ) -> _Key:
-    """A frame that others are compared with. share : (rows, columns), of each cell in contact."""
+    """The frame that others are compared with. share : (rows, columns), of each cell in contact."""
     inside = share > 0
     inside[inside] = _core(field.grid.points[inside], share[inside])
     rest, before = as_complex(field.grid.points[inside]), as_complex(field.displacement[inside])
@@ -298,8 +294,7 @@ def _slid(key: _Key, found: Registration, field: DisplacementField, time: float)
 
 
 def _of_growth(key: _Key, grown: float) -> Floats:
-    """(3, 3), px and radians: covariance of what a growth of the contact adds to its shift. What is pressed
-    harder grows around one of its points; each may be it."""
+    """(3, 3), px and radians: uncertainty of the shift by a growth of the contact around an unknown point."""
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = (grown * PX) ** 2 * key.template.moments
     return covariance
@@ -307,7 +302,7 @@ def _of_growth(key: _Key, grown: float) -> Floats:
 
 def _rigid(places: Complexes, moved: Complexes, share: Floats) -> tuple[Floats, float]:
     """(3,): the rigid motion nearest to displacements of places: shift of the origin, px, and turn from +x to
-    +y, radians; the variance that it leaves of each component, px^2. share : with the sum 1."""
+    +y, radians; the residual variance of each component, px^2. share : weights, with the sum 1."""
     fit = fit_similarity(places, moved, share)
     turn = 1j * fit.slope.imag
     shift = fit.mean - turn * fit.middle
@@ -316,7 +311,7 @@ def _rigid(places: Complexes, moved: Complexes, share: Floats) -> tuple[Floats, 
 
 
 def _core(places: Floats, share: Floats) -> Flags:
-    """Which places (n, 2) with shares (n,) in the contact lie around its middle."""
+    """Which places (n, 2), with shares (n,) in the contact, lie around its middle."""
     distance = np.hypot(*(places - share @ places / share.sum()).T)
     order = np.argsort(distance)
     filled = np.cumsum(share[order])
@@ -324,13 +319,13 @@ def _core(places: Floats, share: Floats) -> Flags:
 
 
 def _correlation(first: Floats32, second: Floats32) -> float:
-    """Correlation of what two registrations with one template leave, 0 to 1."""
+    """Correlation of the residuals of two registrations with one template, 0 to 1."""
     power = math.sqrt(float(np.vdot(first, first)) * float(np.vdot(second, second)))
     return max(float(np.vdot(first, second)), 0.0) / max(power, 1e-9)
 
 
 def _normal(value: float) -> float:
-    """The cumulative normal distribution."""
+    """The cumulative distribution function of the standard normal distribution."""
     return math.erfc(-value / math.sqrt(2)) / 2
 
 
