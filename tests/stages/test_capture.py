@@ -14,7 +14,7 @@ import pytest
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader
-from tactflow.sources.pace import LONGEST_GAP, REST, Pace
+from tactflow.sources.pace import LONGEST_GAP, Pace
 from tactflow.stages.capture import Capture
 from tests.clock import PATIENCE, ManualClock
 
@@ -242,33 +242,6 @@ def test_times_that_run_back_are_counted_on_with_a_warning(caplog: pytest.LogCap
     assert [record.getMessage() for record in caplog.records] == [
         "stamped: its times run back by 0.05 s; they are counted on from there",
     ]
-
-
-def _played(times: list[float], reading: float) -> tuple[list[float], list[float]]:
-    """When reading of each frame began, and when it was shown; nothing but reading and waiting takes time."""
-    clock = ManualClock()
-    pace = Pace(threading.Event(), clock)
-    begun, shown = [], []
-    for t in times:
-        assert pace.wait_to_read()
-        begun.append(clock.now())
-        clock.advance(reading)
-        assert pace.wait_for(t)
-        shown.append(clock.now())
-    return begun, shown
-
-
-@pytest.mark.parametrize("reading", [0.0, 0.004, 0.008])
-def test_a_frame_is_read_some_time_after_the_last_and_shown_when_it_is_due(reading: float) -> None:
-    times = [*(index / 60 for index in range(100)), *(9 + index / 60 for index in range(30))]
-    begun, shown = _played(times, reading)
-    np.testing.assert_allclose(np.array(shown) - shown[0], times, atol=1e-9)
-    np.testing.assert_allclose(np.array(begun[2:]) - shown[1:-1], REST / 60, atol=1e-9)
-
-
-def test_reading_that_cannot_keep_up_is_not_slowed_down() -> None:
-    begun, shown = _played([index / 60 for index in range(100)], 0.020)
-    np.testing.assert_allclose(begun[4:], shown[3:-1], atol=1e-9)
 
 
 def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(

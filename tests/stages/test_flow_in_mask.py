@@ -24,7 +24,6 @@ def test_with_a_field_the_mean_is_an_integral_unless_that_over_markers_is_asked_
     )
     assert plain == FlowInMask(FlowInMask.Params()).process(markers, MASK)
     assert plain.mean == (1.0, 0.0)  # of the two markers inside, one has moved by 2
-    assert integral.mean is not None
     assert 0.1 < integral.mean[0] < 1.0
     assert integral.count == plain.count == 2
 
@@ -42,5 +41,4 @@ def test_where_only_dots_show_a_contact_its_mean_is_as_uncertain_as_the_gel_ther
     assert dots.mean == light.mean
     # Each component varies evenly from -2 to 2 px within the square.
     assert dots.stderr == pytest.approx((2 / 3**0.5,) * 2, rel=0.03)
-    assert light.stderr is not None
     assert max(light.stderr) < 0.1

@@ -17,8 +17,6 @@ FRAMES = 20
 
 def arrays(outcome: TimedResult) -> list[np.ndarray]:
     """All arrays that a frame's results hold."""
-    assert outcome.image is not None
-    assert outcome.contact_mask is not None
     found = [outcome.image, outcome.contact_mask]
     if outcome.markers is not None:
         markers = outcome.markers

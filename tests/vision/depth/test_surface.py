@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from tactflow.vision.depth.poisson import integrate
 from tactflow.vision.depth.slopes import BAND, STEEPEST, SlopeModel, coordinates, place_terms
 from tactflow.vision.depth.surface import Rest, Surface, colour_change
-from tactflow.vision.depth.surroundings import LEAST_MARGIN, OpenSides, resting, surroundings
+from tactflow.vision.depth.surroundings import OpenSides, resting, surroundings
 from tactflow.vision.types import Scale
 
 GEL = np.full((80, 120, 3), (90, 120, 100), np.uint8)
@@ -98,17 +97,6 @@ def test_a_press_has_no_step_along_the_border_of_its_heights() -> None:
     around = [depth.heights[rows[[0, -1]]].max(), depth.heights[:, columns[[0, -1]]].max()]
     assert max(around) < 0.01 * depth.greatest
     assert depth.greatest == pytest.approx(0.1 * 200 / 40, rel=0.15)
-
-
-def test_of_a_slanting_contact_only_the_gel_beside_it_is_looked_at() -> None:
-    mask = np.zeros((400, 400), np.uint8)
-    cv2.line(mask, (20, 20), (380, 380), 255, 12)
-    window, near = surroundings(mask, Rest(np.zeros((400, 400, 3), np.uint8)).window)
-    assert (near > 0).mean() < 0.45
-    for band in range(4, len(near) - 4):
-        columns = np.flatnonzero(near[band])
-        assert abs((band + 0.5) * BAND + window.top - columns.mean() - window.left) < 5
-        assert len(columns) >= 2 * LEAST_MARGIN
 
 
 def test_a_contact_in_the_last_line_that_no_half_resolution_has_is_no_depth() -> None:

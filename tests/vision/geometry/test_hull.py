@@ -36,7 +36,6 @@ def ellipse_mask(
 
 def described(mask: Mask, **kwargs: Any) -> Contact:
     contact = contact_geometry(mask, **kwargs)
-    assert contact is not None
     assert_sound(contact)
     return contact
 
@@ -152,7 +151,6 @@ def test_a_rough_disc_has_no_direction_and_a_rough_ellipse_has(noise: float, len
     for stretch in (1.3, math.sqrt(2)):
         for _ in range(20):
             contact = described(rough(stretch))
-            assert contact.angle is not None
             assert turned(contact.angle, 0) < 8
 
 
@@ -174,7 +172,6 @@ def test_a_rectangle_has_its_direction(ratio: float) -> None:
         across = y * math.cos(theta) - x * math.sin(theta)
         mask = ((np.abs(along) <= 20 * ratio) & (np.abs(across) <= 20)).astype(np.uint8) * 255
         contact = described(mask)
-        assert contact.angle is not None
         # Straight edges meet the grid coherently, so no law of random phases holds; measured: 0.5.
         assert turned(contact.angle, angle) < 1.0
 
@@ -187,7 +184,6 @@ def test_an_ellipse_is_found_as_it_was_drawn(angle: int, ratio: float) -> None:
     rng = np.random.default_rng(angle + 100)
     center = tuple(rng.uniform(68, 72, 2))
     contact = described(ellipse_mask(center, (major, minor), angle))  # type: ignore[arg-type]
-    assert contact.angle is not None
     # Derived (see _anisotropy_limit): the grid moves the anisotropy by sqrt(0.122 / R^3) RMS per component,
     # and the angle by half of that over the anisotropy; five times the RMS never happens in 108 cases.
     radius = math.sqrt(major * minor) / 2
@@ -199,35 +195,9 @@ def test_an_ellipse_is_found_as_it_was_drawn(angle: int, ratio: float) -> None:
     # Centre: first moments vary by 0.68 R^1.5 / (pi R^2) px, below 0.02 px here; six times that.
     assert np.abs(np.subtract(contact.center, center)).max() < 6 * 0.68 / (math.pi * math.sqrt(minor / 2))
     ellipse = contact.ellipse
-    assert ellipse is not None
     assert ellipse.axes == pytest.approx((major, minor), rel=0.02)
     assert ellipse.angle == contact.angle
     assert contact.confidence == pytest.approx((ratio**2 - 1) / (ratio**2 + 1), abs=0.02)
-
-
-def blobs(seed: int, size: tuple[int, int] = (140, 120)) -> Mask:
-    """A few random ellipses that stay 20 px away from the border."""
-    rng = np.random.default_rng(seed)
-    mask = blank(*size)
-    for _ in range(3):
-        center = rng.uniform([45, 45], [size[0] - 45, size[1] - 45])
-        axes = tuple(rng.uniform(8, 48, 2))
-        mask |= ellipse_mask(tuple(center), axes, rng.uniform(-90, 90), size)  # type: ignore[arg-type]
-    return mask
-
-
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_turning_the_mask_turns_the_result(seed: int, quarters: int) -> None:
-    mask = blobs(seed)
-    first = described(mask)
-    second = described(np.ascontiguousarray(np.rot90(mask, quarters)))
-    assert second.area == first.area
-    # The limit of the anisotropy follows a rotation only up to rounding.
-    assert second.confidence == pytest.approx(first.confidence, abs=1e-12)
-    assert (second.angle is None) == (first.angle is None)
-    if first.angle is not None and second.angle is not None:
-        assert turned(second.angle, first.angle + 90 * quarters) < 1e-9
 
 
 @settings(max_examples=150, deadline=None)
@@ -274,24 +244,6 @@ def test_centre_and_area_are_those_of_the_pixels(mask: Mask) -> None:
     assert contact.area == inside
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.98, 1.0])
-def test_a_large_mask_is_summed_exactly_too(share: float) -> None:
-    rng = np.random.default_rng(11)
-    mask = (rng.random((210, 190)) < share).astype(np.uint8) * 7
-    # Whole rows and corners: where a run of pixels meets the next line.
-    mask[[0, 1, -1]] = 7
-    contact = described(mask)
-    y, x = np.nonzero(mask)
-    assert contact.region_area == len(x)
-    assert contact.center == (int(x.sum()) / len(x), int(y.sum()) / len(y))
-    xx, yy, xy = np.var(x), np.var(y), np.mean((x - x.mean()) * (y - y.mean()))
-    spread = math.hypot(xx - yy, 2 * xy)
-    # Rounding of the reference in float64; the sums themselves are whole numbers.
-    assert contact.confidence == pytest.approx(spread / (xx + yy), rel=1e-9)
-    assert contact.ellipse is not None
-    assert contact.ellipse.axes[0] == pytest.approx(4 * math.sqrt((xx + yy + spread) / 2), rel=1e-9)
-
-
 def test_specks_below_min_area_do_not_count() -> None:
     mask = ellipse_mask((60, 50), (50, 20), 30)
     alone = described(mask)
@@ -323,7 +275,6 @@ def test_a_large_frame_loses_no_precision() -> None:
     assert contact.angle == 0.0
     assert contact.area == 2_000_000
     # A row of n pixels has the variance (n^2 - 1) / 12.
-    assert contact.ellipse is not None
     expected = (4 * math.sqrt((2000**2 - 1) / 12), 4 * math.sqrt((1000**2 - 1) / 12))
     assert contact.ellipse.axes == pytest.approx(expected, rel=1e-12)
 
