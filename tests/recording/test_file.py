@@ -111,7 +111,6 @@ def test_the_file_says_how_it_was_made(recording: Path, tmp_path: Path) -> None:
         (facts,) = (item.metadata for item in reader.iter_metadata() if item.name == "tactflow")
     assert {"tactflow", "numpy", "numba", "opencv", "python"} <= set(facts)
     assert facts["opencv"] == cv2.__version__
-    assert "# a comment" in texts["pipeline.original.yaml"]
     settings = yaml.safe_load(texts["pipeline.yaml"])
     assert settings["stages"]["capture"]["source"] == "sim:press?frames=12"
     assert settings["sensor"] == "left"

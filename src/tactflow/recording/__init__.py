@@ -8,8 +8,8 @@ A file has the frames of one sensor. Its channels, with `/main` for the sensor's
     /main/image        previews at a low rate                protobuf foxglove.CompressedImage
     /main/annotations  contacts, markers, arrows on those    protobuf foxglove.ImageAnnotations
 
-Attachments: `pipeline.yaml` (with all overrides, so that it can be run), `pipeline.original.yaml` (the
-original file), `message.schema.json`. Metadata `tactflow`: versions and the source.
+Attachments: `pipeline.yaml` (with all overrides, so that it can be run), `message.schema.json`. Metadata
+`tactflow`: versions and the source.
 
 A chunk of the file ends with every frame, so that a killed process loses only the frame that it was writing.
 The file then has no index at the end: its frames can be played, and `tactflow repair` adds the index for

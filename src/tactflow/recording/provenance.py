@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import platform
-from collections.abc import Callable
 from importlib.metadata import version
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +13,7 @@ import yaml
 from tactflow import __version__
 from tactflow.engine.control import Control
 from tactflow.recording.calibration import stored_arrays, stored_text
-from tactflow.system.redaction import without_secrets
+from tactflow.system.redaction import public_address, without_secrets
 
 log = logging.getLogger("tactflow")
 
@@ -43,26 +41,18 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
 def kept_files(control: Control | None) -> dict[str, bytes]:
     """The files of a run without passwords: name -> content.
 
-    `pipeline.yaml` includes all overrides, `pipeline.original.yaml` is the original file, `calibration.yaml`
-    and `calibration.npz` are the sensor's calibration, if any.
+    `pipeline.yaml` includes all overrides, `calibration.yaml` and `calibration.npz` are the sensor's
+    calibration, if any.
     """
     if control is None:
         return {}
-    pipeline = control.pipeline
-    calibration = pipeline.calibration
-    readers: dict[str, Callable[[], bytes]] = {
-        "pipeline.yaml": lambda: yaml.safe_dump(dict(pipeline.settings), sort_keys=False).encode(),
-        "pipeline.original.yaml": Path(pipeline.file).read_bytes,
-    }
+    settings = without_secrets(dict(control.pipeline.settings))
+    files = {"pipeline.yaml": yaml.safe_dump(settings, sort_keys=False).encode()}
+    calibration = control.pipeline.calibration
     if calibration is not None:
-        readers["calibration.yaml"] = lambda: stored_text(calibration)
-        readers["calibration.npz"] = lambda: stored_arrays(calibration)
-    files = {}
-    for name, read in readers.items():
         try:
-            data = read()
-            is_text = name.endswith(".yaml")
-            files[name] = without_secrets(data.decode("utf-8")).encode() if is_text else data
+            text = public_address(stored_text(calibration).decode()).encode()
+            files |= {"calibration.yaml": text, "calibration.npz": stored_arrays(calibration)}
         except (OSError, ValueError) as error:
-            log.debug("%s is not kept: %s", name, error)
+            log.debug("the calibration is not kept: %s", error)
     return files

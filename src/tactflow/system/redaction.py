@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from typing import Any
 
 # A single slash is the result of passing an address through `pathlib`.
@@ -45,33 +44,17 @@ def public_setting(text: str) -> str:
     return public_address(_SETTING.sub(r"\1\2removed", text))
 
 
-def without_secrets(text: str) -> str:
-    """The text of a pipeline without passwords in addresses and without tokens, for sharing.
+def without_secrets(settings: Any) -> Any:
+    """Settings of a pipeline without passwords in addresses and without tokens, for sharing.
 
-    >>> print(without_secrets("{source: rtsp://me:pass@camera/1, token: abc, host: null}"))
-    {source: rtsp://camera/..., token: removed, host: null}
+    >>> without_secrets({"source": "rtsp://me:pass@camera/1", "token": "abc", "host": None})
+    {'source': 'rtsp://camera/...', 'token': 'removed', 'host': None}
     """
-    # Imported here, because it is slow and rarely needed.
-    import yaml
-
-    try:
-        document = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError):
-        return ""
-    # In any notation: quoted, on its own line, by an alias.
-    for secret in sorted(set(_secrets(document)), key=len, reverse=True):
-        text = text.replace(secret, "removed")
-    return public_address(text)
-
-
-def _secrets(value: Any) -> Iterator[str]:
-    if isinstance(value, dict):
-        for key, part in value.items():
-            # `stages.view.token: ...` is how a sensor overrides one value.
-            if str(key).rpartition(".")[2] in _KEYS and part not in (None, ""):
-                yield str(part)
-            else:
-                yield from _secrets(part)
-    elif isinstance(value, list):
-        for part in value:
-            yield from _secrets(part)
+    if isinstance(settings, dict):
+        return {
+            key: "removed" if key in _KEYS and part not in (None, "") else without_secrets(part)
+            for key, part in settings.items()
+        }
+    if isinstance(settings, list):
+        return [without_secrets(part) for part in settings]
+    return public_address(settings) if isinstance(settings, str) else settings
