@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from tactflow.engine.check import read_only
 from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import Frame
+from tactflow.engine.frame import Frame, read_only
 from tactflow.sources import KINDS, Arrival, CameraRequest, FrameReader, Watch, open_source
 from tactflow.sources.files import ImageFiles, load_image
 from tactflow.sources.pace import paced

@@ -92,7 +92,7 @@ CASES = [
     (
         "prepare",
         "  §outline: {use: @Outline}\n  compare: {use: @Compare}",
-        "compare gives it but stands below .. in: {contact_mask: compare.contact_mask}",
+        "compare gives it but is below .. in: {contact_mask: compare.contact_mask}",
     ),
     ("prepare", "sinks:\n  §out: {use: @Require}", "needs contact, but no stage gives it"),
     (

@@ -314,7 +314,7 @@ def test_one_signal_ends_all_sensors_well(folder: Path, number: int) -> None:
         (GRAPH.replace("  left: {stages:", "  left: {stagse:"), [], "sensors.left.stagse: unknown key"),
         (GRAPH.replace("  left:", "  'le ft':"), [], "should be a word of letters"),
         (GRAPH.replace("left:", "stats:"), [], "give the sensor another name"),
-        (GRAPH + "sensor: main\n", [], "already; leave this one out"),
+        (GRAPH + "sensor: main\n", [], "remove this key"),
         (
             "sensors: []\n" + GRAPH[GRAPH.index('stages:\n  capture: {source: "sim:idle"}') :],
             [],

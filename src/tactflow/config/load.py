@@ -21,7 +21,7 @@ from tactflow.config.wiring import Draft
 from tactflow.engine.conformance import configured, declares
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Gate, Node, OnError, Pipeline
+from tactflow.engine.graph import Node, OnError, Pipeline
 from tactflow.engine.plan import plan_problem
 from tactflow.system.files import expanded
 
@@ -241,14 +241,13 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
     if draft.component.kind == "source" and not (origin := document.mark(*draft.keys, "source")).line:
         # A source of the command line that cannot be opened is not an error in the file.
         mark = origin
-    gates = [Gate(ref, signal.closed or ref.port, signal.otherwise) for ref, signal in draft.gates]
     return Node(
         id=draft.id,
         component=draft.component,
         params=draft.params,
         inputs=draft.inputs,
         mark=mark,
-        gates=tuple(gates),
+        gates=tuple(draft.gates),
         segment=entry.segment,
         queue=entry.queue,
         on_error=entry.on_error or default,

@@ -59,8 +59,8 @@ class Entry(Part):
     inputs: Annotated[dict[str, str | None], _EMPTY] = Field(
         {},
         alias="in",
-        description="input -> the output it takes, as stage.port or port; null: an optional input takes "
-        "nothing; by default the nearest output of its name above",
+        description="input -> the output it takes, as stage.port or port; null leaves an "
+        "optional input unconnected; by default the nearest output of its name above",
     )
     when: str | list[str] | None = Field(
         None, description="the signals that must all be true for it to run: bool ports, as port or stage.port"
@@ -81,8 +81,8 @@ class Entry(Part):
 
 
 _USE = (
-    "which {}: a built-in, a plug-in, package.module:Class or ./file.py:Class; by default the one that is "
-    "called like the id"
+    "which {}: a built-in, a plug-in, package.module:Class or ./file.py:Class; by default the one "
+    "named like the id"
 )
 
 
@@ -97,7 +97,7 @@ class SinkEntry(Entry):
 
     use: str = Field("", description=_USE.format("sink"))
     max_rate: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="frames it is given a second at most, Hz; null: all"
+        None, gt=0, allow_inf_nan=False, description="frames per second at most, Hz; null: all"
     )
 
 
@@ -133,7 +133,7 @@ class PipelineFile(Part):
         ge=0,
         # The system refuses some ten thousand.
         le=1024,
-        description="threads of OpenCV; 1: none beside the caller's; null: OpenCV's choice",
+        description="threads of OpenCV; 1: only the caller's; null: OpenCV's choice",
     )
     stages: Annotated[dict[Word, Annotated[StageEntry, _EMPTY]], _EMPTY] = Field(
         description="id -> stage, in order; the source of frames is one of them"

@@ -53,13 +53,7 @@ def _part(settings: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 
 
 def as_yaml(value: Any) -> str:
-    """A value for `--set`, as JSON, which is also YAML.
-
-    >>> import numpy as np
-    >>> from pathlib import Path
-    >>> as_yaml({"path": Path("out/a.jsonl"), "rate": np.float32(0.5), "size": np.arange(2)})
-    '{"path": "out/a.jsonl", "rate": 0.5, "size": [0, 1]}'
-    """
+    """A value for `--set`, as JSON, which is also YAML."""
     return json.dumps(plain(value), ensure_ascii=False)
 
 

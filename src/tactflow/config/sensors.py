@@ -38,8 +38,7 @@ def select(document: Document, chosen: str | None) -> str:
     else:
         if document.has("sensor"):
             mark = document.mark("sensors")
-            message = f"the names stand under sensors ({mark}) already; leave this one out"
-            document.report(("sensor",), message)
+            document.report(("sensor",), f"the sensors are named under sensors ({mark}); remove this key")
         if chosen is not None and chosen not in known:
             hint = did_you_mean(chosen, known)
             document.report(("sensors",), f"there is no {chosen!r}{hint}")

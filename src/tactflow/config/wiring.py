@@ -9,7 +9,7 @@ from typing import Any
 from tactflow.config.document import Document, Keys, dotted
 from tactflow.config.registry import Section, catalogue
 from tactflow.engine.contract import StageParams
-from tactflow.engine.graph import Component, Mark, Ref
+from tactflow.engine.graph import Component, Gate, Mark, Ref
 from tactflow.engine.ports import Port, SignalPort, describe_type, fits, port_type
 from tactflow.system.spelling import did_you_mean
 
@@ -21,7 +21,7 @@ class Draft:
     mark : of its key.
     component : None if `use` could not be resolved; no errors are reported for nodes that depend on it.
     params : None if invalid.
-    inputs, gates : set by `connect`; for each gate the port, and the signal that defines a closed gate.
+    inputs, gates : set by `connect`.
     edges : every output that it uses, with the location in the file.
     """
 
@@ -31,7 +31,7 @@ class Draft:
     component: Component | None = None
     params: StageParams | None = None
     inputs: dict[str, Ref | None] = field(default_factory=dict)
-    gates: list[tuple[Ref, SignalPort]] = field(default_factory=list)
+    gates: list[Gate] = field(default_factory=list)
     edges: list[tuple[Ref, Mark]] = field(default_factory=list)
 
     @property
@@ -192,7 +192,7 @@ class _Wiring:
         text = f"needs {port.name}, but no stage{where} gives it"
         below = next((draft for draft in self._stages if port.name in draft.outputs), None)
         if below is not None and below is not user:
-            text += f"; {below.id} gives it but stands below: move it up, or write in: "
+            text += f"; {below.id} gives it but is below: move it up, or write in: "
             return text + f"{{{port.name}: {below.id}.{port.name}}}"
         makers = [c.name for c in catalogue()[0] if port.name in (output.name for output in c.ports.outputs)]
         known = f"there are {', '.join(outputs)}" if outputs else "there are none"
@@ -208,7 +208,8 @@ class _Wiring:
             needed = "a gate takes a signal (a bool port such as touching)"
             self._document.report(place, f"{needed}, but {ref} ({producer}) gives {kind}")
             return
-        draft.gates.append((ref, self._meaning(ref, signal)))
+        meaning = self._meaning(ref, signal)
+        draft.gates.append(Gate(ref, meaning.closed or ref.port, meaning.otherwise))
         draft.edges.append((ref, self._document.mark(*place)))
 
     def _meaning(self, ref: Ref, signal: SignalPort, visited: Sequence[str] = ()) -> SignalPort:

@@ -63,6 +63,14 @@ class Absent:
         return False
 
 
+def read_only(value: Any) -> Any:
+    """The value; for an array, a read-only view."""
+    if isinstance(value, np.ndarray):
+        value = value.view()
+        value.flags.writeable = False
+    return value
+
+
 class Tick(Mapping[str, Any]):
     """The values computed for one frame: a mapping from port names to values.
 

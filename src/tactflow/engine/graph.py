@@ -80,8 +80,8 @@ class Queue(BaseModel, frozen=True, extra="forbid", strict=True):
     )
     when_full: FullPolicy | None = Field(
         default=None,
-        description="block: whoever puts waits, nothing is lost; latest: only the newest frame is kept; "
-        "drop_oldest: the oldest frame makes room; null: the planner's choice",
+        description="block: the segment before it waits, nothing is lost; latest: only the newest frame is "
+        "kept; drop_oldest: the oldest frame is dropped; null: the planner's choice",
     )
 
 

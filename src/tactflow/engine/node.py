@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import is_
 from typing import Any
 
-from tactflow.engine.check import check_values, read_only
 from tactflow.engine.conformance import METHODS
 from tactflow.engine.contract import Part, Sink, Stage
-from tactflow.engine.frame import Absent, Frame, Tick
+from tactflow.engine.frame import Absent, Frame, Tick, read_only
 from tactflow.engine.graph import Gate, Node
-from tactflow.engine.ports import SignalPort, port_type
+from tactflow.engine.ports import SignalPort, check_values, port_type
 from tactflow.engine.rate import RateLimit
 from tactflow.engine.stats import NodeStats, SignalStats
 

@@ -286,7 +286,7 @@ class Runner:
                 for link in self._links:
                     link.abort()
                 raise StageError(
-                    f"the run was stopped, but nothing has got on for {CLOSE_SECONDS:g} s: "
+                    f"the run was stopped, but has made no progress for {CLOSE_SECONDS:g} s: "
                     f"{', '.join(places)} hangs"
                 )
 

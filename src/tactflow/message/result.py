@@ -12,9 +12,8 @@ import numpy as np
 import orjson
 from pydantic import Field
 
-from tactflow.engine.check import read_only
 from tactflow.engine.contract import StageParams
-from tactflow.engine.frame import NO_PICTURE, Frame, Tick
+from tactflow.engine.frame import NO_PICTURE, Frame, Tick, read_only
 from tactflow.message.decoding import decode_values
 from tactflow.message.encoding import SCHEMA, encode
 from tactflow.ports import ContactMask, Image, Normals
