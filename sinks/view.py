@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -82,8 +81,6 @@ class View(Sink):
         self._neighbours = None if params.neighbours is None else Neighbours(Path(params.neighbours), sensor)
         self._due = float("-inf")
         self._encoded = 0
-        self._sending = threading.Lock()
-        self._last: tuple[Result, Valid | None, float] | None = None
 
     @classmethod
     def among(cls, params: View.Params, folder: Path, address: str | None) -> View.Params:  # noqa: ARG003
@@ -107,7 +104,7 @@ class View(Sink):
         from tactflow.view.hub import Hub
         from tactflow.view.server import Server
 
-        self._hub = Hub(self._control, self._sensor, self._neighbours or dict, self._send)
+        self._hub = Hub(self._control, self._sensor, self._neighbours or dict)
         self._server = Server(self._hub, listener, p.host, p.token)
         self._server.start()
         self.description = address(p.host, port)
@@ -128,37 +125,24 @@ class View(Sink):
 
     def write(self, result: Result, valid: Valid | None = None) -> None:
         """Send the picture and the results, which the page draws over it."""
+        hub, p = self._hub, self.params
         # The pages may not be ready any more.
-        if not self.wants():
+        if hub is None or not self.wants():
             return
-        now, interval = time.perf_counter(), 1.0 / self.params.max_fps
+        now, interval = time.perf_counter(), 1.0 / p.max_fps
         # Counted from when this one was due, so that an uneven source does not lower the rate.
         self._due = max(self._due, now - interval / 2) + interval
         captured = result.frame.captured
-        self._last = result, valid, (now - captured) * 1000 if captured else -1.0
-        self._send(captured)
-
-    def _send(self, captured: float = 0.0) -> None:
-        """Send the last frame, again if a page of a paused run shows another layer.
-
-        captured : `time.perf_counter` at its capture, s; 0 if the delay is not to be measured.
-        """
-        with self._sending:
-            hub, p = self._hub, self.params
-            if hub is None or self._last is None:
-                return
-            result, valid, latency = self._last
-            packet = encode_packet(
-                result,
-                valid,
-                hub.shown,
-                latency_ms=latency,
-                guide=None if self.session is None else self.session.state,
-                quality=p.quality,
-                max_size=p.max_size,
-            )
-            self._encoded += 1
-            hub.publish(*packet, captured)
+        packet = encode_packet(
+            result,
+            valid,
+            latency_ms=(now - captured) * 1000 if captured else -1.0,
+            guide=None if self.session is None else self.session.state,
+            quality=p.quality,
+            max_size=p.max_size,
+        )
+        self._encoded += 1
+        hub.publish(*packet)
 
     def close(self) -> None:
         """Notify the pages of the end of the run, and stop serving."""

@@ -144,6 +144,8 @@ def read_document(path: Path) -> Document:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"cannot read {path}: {reason}{hint}") from None
+    if hint and b"\0" in data:
+        raise ConfigError(f"{path} is not a pipeline file (YAML){hint}")
     # YAML does not allow the characters that bytes other than UTF-8 become.
     text = data.decode("utf-8-sig", "surrogateescape")
     document = Document(str(path), line=1)

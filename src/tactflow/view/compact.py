@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import cv2
@@ -37,7 +37,6 @@ FIELD_ARROWS = 14.0
 def encode_packet(
     result: Result,
     valid: Valid | None,
-    shown: Collection[str],
     *,
     latency_ms: float,
     guide: Mapping[str, Any] | None,
@@ -46,22 +45,20 @@ def encode_packet(
 ) -> tuple[bytes, bytes]:
     """The header, JSON without its closing brace, and the heights of a surface followed by the JPEG picture.
 
-    The picture is dimmed outside the gel; the page draws the results over it. A field or height map that is
-    available but not shown by any page is `true`.
+    The picture is dimmed outside the gel; the page draws the results over it.
 
-    shown : layers of "field" and "surface" shown by a page. latency_ms : since capture; -1 if unknown.
+    latency_ms : since capture; -1 if unknown.
     guide : state of a guided session. max_size : of the longer side of the picture, px.
     """
     contact, markers, scale = result.contact, result.markers, result.scale
     if contact is not None:
         contact = dataclasses.replace(contact, hull=np.round(contact.hull, 1), separate=())
     image = result.frame.image if result.image is None else result.image
-    arrows, surface = (b"null" if layer is None else b"true" for layer in (result.field, result.depth))
-    heights = b""
-    if result.field is not None and "field" in shown:
+    arrows, surface, heights = b"null", b"null", b""
+    if result.field is not None:
         spacing = FIELD_ARROWS * max(1.0, max(image.shape) / 400)
         arrows = compact_markers(field_arrows(result.field, spacing))
-    if result.depth is not None and "surface" in shown:
+    if result.depth is not None:
         surface, heights = compact_surface(result.depth)
     parts = {
         b"latency_ms": b"%.3f" % latency_ms,

@@ -11,8 +11,6 @@ import asyncio
 import logging
 import secrets
 import struct
-import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -28,42 +26,26 @@ log = logging.getLogger("tactflow")
 STATS_SECONDS = 0.5
 """Interval at which pages receive the statistics of the run, s."""
 
-ON_DEMAND = frozenset({"field", "surface"})
-"""Layers sent only to pages that show them."""
-
-MAX_PAGES = 16
-"""Maximum number of open pages; further ones are rejected."""
-
 
 class Packet(NamedTuple):
-    """An encoded frame.
-
-    number : counts from 1. captured : `time.perf_counter` at capture, s.
-    """
+    """An encoded frame. number : counts from 1."""
 
     number: int
     data: bytes
-    captured: float
 
 
 @dataclass(eq=False, slots=True)
 class Page:
     """State of one open page.
 
-    credit : whether the next frame may be sent. shows : layers of `ON_DEMAND` that it shows. sent, answered :
-    numbers of the last frame sent and acknowledged. captured : `time.perf_counter` of the frame
-    sent, s. screen_s : recent times from capture to screen, s. texts : unsent messages, only the newest of
-    each kind, which bounds the queue of a page that does not read. wake : set when there is something to
-    send. ended : the run is over.
+    credit : whether the next frame may be sent. sent : number of the last frame sent. texts : unsent
+    messages, only the newest of each kind, which bounds the queue of a page that does not read. wake : set
+    when there is something to send. ended : the run is over.
     """
 
     socket: ServerConnection
     credit: bool = True
-    shows: frozenset[str] = frozenset()
     sent: int = 0
-    answered: int = 0
-    captured: float = 0.0
-    screen_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
     texts: dict[str, str] = field(default_factory=dict)
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     ended: bool = False
@@ -77,15 +59,13 @@ class Page:
 class Hub:
     """The open pages.
 
-    `publish`, `wanted`, `shown` and `counters` may be used from any thread, the rest in the server's
-    event loop.
+    `publish`, `wanted` and `counters` may be used from any thread, the rest in the server's event loop.
 
     Parameters
     ----------
     control : handle on the run; None disables commands.
     sensor : name of the sensor.
     neighbours : returns sensor name -> port of the other sensors' pages.
-    again : publishes the last frame again; called in a worker thread.
     answers : further command -> what it calls with its value, of a guided session.
     """
 
@@ -94,19 +74,15 @@ class Hub:
         control: Control | None,
         sensor: str,
         neighbours: Callable[[], Mapping[str, int]] = dict,
-        again: Callable[[], None] = lambda: None,
         answers: Mapping[str, Callable[[Any], Any]] | None = None,
     ) -> None:
         self.control = control
         self._commands = Commands(control)
         self.sensor = sensor
         self.neighbours = neighbours
-        self._again = again
         self.run_id = secrets.token_hex(8)
         self.wanted = False
         """Whether a page has credit."""
-        self.shown: frozenset[str] = frozenset()
-        """Layers of `ON_DEMAND` shown by at least one page."""
         self.pages: set[Page] = set()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop that serves the pages."""
@@ -118,20 +94,19 @@ class Hub:
 
     # -- from other threads -------------------------------------------------------------------------------
 
-    def publish(self, header: bytes, pixels: bytes, captured: float) -> None:
+    def publish(self, header: bytes, pixels: bytes) -> None:
         """Offer a frame to every page; never blocks.
 
         Parameters
         ----------
         header : JSON object that describes the frame, without its closing brace.
         pixels : heights of a surface, if the header describes one, followed by the JPEG picture.
-        captured : `time.perf_counter` at capture, s.
         """
         self._number += 1
         header = header + b',"number":%d}' % self._number
         # A little-endian length, the JSON header, the heights and the picture.
         data = struct.pack("<I", len(header)) + header + pixels
-        packet = Packet(self._number, data, captured)
+        packet = Packet(self._number, data)
         if self.loop is not None and not self.loop.is_closed():
             self.loop.call_soon_threadsafe(self._take, packet)
 
@@ -190,10 +165,7 @@ class Hub:
         snapshot = self._commands.snapshot()
         state = self.state()
         for page in self.pages:
-            delays = sorted(page.screen_s)
-            median = delays[len(delays) // 2] * 1000 if delays else None
-            page.screen_s.clear()
-            page.post("stats", _text(type="stats", sensor=self.sensor, screen_ms=median, run=snapshot))
+            page.post("stats", _text(type="stats", sensor=self.sensor, run=snapshot))
             page.post("state", state)
 
     def state(self) -> str:
@@ -232,7 +204,6 @@ class Hub:
 
     def _recount(self) -> None:
         self.wanted = any(page.credit for page in self.pages)
-        self.shown = frozenset().union(*(page.shows for page in self.pages))
 
     async def _send(self, page: Page) -> None:
         while True:
@@ -248,7 +219,6 @@ class Hub:
             if page.credit and packet is not None and packet.number > page.sent:
                 page.credit = False
                 page.sent = packet.number
-                page.captured = packet.captured
                 self._sent += 1
                 self._recount()
                 await page.socket.send(packet.data)
@@ -262,31 +232,12 @@ class Hub:
             if not isinstance(message, dict):
                 await page.socket.close(1008, "required a JSON object")
                 return
-            if "ack" in message:
-                self._acknowledged(page, message)
-            elif "show" in message:
-                await self._show(page, message["show"])
-            else:
+            if "ack" not in message:
                 await self._command(page, message)
-
-    async def _show(self, page: Page, layers: Any) -> None:
-        page.shows = ON_DEMAND.intersection(map(str, layers if isinstance(layers, list) else ()))
-        before = self.shown
-        self._recount()
-        # While paused, no new frame would provide the layer.
-        if self.shown - before and self._paused:
-            await asyncio.to_thread(self._again)
-
-    def _acknowledged(self, page: Page, message: Mapping[str, Any]) -> None:
-        if message["ack"] != page.sent or page.sent == page.answered:
-            return
-        page.answered = page.sent
-        # A hidden page draws when it becomes visible again, which does not count as latency.
-        if message.get("late") is not True and page.captured > 0:
-            page.screen_s.append(time.perf_counter() - page.captured)
-        page.credit = True
-        self._recount()
-        page.wake.set()
+            elif message["ack"] == page.sent:
+                page.credit = True
+                self._recount()
+                page.wake.set()
 
     async def _command(self, page: Page, message: Mapping[str, Any]) -> None:
         name = message.get("do")

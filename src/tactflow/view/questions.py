@@ -159,6 +159,6 @@ class Questions:
             return
         self._due = now + SHOW_SECONDS
         packet = encode_packet(
-            self._shown, None, (), latency_ms=-1.0, guide=self._state, quality=85, max_size=1280
+            self._shown, None, latency_ms=-1.0, guide=self._state, quality=85, max_size=1280
         )
-        self._hub.publish(*packet, 0.0)
+        self._hub.publish(*packet)

@@ -21,7 +21,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.http11 import Request, Response
 
 from tactflow.view.address import LOOPBACK_NAMES, WILDCARDS, bracketed
-from tactflow.view.hub import MAX_PAGES, Hub
+from tactflow.view.hub import Hub
 
 log = logging.getLogger("tactflow")
 
@@ -32,9 +32,8 @@ CLOSE_SECONDS = 3.0
 """Timeouts for starting and stopping the server, s."""
 
 WRONG_TOKEN = 4401
-TOO_MANY = 4429
-"""WebSocket close codes, because a page cannot read the reason for a rejected handshake. Codes from 4000 are
-for private use (RFC 6455, 7.4.2); the last digits follow HTTP 401 and 429."""
+"""WebSocket close code, because a page cannot read the reason for a rejected handshake. Codes from 4000 are
+for private use (RFC 6455, 7.4.2); the last digits follow HTTP 401."""
 
 TYPES = {
     "html": "text/html; charset=utf-8",
@@ -163,8 +162,6 @@ class Server:
             # Slow down brute-force attacks.
             await asyncio.sleep(0.5)
             await connection.close(WRONG_TOKEN, "token required")
-        elif len(self.hub.pages) >= MAX_PAGES:
-            await connection.close(TOO_MANY, f"more than {MAX_PAGES} pages are open")
         else:
             await self.hub.serve(connection)
 

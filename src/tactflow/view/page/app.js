@@ -84,7 +84,6 @@ const news = {
       s.rate = Math.max(0, stats.frames - s.stats.frames) / (stats.wall_s - s.stats.wall_s);
     }
     s.stats = stats;
-    s.screen = message.screen_ms;
     if (s.name === current) drawStats(s);
     refresh();
   },
@@ -196,7 +195,6 @@ function drawOffers(offers) {
 function drawStats(s) {
   const stats = s?.stats;
   set("rate", s && s.rate !== null ? `${s.rate.toFixed(s.rate < 10 ? 1 : 0)}/s` : "–");
-  set("screen", s?.screen ? `${Math.round(s.screen)} ms` : "–");
   set("dropped", stats ? grouped(stats.dropped) : "–");
   const body = $("stage-rows");
   if (!stats) {

@@ -14,12 +14,11 @@ let connection = null;
 let picture = null;
 let surface = null;
 let plots = {};
-let shows = [];  // on-demand layers requested by this page
+let showsSurface = false;
 let run = null;
 let current = null;
 let visible = Promise.resolve();
 let reveal = null;  // resolves `visible`
-let hiddenSince = 0;
 const sensors = new Map();
 
 const tell = (type, content = {}) => postMessage({ type, ...content });
@@ -52,7 +51,7 @@ const orders = {
     ]);
     tell("turns", { turns: surface.turns });
     orders.hide({ hidden });
-    connection = new Connection(token, { open, text, frame, lost: (seconds) => tell("lost", { seconds }), refused: () => tell("refused") });
+    connection = new Connection(token, { open: () => tell("open"), text, frame, lost: (seconds) => tell("lost", { seconds }), refused: () => tell("refused") });
   },
   resize({ id, width, height, ratio }) {
     ({ picture, surface, ...plots })[id].resize(width, height, ratio);
@@ -64,13 +63,8 @@ const orders = {
     picture.choose(layers, magnify, unit);
     surface.choose(rise);
     for (const plot of Object.values(plots)) plot.choose(unit);
-    const before = String(shows);
-    shows = ["field", "surface"].filter((name) => layers[name]);
-    if (String(shows) !== before) {
-      connection.send({ show: shows });
-      // The heights may already be here because another page requested them; a paused run sends no new frame.
-      if (current !== null) showSurface(sensor(current));
-    }
+    showsSurface = layers.surface;
+    if (current !== null) showSurface(sensor(current));
   },
   turn({ dx, dy }) {
     surface.turn(dx, dy);
@@ -82,7 +76,6 @@ const orders = {
   },
   hide({ hidden }) {
     if (hidden && reveal === null) {
-      hiddenSince = performance.now();
       visible = new Promise((resolve) => { reveal = resolve; });
     } else if (!hidden && reveal !== null) {
       reveal();
@@ -97,11 +90,6 @@ const orders = {
 onmessage = ({ data }) => orders[data.order](data);
 
 // -- from the run -----------------------------------------------------------------------------------------
-
-function open() {
-  if (shows.length) connection.send({ show: shows });
-  tell("open");
-}
 
 function text(message) {
   if (message.type === "hello") {
@@ -124,7 +112,6 @@ function text(message) {
 }
 
 async function frame(header, blob, heights) {
-  const received = performance.now();
   const s = sensor(header.message.sensor);
   let bitmap = null;
   try {
@@ -140,7 +127,7 @@ async function frame(header, blob, heights) {
   }
   addFrame(s, header, heights);
   // The run sends the next frame after this: a slow page gets fewer frames instead of old ones.
-  connection.send({ ack: header.number, late: hiddenSince > received });
+  connection.send({ ack: header.number });
 }
 
 function addFrame(s, header, heights) {
@@ -180,7 +167,7 @@ function showFrame(s) {
 
 function showSurface(s) {
   // The colour scale is that of the plot, which rarely changes.
-  if (shows.includes("surface")) surface.show(s.header, s.heights, plots["plot-depth"].limits(s.points)[1]);
+  if (showsSurface) surface.show(s.header, s.heights, plots["plot-depth"].limits(s.points)[1]);
 }
 
 // Update the plots and the text of the page.
