@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import signal
@@ -53,18 +52,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def statuses(folder: Path) -> dict[str, str]:
     rows = [json.loads(line) for line in (folder / "out" / "runs.jsonl").read_text().splitlines()]
     return {row["name"].removesuffix(".npy"): row["status"] for row in rows}
-
-
-def test_a_system_that_has_no_semaphores_is_named(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr(workers, "ProcessPoolExecutor", refused)
-    assert main(batch("a.npy")) == 3
-    assert "processes cannot be started: Read-only file system; on Linux, /dev/shm" in capsys.readouterr().err
-    assert folder.is_dir()
 
 
 def test_a_recording_that_kills_its_worker_fails_and_the_others_are_done(

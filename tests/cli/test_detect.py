@@ -17,7 +17,7 @@ def test_what_was_found_is_told_and_drawn(tmp_path: Path, terminal: Terminal) ->
     file = tmp_path / "found.png"
     assert terminal("detect", GEL, "--downsample", "2", "--picture", str(file)) == 0
     title, *lines = terminal.out.splitlines()
-    assert title == f"{GEL}, frame 0: 400 x 300 px"
+    assert title == f"{GEL}: 400 x 300 px"
     assert lines[0].startswith("yellow circles: 80 dark dots, radius 4.9 px, 34.0 px apart")
     assert lines[1].startswith("green: 142 links; 98 % of the parallelograms")
     picture = cv2.imread(str(file))
@@ -47,8 +47,6 @@ def test_a_gel_without_marks_is_exit_code_3_and_the_best_spots_are_drawn(
     ("options", "code", "words"),
     [
         (["nowhere.mp4"], 4, "no such file"),
-        ([GEL, "--frame", "5"], 4, "has no frame 5, counted from 0"),
-        ([GEL, "--frame", "-1"], 2, "--frame: required a whole number from 0, got '-1'"),
         ([GEL, "--dot", "900"], 2, "--dot: required dot_radius 1 to 150 px, got 900"),
         ([GEL, "--picture", "found.txt"], 2, "ends in .png or .jpg, got found.txt"),
         ([GEL, "--picture", "here.png"], 2, "here.png already exists; give --overwrite"),

@@ -15,9 +15,6 @@ from tactflow.sources.files import IMAGE_SUFFIXES, matching, natural_key
 from tactflow.sources.paths import find_path, locate, split_prefix
 from tactflow.system.files import expanded, is_utf8
 
-_MAX_MISTAKES = 10
-"""Mistakes reported per call: they fit on a terminal."""
-
 
 @dataclass(frozen=True, slots=True)
 class Recording:
@@ -66,8 +63,6 @@ def find_recordings(words: Sequence[str]) -> list[Recording]:
             mistakes.append(str(error))
     # Messages and tables are UTF-8.
     mistakes += [f"{source}: the name is not UTF-8; rename it" for source in sources if not is_utf8(source)]
-    if len(mistakes) > _MAX_MISTAKES:
-        mistakes[_MAX_MISTAKES:] = [f"and {len(mistakes) - _MAX_MISTAKES} more"]
     if mistakes:
         raise ConfigError(*mistakes)
     names = _short_names(list(sources))

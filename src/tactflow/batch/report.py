@@ -14,7 +14,7 @@ import orjson
 
 from tactflow.batch.recordings import Recording
 from tactflow.batch.store import Format, Outcome, Store
-from tactflow.engine.errors import ConfigError, StageError
+from tactflow.engine.errors import ConfigError
 from tactflow.system.extras import missing
 from tactflow.system.files import completed
 
@@ -38,27 +38,24 @@ def require_pyarrow() -> None:
 
 
 def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
-    """Write the table of runs, overwriting an earlier one; return its path. Raises StageError."""
+    """Write the table of runs, overwriting an earlier one; return its path."""
     path = store.path / f"runs.{format_}"
     columns = [field for field in fields(Outcome) if field.name not in NOT_IN_TABLE]
     rows = [{column.name: getattr(outcome, column.name) for column in columns} for _, outcome in runs]
-    try:
-        with completed(path) as partial:
-            if format_ == "jsonl":
-                partial.write_bytes(b"".join(orjson.dumps(row) + b"\n" for row in rows))
-            else:
-                import pyarrow as pa  # type: ignore[import-untyped]
-                import pyarrow.parquet as pq  # type: ignore[import-untyped]
+    with completed(path) as partial:
+        if format_ == "jsonl":
+            partial.write_bytes(b"".join(orjson.dumps(row) + b"\n" for row in rows))
+        else:
+            import pyarrow as pa  # type: ignore[import-untyped]
+            import pyarrow.parquet as pq  # type: ignore[import-untyped]
 
-                types = [(c.name, getattr(pa, _TYPES.get(str(c.type), "string"))()) for c in columns]
-                pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(types)), partial)
-    except OSError as error:
-        raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+            types = [(c.name, getattr(pa, _TYPES.get(str(c.type), "string"))()) for c in columns]
+            pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(types)), partial)
     return path
 
 
 def write_page(store: Store, runs: Runs, title: str) -> Path:
-    """Write `index.html`, overwriting an earlier one; return its path. Raises StageError."""
+    """Write `index.html`, overwriting an earlier one; return its path."""
     path = store.path / "index.html"
     ordered = sorted(runs, key=lambda run: ("failed", "done", "not done").index(run[1].status))
     done = [outcome for _, outcome in runs if outcome.status == "done"]
@@ -72,11 +69,8 @@ def write_page(store: Store, runs: Runs, title: str) -> Path:
     template = Template(files("tactflow.batch").joinpath("page.html").read_text(encoding="utf-8"))
     columns = "".join(f"<th>{column}" for column in COLUMNS)
     page = template.substitute(title=escape(title), text=text, columns=columns, rows="\n".join(rows))
-    try:
-        with completed(path) as partial:
-            partial.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise StageError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with completed(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return path
 
 

@@ -14,6 +14,7 @@ from tactflow.batch.store import Outcome, Store
 from tactflow.batch.work import Request, Task
 from tactflow.batch.workers import SCHEDULER_GONE, Workers
 from tactflow.engine.errors import StageError
+from tactflow.outputs import cannot_write
 
 POLL_SECONDS = 0.2
 """Interval at which signals are checked, s: too short for people to notice."""
@@ -165,12 +166,12 @@ class Batch:
         try:
             self.store.save(recording, outcome)
         except OSError as error:
-            raise StageError(f"{self.store.records}: cannot be written: {error.strerror or error}") from error
+            raise cannot_write(self.store.records, error) from error
 
     def _reason_to_end(self, outcome: Outcome) -> str | None:
         """Reason to start no more recordings after this outcome, or None."""
         if outcome.disk_full:
-            return "the disk is full; free some space and run again: finished recordings are kept"
+            return "the disk is full; free some space, then run again: finished recordings are kept"
         if self._deaths == MAX_DEATHS:
             return f"{MAX_DEATHS} recordings in a row killed their workers; try fewer --workers"
         return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import functools
 import hashlib
 import logging
@@ -30,6 +29,7 @@ from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
 from tactflow.engine.graph import Mark, Node, Pipeline
 from tactflow.message.result import Result
+from tactflow.outputs import DISK_FULL
 from tactflow.system.clock import SYSTEM
 
 _SRC = Mark("recording", 0, 0)
@@ -246,7 +246,7 @@ def _describe(error: Exception) -> str:
 
 def _is_disk_full(error: BaseException | None) -> bool:
     while error is not None:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import signal
 import threading
-import warnings
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -51,7 +50,7 @@ class Workers(Protocol):
 
 
 class LocalProcesses:
-    """Processes on this machine. count : number of processes. Raises StageError if the system has none."""
+    """Processes on this machine. count : number of processes."""
 
     def __init__(self, count: int) -> None:
         self.description = f"{count} {'process' if count == 1 else 'processes'}"
@@ -63,14 +62,8 @@ class LocalProcesses:
         # Not fork: this process has threads, and OpenCV may hold locks.
         context = multiprocessing.get_context("spawn")
         # The queues of a pool start multiprocessing's resource tracker.
-        try:
-            with starting_children():
-                return ProcessPoolExecutor(self.slots, context, initializer=_begin)
-        except OSError as error:
-            raise StageError(
-                f"worker processes cannot be started: {error.strerror or error}; on Linux, /dev/shm must be "
-                "there and writable"
-            ) from error
+        with starting_children():
+            return ProcessPoolExecutor(self.slots, context, initializer=_begin)
 
     def submit(self, task: Task) -> Future[Outcome]:
         """See `Workers.submit`."""
@@ -110,7 +103,7 @@ class DaskCluster:
 
     Raises
     ------
-    ConfigError : Dask is missing, or no scheduler of the same version answers.
+    ConfigError : Dask is missing, or no scheduler answers.
     """
 
     def __init__(self, address: str) -> None:
@@ -143,30 +136,15 @@ class DaskCluster:
 
 
 def _connect(address: str) -> Any:
-    """Connect to a scheduler and check that all machines have our version of Dask."""
+    """Connect to a scheduler. Dask warns if its machines have other versions."""
     # Imported here because it takes a second.
     distributed = import_module("distributed")
     # Errors are reported below, without tracebacks.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Mismatched versions")
-            client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        return distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, ImportError, TypeError) as error:
         raise ConfigError(
             f"--scheduler {address}: no Dask scheduler answers ({error}); is it the address that "
             "`dask scheduler` shows, tcp://HOST:8786, of the same version of Dask?"
         ) from None
-    versions = client.get_versions()
-    here, *remote = (
-        str(host["packages"]["distributed"])
-        for host in (versions["client"], versions["scheduler"], *versions["workers"].values())
-    )
-    if set(remote) - {here}:
-        client.close()
-        there = ", ".join(sorted(set(remote) - {here}))
-        raise ConfigError(
-            f"--scheduler {address}: runs distributed {there}, this machine {here}; install the same version "
-            "on all machines"
-        )
-    return client

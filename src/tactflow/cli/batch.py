@@ -17,7 +17,7 @@ from tactflow.batch.run import Batch, Result, make_plan
 from tactflow.batch.store import Outcome, Store
 from tactflow.batch.work import Request, resolved
 from tactflow.batch.workers import DaskCluster, LocalProcesses
-from tactflow.cli.options import add_overrides, add_quiet, add_sensor
+from tactflow.cli.options import add_overrides, add_quiet, add_sensor, writing
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
@@ -108,8 +108,9 @@ def run(args: argparse.Namespace) -> int:
         for line in _closing(result, len(plan.done)):
             tell(line)
         runs = [(recording, _outcome(recording, result, store, request)) for recording in recordings]
-        write_runs(store, runs, args.format)
-        page = write_page(store, runs, f"{file.stem}: {len(runs)} recordings")
+        with writing(store.path):
+            write_runs(store, runs, args.format)
+            page = write_page(store, runs, f"{file.stem}: {len(runs)} recordings")
         tell(f"report: {page}")
     if signals and result.undone:
         return INTERRUPTED

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Iterator
-from itertools import islice
+from contextlib import closing
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.cli.options import add_overwrite, refuse_output, writing
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
-from tactflow.system.arguments import number
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.system.terminal import printable
@@ -25,7 +22,6 @@ from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
 
-_index = number(int, 0, math.inf, "a whole number from 0")
 SHOWN: Final = 0.25
 """Score of the runner-up, relative to that of the marks, above which it is shown."""
 
@@ -35,7 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="SRC", help="as in 'tactflow run', of the untouched gel")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the dots, and why they were found")
     add_overwrite(parser)
-    parser.add_argument("--frame", type=_index, default=0, metavar="N", help="index of the frame, from 0")
     parser.add_argument(
         "--downsample", type=int, default=1, choices=(1, 2, 4, 8, 16), help="as in preprocess"
     )
@@ -53,7 +48,11 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.picture is not None:
         refuse_output("--picture", args.picture, overwrite=args.overwrite, suffixes=(".png", ".jpg"))
-    image = _frame(args.source, args.frame)
+    with closing(open_source(args.source)) as reader:
+        frame = reader.read()
+    if frame is None:
+        raise SourceError(f"{args.source}: has no frame")
+    image = frame[0]
     image = Preprocessor(image.shape[1::-1], downsample=args.downsample)(image)
     valid = valid_area(image)
     marks: Detection | None = None
@@ -65,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         rival, lines = error.best, [str(error), *_best(error.best)]
     except ValueError as error:
         raise ConfigError(f"--dot: {error}") from None
-    title = f"{public_address(args.source)}, frame {args.frame}: {image.shape[1]} x {image.shape[0]} px"
+    title = f"{public_address(args.source)}: {image.shape[1]} x {image.shape[0]} px"
     without = 0.0 if valid is None else float(np.mean(valid == 0))
     if without > 0:
         lines.append(f"dim: {100 * without:.0f} % of the picture shows no gel")
@@ -105,15 +104,3 @@ def _best(spots: Candidate | None, what: str = "best") -> Iterator[str]:
     if spots is not None:
         closed = f"{100 * spots.lattice:.0f} % of their parallelograms close"
         yield f"magenta: {what}, {spots}; {closed}; score {spots.score:.1f}"
-
-
-def _frame(source: str, index: int) -> NDArray[np.uint8]:
-    """One frame of a source."""
-    reader = open_source(source)
-    try:
-        frame = next(islice(iter(reader.read, None), index, None), None)
-    finally:
-        reader.close()
-    if frame is None:
-        raise SourceError(f"{source}: has no frame {index}, counted from 0")
-    return frame[0]
