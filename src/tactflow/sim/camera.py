@@ -1,7 +1,7 @@
 """The simulated camera: projection of the gel to the raw frame, noise and compression.
 
 The gel plane and the raw frame share one unit (raw pixels); without perspective and distortion they coincide.
-Everything is closed-form or solved to machine precision, so that truth can be mapped too.
+Everything is closed-form or solved to machine precision, so that the truth can be mapped, too.
 """
 
 from __future__ import annotations
@@ -31,22 +31,21 @@ _APERTURE_EDGE = 3.0
 """Width of the blurred edge of the aperture, px. Chosen by hand."""
 _NEWTON_STEPS = 12
 """Newton steps to invert the distortion, enough for machine precision."""
-_BANK_SPAN = 1 << 22
-_BANK_STEP = 2592173
-"""Number of offsets into the noise bank, and the step between consecutive frames, elements. An odd step near
-span / golden ratio visits all 2**22 offsets before repeating, and keeps any two of the first n at least span
-/ (2.7 n) apart."""
+_BANK_SPAN, _BANK_STEP = 1 << 22, 2592173
+"""Number of offsets into the noise bank, and the step between consecutive frames. An odd step near span /
+golden ratio visits all offsets before repeating, and keeps any two of the first n at least span / (2.7 n)
+apart."""
 
 
 @dataclass(frozen=True)
 class Camera:
     """Perspective followed by radial lens distortion, seen through a round aperture.
 
-    perspective : in [0, 0.4]; each lower corner of the gel moves inwards by this fraction of half the width
-        and the whole gel shrinks a little, so that it appears as the trapezoid of a tilted camera. 0: none.
-    distortion : in [-0.2, 0.4]; k of undistorted = distorted * (1 + k rho^2), rho = distance from the centre
-        in half diagonals. Positive is a barrel (wide lens), negative a pincushion. 0: none.
-    aperture_radius : radius of the round picture in a black frame, in half heights of the frame. 0: none.
+    perspective : 0 to 0.4; fraction of half the width by which the lower corners of the gel move inwards, so
+    that it appears as the trapezoid of a tilted camera; the whole gel shrinks a little. distortion : -0.2 to
+    0.4; k of undistorted = distorted * (1 + k rho^2), rho = distance from the centre in half diagonals;
+    positive is a barrel (wide lens). aperture_radius : radius of the round picture in a black frame, in half
+    heights of the frame. 0: none, each.
     """
 
     perspective: float = 0.0
@@ -138,9 +137,8 @@ def _noise_bank(seed: int, count: int) -> NDArray[np.int16]:
 def sensor_noise(seed: int, index: int, shape: tuple[int, int, int]) -> NDArray[np.int16]:
     """Standard normal noise of one frame as a read-only view, in units of 1 / `NOISE_UNIT`.
 
-    Drawing 1.4 million normals takes 12 ms; a window of a fixed bank takes no time. Each of 2**22 frames has
-    a unique offset, so the noise of a pixel is different in every frame; two frames share values only at
-    different positions.
+    It is a window of a fixed bank, since drawing 1.4 million normals takes 12 ms. Each of 2**22 frames has a
+    unique offset, so that frames share values only at different positions.
     """
     count = shape[0] * shape[1] * shape[2]
     start = (index * _BANK_STEP + seed * 7919) % _BANK_SPAN

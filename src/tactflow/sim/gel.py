@@ -1,14 +1,13 @@
 """The gel: contact region, surface and displacement under an indenter.
 
-What counts as contact is where the indenter lies below the surface of the untouched gel. It need not touch
-the gel there: a soft surface sinks. When a ball of radius R is pressed by d into a deep gel, that region has
-a radius of sqrt(2 R d), but the gel clings to the ball only up to sqrt(R d), where the surface has sunk by
-d / 2 (Hertz); a thin layer on a plate sinks only where it is touched, so that both are the same (Johnson,
-Contact Mechanics, 1985, ch. 4 and 5.8). A sensor's gel lies in between: here it sinks by s = SINK_IN d where
-it leaves the indenter, for every shape, and what lies deeper carries the force. There the surface is that of
-the indenter. Around it, the surface decays as s exp(RIM (reached / s - 1)), a closed form of the Gaussian
-pyramid of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L
-2022).
+Contact is where the indenter lies below the surface of the untouched gel. It need not touch the gel there,
+since a soft surface sinks: when a ball of radius R is pressed by d into a deep gel, that region has a radius
+of sqrt(2 R d), but the gel clings to the ball only up to sqrt(R d), where the surface has sunk by d / 2
+(Hertz); a thin layer on a plate sinks only where it is touched, so the two regions are the same (Johnson,
+Contact Mechanics, 1985, ch. 4 and 5.8). A sensor's gel is in between: here it sinks by s = SINK_IN d where it
+leaves the indenter, for every shape. Deeper parts have the surface of the indenter and carry the force.
+Around them, the surface decays as s exp(RIM (reached / s - 1)), a closed form of the Gaussian pyramid of
+Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022).
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ SINK_IN = 0.3
 """Depth of the surface where it leaves the indenter, relative to full depth. Chosen by hand, between a thin
 layer (0) and a deep gel (0.5)."""
 RIM = 0.6
-"""Slope of the surface just outside of where it leaves the indenter relative to just inside; less than 1 is a
-crease. Chosen by hand."""
+"""Slope of the surface just outside that border relative to just inside; below 1 there is a crease. Chosen by
+hand."""
 TOUCH_DEPTH = 0.25
 """Depth below which an indenter does not count as touching, px. Chosen by hand."""
 _MAX_STICK = 0.999
@@ -76,8 +75,7 @@ class Press:
 
     @property
     def radius(self) -> float:
-        """How far along x from the origin the gel clings to it, px: for a ball, the radius of the disc that
-        carries the force."""
+        """How far along x the gel clings to it, px: for a ball, the radius of the disc that carries force."""
         near, far = 0.0, self.shape.reach
         for _ in range(_BISECTIONS):
             middle = np.array([(near + far) / 2], np.float32)
@@ -107,8 +105,7 @@ def reached(press: Press, x: Array, y: Array) -> Array:
 
 
 def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_]:
-    """Whether an indenter lies below the untouched surface: bool of the shape of x and y (float32 gel
-    coordinates, px)."""
+    """Whether an indenter lies below the untouched surface at gel coordinates x, y (float32, px)."""
     mask = np.zeros(x.shape, dtype=np.bool_)
     for press in presses:
         if press.touching:

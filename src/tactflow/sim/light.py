@@ -1,11 +1,10 @@
 """Illumination: the untouched gel, and shading of its deformed surface.
 
 Three coloured lights at grazing angles make each colour channel respond to the slope of the surface in one
-direction: photometric stereo as in GelSight (Yuan, Dong and Adelson, "GelSight:
-High-Resolution Robot Tactile Sensors for Estimating Geometry and Force", Sensors 2017). With the elevation e
-of a light and the horizontal direction t towards it, the shading of a Lambertian surface with slope g = grad
-z is (1 - cot(e) g . t) / sqrt(1 + |g|^2), which is 1 at rest. Seen from the camera inside, an indentation is
-a hill.
+direction: photometric stereo as in GelSight (Yuan, Dong and Adelson, "GelSight: High-Resolution Robot Tactile
+Sensors for Estimating Geometry and Force", Sensors 2017). With the elevation e of a light and the horizontal
+direction t towards it, the shading of a Lambertian surface with slope g = grad z is (1 - cot(e) g . t) /
+sqrt(1 + |g|^2), which is 1 at rest. Seen from the camera inside, an indentation is a hill.
 """
 
 from __future__ import annotations
@@ -26,15 +25,13 @@ from tactflow.sim.shapes import Array
 class Light:
     """The illumination of a type of sensor.
 
-    azimuth : of the blue, green and red light, degrees, counter-clockwise on the screen.
-    level : grey level of the untouched gel at the centre, blue, green, red.
-    falloff : decrease of brightness with the distance from a light, 0 for uniform light.
-    slope_gain : cotangent of the lights' elevation, common or per light; higher values give stronger colours.
-    ambient : fraction of diffuse light, 0 to 1.
-    brightening : change of all channels in a contact of full depth, grey levels.
-    onset : depth range of this change beyond the contact's edge, relative to full depth.
-    halo : brightening just outside a contact of full depth, grey levels.
-    absorption : of a gel that is darker the deeper it is pressed, part of the light per raw px of depth.
+    azimuth : of the blue, green and red light, degrees, counter-clockwise on the screen. level : grey level
+    of the untouched gel at the centre, blue, green, red. falloff : decrease of brightness with the distance
+    from a light, 0 for uniform light. slope_gain : cotangent of the lights' elevation, common or per light.
+    ambient : fraction of diffuse light, 0 to 1. brightening : change of all channels in a contact of full
+    depth, grey levels. onset : depth range of this change beyond the contact's edge, relative to full depth.
+    halo : brightening just outside a contact of full depth, grey levels. absorption : part of the light per
+    raw px of depth, for gels that darken with it.
     """
 
     azimuth: tuple[float, float, float]

@@ -1,8 +1,8 @@
 """Markers on the gel: their layout, and drawing with exact sub-pixel centres.
 
 A marker is drawn by evaluating its blurred shape at each pixel's centre. Its edge is a logistic ramp of
-`EDGE` px standard deviation, similar to a Gaussian point spread function and smooth enough that sampling
-shifts the centroid by less than 1e-3 px.
+`EDGE` px standard deviation, similar to a Gaussian point spread function, and so smooth that sampling shifts
+the centroid by less than 1e-3 px.
 """
 
 from __future__ import annotations
@@ -19,18 +19,15 @@ EDGE = 0.8
 DARK_MARKER = 0.88
 """Fraction of light that a fresh dark marker absorbs. Chosen by hand."""
 FIXED_POINT = 64.0
-"""Fixed-point steps per grey level. Chosen by hand: much finer than the noise, and 255 levels fit into 16
-bits."""
+"""Fixed-point steps per grey level: much finer than the noise, and 255 levels fit into 16 bits."""
 
 
 @dataclass(frozen=True)
 class Layout:
     """The markers printed on the gel.
 
-    rest : (N, 2) float64, positions on the untouched gel, px. contrast : (N,) in [0, 1], 1 for a fresh
-    marker.
-    group : (N,) int; markers of the same group never overlap. radii : (N,), px. pitch, radius : px; `radius`
-    is the mean.
+    rest : (N, 2) float64, positions on the untouched gel, px. contrast : (N,), 0 to 1, 1 for a fresh marker.
+    group : (N,) int; markers of the same group never overlap. radii : (N,), px. pitch, radius : mean, px.
     """
 
     rest: NDArray[np.float64]
@@ -68,14 +65,10 @@ def _ramp(inside: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(ramp, np.float32)
 
 
-def coverage(
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    radius: float | NDArray[np.float32],
-    shape: str,
+def _coverage(
+    x: NDArray[np.float32], y: NDArray[np.float32], r: NDArray[np.float32], shape: str
 ) -> NDArray[np.float32]:
-    """Fraction of a pixel at offset (x, y), px, from a marker's centre that the marker covers."""
-    r = np.asarray(radius, np.float32)
+    """Fraction of a pixel at offset (x, y), px, from a marker's centre that a marker of radius r covers."""
     if shape == "square":
         return _ramp(r - np.abs(x)) * _ramp(r - np.abs(y))
     if shape == "doubled":
@@ -106,16 +99,14 @@ def draw(
 ) -> None:
     """Paint markers onto a padded canvas, in place.
 
-    canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`.
-    centers : (N, 2) positions without the padding, px. strength : (N,) opacity, 0 to 1.
-    radii : (N,), px. half : see `half_patch`.
-    bright : grey level of a bright marker, None for dark ones. deform : (N, 2, 2), Jacobian from the image to
+    canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`. centers : (N, 2) positions
+    without the padding, px. strength : (N,) opacity, 0 to 1. radii : (N,), px. half : see `half_patch`.
+    bright : grey level of bright markers; None for dark ones. deform : (N, 2, 2), Jacobian from the image to
     the gel; None for the identity.
     """
     padded_height, padded_width = canvas.shape[:2]
     anchor = np.rint(centers).astype(np.int64)
-    # A marker outside the frame may still reach in. Indices beyond the padding are clamped to its invisible
-    # edge.
+    # A marker outside the frame may reach in. Indices beyond the padding are clamped to its invisible edge.
     reachable = np.all(anchor > -half, axis=1)
     reachable &= (anchor[:, 0] < padded_width - half) & (anchor[:, 1] < padded_height - half)
     span = np.arange(-half, half + 1)
@@ -131,7 +122,7 @@ def draw(
             m = deform[chosen].astype(np.float32)[:, :, :, None, None]
             dx, dy = m[:, 0, 0] * dx + m[:, 0, 1] * dy, m[:, 1, 0] * dx + m[:, 1, 1] * dy
         radius = radii[chosen, None, None].astype(np.float32)
-        opaque = coverage(dx, dy, radius, shape) * strength[chosen].astype(np.float32)[:, None, None]
+        opaque = _coverage(dx, dy, radius, shape) * strength[chosen].astype(np.float32)[:, None, None]
         rows = anchor[chosen, 1, None] + half + span
         columns = anchor[chosen, 0, None] + half + span
         np.clip(rows, 0, padded_height - 1, out=rows)

@@ -27,10 +27,7 @@ _BRIGHT_MARKER = 225.0
 
 
 class Painter:
-    """Draws the camera's view of the gel.
-
-    layout : the markers as printed.
-    """
+    """Draws the camera's view of the gel. layout : the markers as printed."""
 
     def __init__(self, settings: Settings, camera: Camera, layout: markers.Layout) -> None:
         self._settings = settings
@@ -43,10 +40,9 @@ class Painter:
     def frame(
         self, index: int, pressed: Sequence[gel.Press], shown: NDArray[np.bool_] | None
     ) -> NDArray[np.uint8]:
-        """Render the raw frame, a new (600, 800, 3) uint8 BGR array.
+        """Render raw frame `index`, a new (600, 800, 3) uint8 BGR array.
 
-        index : of the frame. shown : (N,), false for invisible markers; None for a frame without markers,
-        dirt and noise.
+        shown : (N,), false for invisible markers; None for a frame without markers, dirt and noise.
         """
         settings = self._settings
         canvas = self._canvas(index, pressed, shown)
@@ -106,8 +102,7 @@ class Painter:
         return canvas
 
     def _gel_blocks(self, step: int) -> NDArray[np.float64]:
-        """Gel coordinates (600 // step, 800 // step, 2) of the centres of blocks of `step` x `step` raw
-        pixels."""
+        """(600 // step, 800 // step, 2): gel coordinates of the centres of blocks of step x step raw px."""
         width, height = SIZE
         across = np.arange(width // step) * step + (step - 1) / 2.0
         down = np.arange(height // step) * step + (step - 1) / 2.0
@@ -116,7 +111,7 @@ class Painter:
 
     @cached_property
     def _coarse(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Gel coordinates of the centres of blocks of `_STEP` x `_STEP` raw pixels."""
+        """Gel coordinates x and y of the centres of blocks of `_STEP` x `_STEP` raw pixels."""
         mapped = self._gel_blocks(_STEP).astype(np.float32)
         return np.ascontiguousarray(mapped[..., 0]), np.ascontiguousarray(mapped[..., 1])
 
@@ -213,36 +208,30 @@ class Painter:
 
     def _shade(self, padded: Canvas, press: gel.Press) -> None:
         """Shade the part of a padded canvas that a contact deforms, in place."""
-        if press.depth <= 0:
-            return
-        window = self._window(press)
+        window = self._window(press) if press.depth > 0 else None
         if window is None:
             return
         rows, columns = window
         x, y = self._coarse
         depth = gel.reached(press, x[window], y[window])
         sunk = gel.surface(press, depth)
+        fine = tuple(slice(_STEP * part.start, _STEP * part.stop) for part in (rows, columns))
         half = self._half
-        region = padded[
-            half + _STEP * rows.start : half + _STEP * rows.stop,
-            half + _STEP * columns.start : half + _STEP * columns.stop,
-        ]
+        region = padded[half:-half, half:-half][fine]
         full = (region.shape[1], region.shape[0])
-        fine = cv2.resize(light.shading(self._light, sunk, _STEP), full, interpolation=cv2.INTER_LINEAR)
-        lit = cv2.multiply(region, fine, dtype=cv2.CV_32F)
+        shading = cv2.resize(light.shading(self._light, sunk, _STEP), full, interpolation=cv2.INTER_LINEAR)
+        lit = cv2.multiply(region, shading, dtype=cv2.CV_32F)
         if self._light.brightening:
             added = light.brightness(self._light, press, depth)
             wide = cv2.resize(added, full, interpolation=cv2.INTER_LINEAR) * np.float32(FIXED_POINT)
             if self._settings.aperture:
-                wide *= self._aperture[
-                    _STEP * rows.start : _STEP * rows.stop, _STEP * columns.start : _STEP * columns.stop
-                ]
+                wide *= self._aperture[fine]
             lit = cv2.add(lit, cv2.merge([wide, wide, wide]))
         np.clip(lit, 0, 32000, out=lit)
         region[...] = np.rint(lit, out=lit)
 
     def _window(self, press: gel.Press) -> tuple[slice, slice] | None:
-        """Rows and columns of the coarse grid that a contact reaches, or None."""
+        """Rows and columns of the coarse grid that a contact deforms, or None."""
         reach = press.shape.reach
         turn = np.linspace(0, 2 * np.pi, 33)
         ring = np.stack([press.x + reach * np.cos(turn), press.y + reach * np.sin(turn)], axis=1)

@@ -47,10 +47,8 @@ def open_scene(spec: str) -> Scene:
 class Scene:
     """A simulated recording with random access to frames; the same spec gives bit-identical frames.
 
-    Attributes
-    ----------
-    name : of the scene. settings : its settings. size : (width, height), px. fps : frames per second. camera
-    : maps the gel to the raw frame. layout : the markers as printed.
+    name, settings : of the scene. size : (width, height), px. fps : frames per second.
+    camera : maps the gel to the raw frame. layout : the markers as printed.
     """
 
     fps = FPS
@@ -61,7 +59,6 @@ class Scene:
         self.settings = settings
         self.camera = Camera(settings.perspective, settings.distortion, settings.aperture)
         self.layout = markers.layout(settings, SIZE)
-        self._raw = PixelMapping.identity(SIZE)
         self._programme = programme
         self._shapes = tuple(make() for make in (programme.indenters if programme else ()))
         self._painter = Painter(settings, self.camera, self.layout)
@@ -92,10 +89,11 @@ class Scene:
         mapping : gives the truth in coordinates of the processed frame, with the contact evaluated at its
             pixel centres. None: raw coordinates.
         """
-        pixels = mapping.mapping if isinstance(mapping, Preprocessor) else mapping or self._raw
+        if isinstance(mapping, Preprocessor):
+            mapping = mapping.mapping
         presses, cycle = self._contact(index)
-        shown = ~self._hidden(cycle)
-        return Truth(presses, self.camera, pixels, self.layout.rest, shown)
+        pixels = mapping or PixelMapping.identity(SIZE)
+        return Truth(presses, self.camera, pixels, self.layout.rest, ~self._hidden(cycle))
 
     def _hidden(self, cycle: int) -> NDArray[np.bool_]:
         """(N,) bool: markers invisible during contact number `cycle` (-1: no contact)."""

@@ -15,13 +15,13 @@ from tactflow.sim.gel import MM, Press, displacement, force, in_contact, reached
 from tactflow.vision.geometry import PixelMapping
 
 FLOW_POINTS: Final = 1500
-"""Points around a contact at which the displacement is computed, with interpolation in between. With
-FLOW_FINE, the mean over a contact is accurate to 0.01 px (five scenes, against four times the points)."""
+"""Points around a contact between which the displacement is interpolated. With FLOW_FINE, the mean over a
+contact is accurate to 0.01 px (five scenes, against four times the points)."""
 FLOW_FINE: Final = 0.5
 """Spacing of the points tested for contact, processed px."""
 NO_DIRECTION: Final = 0.02
-"""Anisotropy (difference over sum of the principal second moments) below which a region has no direction.
-Chosen by hand: an axis ratio of 1.02."""
+"""Anisotropy (difference over sum of the principal second moments) below which a region has no direction:
+an axis ratio of 1.02. Chosen by hand."""
 
 
 class Truth:
