@@ -119,13 +119,6 @@ def test_a_gauge_with_one_axis_that_writes_zeros_for_the_others_gives_no_drag() 
     assert fit.entry.press == fit_force(watched, references).entry.press
 
 
-def test_a_contact_larger_than_all_of_the_fit_is_out_of_range() -> None:
-    model = fit_force(*sessions(range(3))).entry.model()
-    largest = dict(model.press.greatest)
-    assert model.force(Seen(largest, {})).in_range
-    assert not model.force(Seen({**largest, "volume": 1.2 * largest["volume"]}, {})).in_range
-
-
 CHANGES: dict[str, Callable[[Reference], dict[str, np.ndarray]]] = {
     r"time runs from 100 to .* --offset": lambda gauge: {"time": gauge.time + 100},
     "its sign is turned": lambda gauge: {"force": -gauge.force},

@@ -50,9 +50,3 @@ def test_mistakes_are_explained_and_nothing_is_written(
     assert terminal.out == ""
     assert sorted(Path().rglob("*")) == before
     assert Path("there.npy").read_bytes() == b"kept"
-
-
-def test_overwrite_replaces_a_file(terminal: Terminal) -> None:
-    assert terminal("sim", "idle?frames=3", "--out", "a.npy", "--quiet") == 0
-    assert terminal("sim", "idle?frames=2", "--out", "a.npy", "--quiet", "--overwrite") == 0
-    assert np.load("a.npy", mmap_mode="r").shape[0] == 2

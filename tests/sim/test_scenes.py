@@ -70,22 +70,9 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
         assert truth.depth > gel.TOUCH_DEPTH
 
 
-@pytest.mark.parametrize("name", [n for n in MOVING if n not in ("tap", "jumps")])
-def test_markers_move_smoothly_in_time(name: str) -> None:
-    scene = open_scene(name)
-    steps = [largest_step(scene, index) for index in range(28, 110)]
-    # Half a pitch is what nearest-neighbour matching can follow; taps, jumps and lost frames are faster.
-    assert 0 < max(steps) < 0.5 * scene.layout.pitch
-
-
 def positions(scene: Scene, index: int) -> NDArray[np.float64]:
     """Where the markers are on the gel, px: faster than the whole truth."""
     return scene.layout.rest + gel.displacement(scene.presses(index), scene.layout.rest)
-
-
-def largest_step(scene: Scene, index: int) -> float:
-    """How far the fastest marker moves from frame index - 1 to frame index, px."""
-    return float(np.hypot(*(positions(scene, index) - positions(scene, index - 1)).T).max())
 
 
 def test_a_long_recording_rests_for_two_seconds_and_stays_on_the_gel() -> None:
