@@ -54,23 +54,20 @@ class Tracker(Stage):
         Marks are looked for inside of `valid`. One that the reference did not show joins behind the others.
         """
         if self._tracker is None:
-            self._references.append(image)
-            self._tracker = self._first_tracker(image, valid)
+            self._valid = valid
+            self._detection = detect_markers(
+                image, dot_radius=self.params.dot, polarity=self.params.polarity, valid=valid
+            )
+            self._references = [image]
+            self._tracker = self._tracker_of(self._detection)
         elif frame.reference:
             self._references.append(image)
         elif len(self._references) > 1 and self._detection is not None:
-            # All reference frames are in: their mean has less noise than the first of them.
-            self._tracker = self._tracker_of(self._references, self._detection)
+            # All reference frames have arrived: their mean has less noise than the first of them.
+            self._tracker = self._tracker_of(self._detection)
             self._references = self._references[:1]
         return self._tracker.track(image)
 
-    def _first_tracker(self, image: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> MarkerTracker:
-        self._valid = valid
-        self._detection = detect_markers(
-            image, dot_radius=self.params.dot, polarity=self.params.polarity, valid=valid
-        )
-        return self._tracker_of([image], self._detection)
-
-    def _tracker_of(self, references: list[NDArray[np.uint8]], detection: Detection) -> MarkerTracker:
+    def _tracker_of(self, detection: Detection) -> MarkerTracker:
         farthest = self.params.max_displacement
-        return MarkerTracker(references, detection, max_displacement=farthest, valid=self._valid)
+        return MarkerTracker(self._references, detection, max_displacement=farthest, valid=self._valid)

@@ -37,9 +37,6 @@ class Visualize(Stage):
         deepest: float = Field(1.0, gt=0, le=100, description="view depth: height of the lightest colour, mm")
         field: bool = Field(False, description="whether the displacement between the markers is drawn")
         text: bool = Field(True, description="whether numbers are written")
-        dilate: float = Field(
-            8.0, ge=0, le=1000, description="view contact: how far outside the contact is shown, px"
-        )
 
         def needed_inputs(self) -> Mapping[str, str]:
             """Views of the surface show heights or normals."""
@@ -55,7 +52,6 @@ class Visualize(Stage):
             arrow_scale=params.arrow_scale,
             view=params.view,
             text=params.text,
-            dilate=params.dilate,
             deepest=params.deepest,
         )
 

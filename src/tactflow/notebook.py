@@ -63,7 +63,7 @@ def draw(result: Result, image: NDArray[np.uint8] | None = None, **options: Any)
     result : from `tactflow.stream(..., images=True)`.
     image : (H, W, 3) uint8 BGR to draw on; None: that of the result.
     options : of the stage `visualize`: `arrow_scale`, `view` ("frame", "contact", "depth" or
-        "normals"), `text`, `dilate`, `deepest`.
+        "normals"), `text`, `deepest`.
 
     Returns
     -------

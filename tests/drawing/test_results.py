@@ -97,7 +97,7 @@ def test_the_hull_is_green_and_the_axis_orange() -> None:
 
 
 def test_the_contact_view_is_black_outside_the_contact() -> None:
-    picture = Annotator(view="contact", text=False, dilate=4)(GRAY, **everything())
+    picture = Annotator(view="contact", text=False)(GRAY, **everything())
     assert not picture[:40].any()
     assert not picture[:, 250:].any()
     assert picture[120, 150].any()

@@ -41,7 +41,6 @@ def test_everything_but_the_image_may_be_absent() -> None:
     [
         {"arrow_scale": 10.0},
         {"view": "contact"},
-        {"view": "contact", "dilate": 0},
         {"text": False},
     ],
     ids=str,

@@ -51,6 +51,8 @@ _TEXT, _LINE_SPACING = 11, 14
 """Size of the text, and distance of its lines, px."""
 _BAR: Final = (70, 6)
 """Width and height of the bar that explains the colours of heights, px."""
+_MARGIN: Final = 8
+"""How far outside the contact the "contact" view reaches, px. Chosen by hand."""
 _BETWEEN: Final = 12.0
 """Minimum distance of the arrows of a field, px."""
 _STATUS_COLOURS: Final = (
@@ -83,7 +85,6 @@ class Annotator:
     view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black;
         "depth" the height map instead of the picture.
     text : whether numbers are written.
-    dilate : px, for the "contact" view: how far outside the contact the picture and its arrows reach.
     deepest : mm, for the "depth" view: height of the lightest colour.
 
     Arrows are yellow for tracked markers, white for inferred ones, dim gray for lost ones. The hull is green,
@@ -105,20 +106,17 @@ class Annotator:
         arrow_scale: float = 3.0,
         view: View = "frame",
         text: bool = True,
-        dilate: float = 8.0,
         deepest: float = 1.0,
     ) -> None:
         if view not in get_args(View):
             raise ValueError(f"required view to be one of {', '.join(get_args(View))}, got {view!r}")
-        if not (0 <= arrow_scale < math.inf and 0 <= dilate < math.inf and 0 < deepest < math.inf):
+        if not (0 <= arrow_scale < math.inf and 0 < deepest < math.inf):
             raise ValueError(
-                "required finite arrow_scale >= 0, dilate >= 0 px and deepest > 0 mm, "
-                f"got {arrow_scale}, {dilate} and {deepest}"
+                f"required finite arrow_scale >= 0 and deepest > 0 mm, got {arrow_scale} and {deepest}"
             )
         self._arrow_scale = arrow_scale
         self._view = view
         self._text = text
-        self._dilate = dilate
         self._deepest = deepest
         self._letters = Lettering()
 
@@ -200,14 +198,14 @@ class Annotator:
         self._letters.write(picture, f"{self._deepest:g} mm", place, WHITE, round(_TEXT * unit))
 
     def _shown(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-        """(H, W): the contact and what lies up to `dilate` around it."""
+        """(H, W): the contact and a margin around it."""
         if mask is None:
             return np.zeros(image.shape[:2], np.uint8)
         if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
             raise ValueError(
                 f"required a contact_mask of shape {image.shape[:2]} uint8, got {mask.shape} {mask.dtype}"
             )
-        side = 2 * round(self._dilate) + 1
+        side = 2 * _MARGIN + 1
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         return np.asarray(cv2.dilate(mask, disc), np.uint8)
 
