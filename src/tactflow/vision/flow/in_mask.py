@@ -8,15 +8,14 @@ from typing import Final
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Mask
-from tactflow.vision.flow.displacement_field import DisplacementField, GelMotion
+from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.geometry.similarity import as_complex, fit_similarity
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
 UNKNOWN: Final = 0.1
-"""Share of what the mean flow could be that markers may leave open. Simulated contacts within the grid of
-markers leave less than 0.04; those beyond the last markers leave more, and there the mean is wrong by
-pixels."""
+"""Largest unknown share of the variance of a mean flow. Simulated contacts within the grid of markers have
+less than 0.04; for those beyond the last markers, which have more, the mean is wrong by pixels."""
 _FLAT: Final = 1e-3
 """Spread of markers across a line over that along it, 1, up to which they do not span a plane. Chosen by
 hand."""
@@ -34,11 +33,10 @@ def flow_in_mask(markers: Markers, mask: Mask) -> Flow:
 
     Returns
     -------
-    Flow : its mean is that over all markers inside, tracked or inferred; if only one of them is tracked,
-        that of this one, since the others have their motion from markers outside. Rotation and divergence
-        are those of the similarity that takes the markers' origins to their positions, by least squares.
-        stderr is the scatter that it leaves unexplained over the square root of the number of *tracked*
-        markers; None with fewer than two of those.
+    Flow : its mean is that of all markers inside, tracked or inferred; if only one of them is tracked, its
+        displacement, since the others were inferred from markers outside. Rotation and divergence are those
+        of the similarity that takes the markers' origins to their positions, by least squares. stderr is its
+        residual scatter over the square root of the number of *tracked* markers; None with fewer than two.
 
     Raises
     ------
@@ -91,15 +89,15 @@ def flow_of_field(field: DisplacementField, markers: Markers, mask: Mask, *, coa
     field : of this frame.
     markers : as for `flow_in_mask`; they only give the flow's `count`.
     mask : (H, W) uint8, 255 inside the contact, else 0.
-    coarse : whether the mask only says roughly where the contact is, as one does that markers alone show. The
-        standard error of the mean then is how much the displacement differs within it.
+    coarse : whether the outline is only approximate, as that of a contact that markers alone show. The
+        standard error of the mean then is the RMS difference of the displacement within it.
 
     Returns
     -------
-    Flow : its mean is the integral of the field over the contact, by area of the gel at rest; so a marker
-        that enters makes no jump. None where no marker is inside, or where markers are too far away to tell.
-        Rotation, divergence and shear are those of the affine motion nearest to the field. stderr of the mean
-        includes that the outline may be wrong.
+    Flow : its mean is the integral of the field over the contact, by area of the gel at rest, so that it does
+        not jump when a marker enters. None where no marker is inside, or where the markers are too far away.
+        Rotation, divergence and shear are those of the affine motion nearest to the field. The standard error
+        of the mean includes that of the outline.
 
     Raises
     ------
@@ -122,15 +120,6 @@ def flow_of_field(field: DisplacementField, markers: Markers, mask: Mask, *, coa
     if motion is None or motion.unknown > UNKNOWN:
         return Flow(None, count)
     outline = (motion.spread, motion.spread) if coarse else motion.outline_stderr
-    return _flow_of_motion(motion, count, outline)
-
-
-def _inside(markers: Markers, mask: Mask) -> Flags:
-    """Which markers (N,) lie inside the mask; lost ones do not count."""
-    return np.asarray(inside_mask(markers.position, mask) & (markers.status != _LOST))
-
-
-def _flow_of_motion(motion: GelMotion, count: int, outline: tuple[float, float]) -> Flow:
     stderr = math.hypot(motion.stderr, outline[0]), math.hypot(motion.stderr, outline[1])
     gradient = motion.gradient
     if gradient is None:
@@ -149,6 +138,11 @@ def _flow_of_motion(motion: GelMotion, count: int, outline: tuple[float, float])
         2 * error,
         2 * error,
     )
+
+
+def _inside(markers: Markers, mask: Mask) -> Flags:
+    """Which markers (N,) lie inside the mask; lost ones do not count."""
+    return np.asarray(inside_mask(markers.position, mask) & (markers.status != _LOST))
 
 
 def _rotation(spread: float, turn: float) -> float:

@@ -12,36 +12,36 @@ from tactflow.vision.markers.lattice import LONGEST_LINK, neighbour_graph, pitch
 from tactflow.vision.types import Markers, MarkerStatus
 
 TOGETHER: Final = 3
-"""Neighbouring markers that must have moved: a single one may be mistaken for its neighbour."""
+"""Neighbouring markers that must have moved: a single one may have been confused with another."""
 TRIPLES: Final = 15
-"""Pairs among the neighbours of a marker, with which it makes three that move together, at most: of six."""
+"""Largest number of pairs among the neighbours of a marker, of which there are up to six."""
 STAY: Final = 0.6
 """Low hysteresis threshold, as a fraction of the threshold for motion. Chosen by hand."""
 ALONE: Final = 3.0
-"""Threshold for a contact that nothing else shows, times that for motion: such a region is coarse, and where
-the light answers at all it shows most contacts earlier. Chosen on the simulator's press, whose first frames
-had a region of ten times the area, and sts_640 and tactip_video, of which no contact is lost."""
+"""Threshold for a contact that the light does not show, over that for motion: its region is coarse, and where
+the light responds at all it shows most contacts earlier. Chosen on the simulator's press, whose first frames
+had a region of ten times the area, and on sts_640 and tactip_video, of which no contact is lost."""
 LASTING: Final = 4
-"""Frames of motion in a row that are averaged, at most: n of them have an error smaller by the root of n, so
-less motion is enough. Chosen on every second recording of franka_mini."""
+"""Largest number of consecutive frames of motion that are averaged: the error of a mean of n is smaller by
+the root of n, so that less motion is enough. Chosen on every second recording of franka_mini."""
 FADES: Final = 0.7
 """Motion relative to the frame before below which a contact is ending and is not averaged. Chosen by hand."""
 STILL: Final = 0.5
-"""Part of the threshold up to which a marker is at rest. Chosen by hand."""
+"""Fraction of the threshold up to which a marker is at rest. Chosen by hand."""
 FORGET: Final = 0.96
 """Decay of the strongest recent motion per frame: half in 17 frames, as for the light."""
 STRETCHED: Final = 0.7
-"""Part of the largest strain from which on the gel beside a marker is in contact: a contact drags along all
-gel around, but what it strains most is where it ends. Chosen on the simulator, mini_ball and gelslim_ball,
-where the region then overlaps the true one by 0.3 to 0.7 (IoU, medians), and less where a contact slides."""
+"""Fraction of the largest strain above which a marker is in contact: a contact drags all gel around it along,
+but strains it most at its border. Chosen on the simulator, mini_ball and gelslim_ball, where the region then
+overlaps the true one by 0.3 to 0.7 (IoU, medians), and less where a contact slides."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
 
 
 class Motion(NamedTuple):
-    """What the markers say of one frame.
+    """Motion of the markers in one frame.
 
     moving : whether neighbouring markers have moved in a way that no motion of the whole gel explains.
-    clearly : whether they have moved so far that it is a contact whatever else is seen.
+    clearly : whether they have moved so far that it is a contact, whatever the light shows.
     largest : the third largest of their motions, px; 0 with fewer than three tracked markers.
     left : (N,) float64, the motion of each tracked marker that no motion of the whole gel explains, px; 0 of
     others. bound : (N,) float64, threshold for motion, px.
@@ -56,7 +56,7 @@ class Motion(NamedTuple):
     def still(self) -> Flags:
         """Markers (N,) bool that are at rest: their motion is below half the threshold.
 
-        One whose standard error is unknown, as of those that are not tracked, does not rest.
+        A marker with an unknown standard error, such as one that is not tracked, is not at rest.
         """
         return np.asarray(self.left <= STILL * self.bound)
 
@@ -64,19 +64,19 @@ class Motion(NamedTuple):
 class MotionTest:
     """Tests whether markers have moved against each other, beyond their standard errors.
 
-    What the whole gel does, or the camera that looks at it, is no contact: both are stiff, so that it is a
-    shift and a turn. They are estimated by medians, which follow the majority of the markers, and taken out.
-    The rest of a tracked marker's motion is compared with its standard error, joined by `steadiness`. Markers
-    that are inferred or lost have no vote.
+    A motion of the whole gel, or of the camera, is not a contact: both are stiff, so that it is a shift and a
+    turn. These are estimated by medians, which follow the majority of the markers, and removed. The rest of a
+    tracked marker's motion is compared with its standard error, combined with `steadiness`. Markers that are
+    inferred or lost have no vote.
 
     Parameters
     ----------
     origin : (N, 2) float64, markers in the reference frame, px.
-    false_alarms : rate of frames of an untouched gel in which markers seem to move, in (0, 1). Errors of
-        neighbours are taken for independent.
+    false_alarms : rate of frames of an untouched gel in which markers seem to move, in (0, 1), if the errors
+        of neighbours are independent.
     steadiness : standard deviation of each coordinate of the markers of an untouched gel, px. Higher misses
         lighter contacts.
-    relaxation : part of the strongest recent motion that a gel may still show after it was released, [0, 1).
+    relaxation : fraction of the strongest recent motion that a gel may still show after its release, [0, 1).
 
     Raises
     ------
@@ -151,14 +151,14 @@ class MotionTest:
         self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
         alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
         self._largest = largest
-        # What is beyond the far bound is beyond the near one as well.
+        # Motion beyond the far threshold is beyond the near one as well.
         self._clearly = chain > alone * (STAY if self._clearly else 1.0)
         self._moving = self._clearly or chain > (STAY if self._moving else 1.0)
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
         return Motion(self._moving, self._clearly, largest, left, bound)
 
     def _unexplained(self, markers: Markers) -> Floats:
-        """(N,), `Motion.left`: what a shift and a turn by the medians leave."""
+        """(N,), `Motion.left`: the residual after a shift and a turn, estimated by medians."""
         seen = markers.status == _TRACKED
         if np.count_nonzero(seen) < TOGETHER:
             return np.zeros(self.count)

@@ -1,11 +1,11 @@
 """How the picture of a contact has moved: registration of the change of light, by Gauss-Newton.
 
-What an object does to the light of the gel moves with the object: its outline, its shading, its texture. The
-markers are left out, since they move with the gel.
+The outline, shading and texture of an object move with it. The markers are left out, since they move with the
+gel.
 
-The covariance of a motion is that of least squares with considered parameters: how the lamps differ from
-place to place is not estimated, but what it may do to the estimate counts. So the motion of a straight cable
-along itself, which only its shading could tell, stays as uncertain as it was beforehand.
+The covariance of a motion is that of least squares with considered parameters: the unevenness of the lamps is
+not estimated, but its possible effect on the estimate counts. So the motion of a straight cable along itself,
+which only its shading could show, stays as uncertain as the prior.
 
 References
 ----------
@@ -30,32 +30,32 @@ from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import cell_means
 
 CELL: Final = 4
-"""Processed px per side of a cell, over which the light is averaged."""
+"""Side of the cells over which the light is averaged, processed px."""
 MARGIN: Final = 2
-"""Cells around a contact that belong to its picture: the outline shows against the gel at rest."""
+"""Cells around a contact that belong to its picture, so that the outline stands out from the gel at rest."""
 MOST: Final = 500
-"""Cells of a template at most: neighbours share their errors, and more of them cost time alone."""
+"""Largest number of cells of a template: neighbours share their errors, so that more only cost time."""
 FEWEST: Final = 30
-"""Cells of a template at least."""
+"""Smallest number of cells of a template."""
 PATCHES: Final = 25
-"""Patches of a template, about: errors of neighbouring cells are alike, those of patches independent."""
+"""Approximate number of patches of a template, whose errors are independent; those of cells are not."""
 ROUNDING: Final = 1 / 6
 """Variance of the difference of two rounded grey levels."""
 SOBEL: Final = 3 / 16
 """Variance of a gradient over that of the light."""
 LAMPS: Final = 0.05
-"""Standard deviation of what the place on the gel, and turning, do to the light of a contact, relative: how
-much brighter it is at the RMS radius, and how much of one channel shows in another."""
+"""Relative standard deviation of the effect of place and turn on the light of a contact: by how much it is
+brighter at the RMS radius, and how much of one channel shows in another."""
 LEAST: Final = 1e-6
-"""Information on a motion, at least, so that it has an inverse."""
+"""Smallest information on a motion, so that it has an inverse."""
 STEPS: Final = 12
-"""Steps of Gauss-Newton at most."""
+"""Largest number of steps of Gauss-Newton."""
 CONVERGED: Final = 0.05
-"""Step after which it ends, cells: the next one is several times smaller."""
+"""Step at which the iteration ends, cells: the next one would be several times smaller."""
 SEEN: Final = 0.4
-"""Share of a template's cells that the picture must show."""
+"""Smallest share of a template's cells that the picture must show."""
 UNLIKE: Final = 0.6
-"""Residual relative to the contrast of the picture from which on a picture shows something else."""
+"""Residual, relative to the contrast of the picture, above which it shows something else."""
 
 
 def light_change(unmarked: ColorImage, untouched: ColorImage, markers: Mask | None) -> Floats32:
@@ -79,9 +79,9 @@ class Template(NamedTuple):
 
     center : (2,), mean of its cells. radius : RMS distance from it. moments : (2, 2), second moments of the
     cells. away : (N, 2) float32, from the centre. patches : (N,) int64, to which each cell belongs, in order.
-    light : (N, 3) float32, grey levels. by : (N, 3, 5) float32, what a small motion, and a gain, change the
-    difference by. power : (5, 5), sum of the products of `by`. lamps : (5, 5), covariance of the sum of `by`
-    times what the lamps may do. contrast : standard deviation of the light. noise : variance of the
+    light : (N, 3) float32, grey levels. by : (N, 3, 5) float32, derivatives of the difference by a small
+    motion and by a gain. power : (5, 5), sum of the products of `by`. lamps : (5, 5), covariance of the sum
+    of `by` times the effect of the lamps. contrast : standard deviation of the light. noise : variance of the
     difference of the light of two pictures.
     """
 
@@ -169,10 +169,10 @@ def template_of(change: Floats32, mask: Mask) -> Template | None:
 
 
 def _noise(light: Floats32) -> float:
-    """Variance of the difference of two pictures like this one (h, w, 3), by Immerkaer's differences, which a
-    smooth picture does not have: most of the gel is untouched."""
+    """Variance of the difference of two pictures like this one (h, w, 3), from Immerkaer's differences, which
+    are 0 for a smooth picture: most of the gel is untouched."""
     line = np.array([1.0, -2.0, 1.0])
-    # Every other one, for neighbours are alike.
+    # Neighbours are alike: every other one is enough.
     differences = np.abs(cv2.sepFilter2D(light, cv2.CV_32F, line, line)[1:-1:2, 1:-1:2])
     return max(2 * (MAD_TO_SIGMA * float(np.median(differences))) ** 2 / 36, ROUNDING)
 
@@ -183,7 +183,7 @@ def register(
     """The motion from a template to a picture; None where the picture does not show it.
 
     change : of `light_change`. start : (5,), first guess. expected, spread : (5,), mean and standard
-    deviation of what is known beforehand; it decides where the picture tells nothing.
+    deviation of the prior, which decides where the picture has no information.
     """
     motion, prior = start, np.diag(spread**-2.0)
     error, sums, turned = np.empty_like(template.light), np.empty(10), np.eye(5)
@@ -215,12 +215,12 @@ def register(
         motion = motion + step
         if np.abs(step[:4]).max() < CONVERGED:
             break
-    # Lamps that flicker change all of it alike.
+    # A flicker of the lamps changes all cells alike: it does not count.
     unlike = math.sqrt(max(power - float(np.square(sums[7:] / count).mean()), 0.0))
     residual = unlike / max(template.contrast * (1 + float(motion[4])), 1e-3)
     if residual > UNLIKE:
         return None
-    # Noise has gradients, too, which tell nothing; nor are those right of what differs.
+    # Gradients of noise carry no information, and those of what differs are wrong.
     gradients = 3 * count * SOBEL / variance * np.diag([1.0, 1.0, 1.0, 1.0, 0.0])
     values, axes = np.linalg.eigh(information - template.noise * gradients)
     known = (axes * np.maximum(values, LEAST)) @ axes.T
@@ -246,13 +246,13 @@ def compare_light(
     error: Floats32,
     sums: Floats,
 ) -> int:
-    """How the light of a picture differs from that of a template that has moved; returns how many cells are
-    seen, of which neither the border nor a marker hides a part.
+    """Difference of the light of a picture and a template that has moved; returns the number of visible
+    cells, which neither the border nor a marker cuts.
 
     change : (h, w, 4), of `light_change`. warp : (4,): scale times cosine and sine of the turn, and where the
     centre is, cells. gain : factor of the light. away, light, by, patches : of a template.
-    error : (N, 3), filled: picture less template, 0 where it is not seen. sums : (10,), filled: `by` times
-    the error; its square; the squares of its sums over patches; the error of each channel.
+    error : (N, 3), filled: picture less template, 0 where not visible. sums : (10,), filled: `by` times the
+    error; its square; the squares of its sums over patches; the error of each channel.
     """
     count, patch = 0, np.zeros(3)
     sums[:] = 0
