@@ -21,7 +21,7 @@ Flags = NDArray[np.bool_]
 MAD_TO_SIGMA: Final = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 SATURATED: Final = 250
-"""Grey levels from which on a camera is taken for saturated: it cannot become brighter. Chosen by hand."""
+"""Grey level from which a pixel counts as saturated. Chosen by hand."""
 
 
 def check_color_image(image: NDArray[Any]) -> None:

@@ -1,18 +1,17 @@
 """The force on the gel, linear in what is seen of the contact.
 
-An elastic gel answers to a press in one of two ways. A layer that is thin compared with the contact is a bed
+An elastic gel responds to a press in one of two ways. A layer that is thin compared with the contact is a bed
 of springs: the force is proportional to the volume that is indented in the contact (Winkler). In a deep one
 it is proportional to depth times width, for a ball (Hertz) as for a flat punch. A real gel lies between the
-two, and so do linear combinations of both. The area is there for objects that are softer than the gel, which
-spread instead of sinking in. Where heights are not known, the change of the light stands for them, that of
-the whole gel: an incompressible gel bulges where it is not pressed, under a soft object more visibly than it
-sinks in. Under a ball the integral of the slopes is proportional to Hertz's force; under an object softer
-than the gel there are few slopes, and the force goes with the area that has changed at all. The integral of
-the square root of the change lies between the two, and steep slopes, whose light saturates, do not outweigh
-all others.
+two, and so do linear combinations of both. The area is included for objects softer than the gel, which spread
+instead of sinking in. Where heights are not known, the change of the light of the whole gel replaces them: an
+incompressible gel bulges where it is not pressed, under a soft object more visibly than it sinks in. Under a
+ball the integral of the slopes is proportional to Hertz's force; under an object softer than the gel there
+are few slopes, and the force follows the changed area. The integral of the square root of the change lies
+between the two, and steep slopes, whose light saturates, do not outweigh all others.
 
-Sideways it is the same: a thin layer answers with the integral of the shear over the contact, a deep one with
-shear times width (Mindlin).
+Sideways it is the same: the force on a thin layer is the integral of the shear over the contact, that on a
+deep one shear times width (Mindlin).
 
 References
 ----------
@@ -36,23 +35,23 @@ from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
 
 BY_DEPTH: Final = ("volume", "depth_by_width", "area")
-"""What the force is linear in where heights are known: mm^3, mm^2, mm^2."""
+"""Features of the force where heights are known: mm^3, mm^2, mm^2."""
 BY_CHANGE: Final = ("root_change",)
 """The same without heights: mm^2."""
 BY_SHEAR: Final = ("shear_by_area", "shear_by_width")
-"""What the force sideways is linear in, along x and y: mm^3, mm^2."""
+"""Features of the force sideways, along x and y: mm^3, mm^2."""
 CELLS: Final = 80
 """Cells along the longer side of a picture, over which its light is averaged: smaller than most contacts, and
 large enough to average noise out. The errors on real grasps are the same with 40."""
 FAINT: Final = 0.02
-"""Relative change that noise and the fit of the lamps leave; below it, a change counts by less than its root.
-The errors on real grasps are the same from 0.01 to 0.02; those on another day grow from 0.04 on."""
+"""Relative change due to noise and the fit of the lamps; a smaller change counts less than its root. The
+errors on real grasps are the same from 0.01 to 0.02; those on another day grow from 0.04 on."""
 BEYOND: Final = 1.1
-"""How far beyond the largest contact of the fit a contact may be to count as in range, relative. By hand."""
+"""Largest feature of a contact in range, over the largest of the fit. Chosen by hand."""
 
 
 class Seen(NamedTuple):
-    """What is seen of a contact that tells of its force.
+    """Features of a contact that determine its force.
 
     press : name -> value, those of `BY_DEPTH` and `BY_CHANGE` that are known. drag : name -> (x, y), those of
     `BY_SHEAR`; empty where the flow is not known.

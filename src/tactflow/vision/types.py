@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
-FloatArray = NDArray[np.floating[Any]]
 
 Evidence = Literal["light", "dots", "both"]
 """What shows a contact: a change of the light, motion of the markers, or both."""

@@ -1,16 +1,16 @@
 """The slope of the gel's surface from its colour.
 
-A surface that tilts answers to each coloured light in proportion to the cosine between its normal and the
-light, so that for a matt surface the horizontal part of the normal is linear in the relative change of the
-three channels. Shadows, gloss and light from near make it a smooth function of the colour that differs from
-place to place: here a cubic polynomial in the colour, without a constant, so that no change is no slope,
-whose coefficients are quadratic polynomials of the place. Nothing of it is learned at run time.
+A matt surface reflects each coloured light in proportion to the cosine between its normal and the light, so
+that the horizontal part of the normal is linear in the relative change of the three channels. Shadows, gloss
+and near light make it a smooth function of the colour that varies with the place: here a cubic polynomial in
+the colour, without a constant, since no change is no slope, whose coefficients are quadratic polynomials of
+the place. Nothing is learned at run time.
 
-A cubic is arbitrary beyond what it was fitted to. Normals that are steeper than any part of the balls are
-therefore those of the matt surface: along the line from no change to the colour of the pixel, they grow in
-proportion from where they are as steep as the balls. Fitted to the middle of balls (0.35 of the radius), this
-takes the error of the normals outside of it from 9.7 to 7.9 degrees on mini_ball, and from 2.2 to 2.0, 17.9
-to 17.7 and 22.7 to 22.1 on the others.
+A cubic is arbitrary beyond the range of the fit. Normals steeper than any part of the balls are therefore
+those of a matt surface: along the line from no change to the colour of the pixel, they grow in proportion
+from where they are as steep as the balls. Fitted to the middle of balls (0.35 of the radius), this reduces
+the error of the normals outside of it from 9.7 to 7.9 degrees on mini_ball, and from 2.2 to 2.0, 17.9 to 17.7
+and 22.7 to 22.1 on the others.
 
 References
 ----------
@@ -31,12 +31,12 @@ from tactflow.vision.compiled import helper, kernel
 Bytes = NDArray[np.uint8]
 
 BAND: Final = 8
-"""Rows that are computed over the same columns. Chosen by hand: the columns of each row alone would take four
-times as long to find."""
+"""Rows that are computed over the same columns. Chosen by hand: to find the columns of each row would take
+four times as long."""
 STEEPEST: Final = 0.95
-"""Horizontal part of a unit normal at most: a slope of 3. What is steeper has no colour of its own."""
+"""Largest horizontal part of a unit normal: a slope of 3. Steeper slopes have no colour of their own."""
 HALVINGS: Final = 12
-"""Bisections until the place on a line of colours is known to 1 / 4096 of it."""
+"""Bisections that locate a point on a line of colours to 1 / 4096 of its length."""
 
 FACTORS: Final = np.array(
     (
@@ -44,7 +44,8 @@ FACTORS: Final = np.array(
         *((0, 3), (0, 4), (0, 5), (0, 6), (0, 7), (0, 8), (1, 6), (1, 7), (1, 8), (2, 8)),
     )
 )
-"""Which two terms of the colour give each one from the fourth on; the first three are the channels."""
+"""Pairs of terms of the colour whose product is the fourth term, the fifth, ...; the first three are the
+channels."""
 COLOUR_TERMS: Final = 19
 """Products of one to three of the three channels."""
 PLACE_TERMS: Final = 6

@@ -1,8 +1,8 @@
 """The height map of a pressed gel, from its colour.
 
-Only a window around the contact is looked at (`surroundings`), at half resolution: colours become slopes
-(`slopes`), slopes become heights (`poisson`). The window ends where the gel is found at rest, at height 0, or
-where the picture ends.
+Only a window around the contact is used (`surroundings`), at half resolution: colours become slopes
+(`slopes`), slopes become heights (`poisson`). The window ends where the gel is at rest, at height 0, or with
+the picture.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from tactflow.vision.geometry.downsample import cell_means
 from tactflow.vision.types import Depth, Scale
 
 DIM: Final = 20.0
-"""Grey levels that are added to the light at rest before a change is divided by it, so that the noise of a
-dark channel does not count as colour. Chosen by hand."""
+"""Grey levels added to the light at rest before a change is divided by it, so that the noise of a dark
+channel does not count as colour. Chosen by hand."""
 
 UNEXPLAINED: Final = 5.4
 """Relative error of depth and volume, over the share of the slopes (sum of squares) that no surface explains:
-slopes that gloss, shadows or new colours make wrong contradict each other. This and the two below maximise
-the likelihood of presses on five sensors and of 19 simulated scenes, each with the same weight. Chosen
-without the sensor that is judged, 78 % of the depths of real presses lie within one standard error and 94 %
-within two; of the volumes 65 and 92 %. The error of balls that a calibration has not seen does not count:
-with it, the likelihood of the presses of a left-out sensor is lower."""
+slopes made wrong by gloss, shadows or new colours contradict each other. This and the two below maximise the
+likelihood of presses on five sensors and of 19 simulated scenes, each with the same weight. When the judged
+sensor is left out, 78 % of the depths of real presses lie within one standard error and 94 % within two; of
+the volumes 65 and 92 %. The error of balls that were not used for the calibration is not included: with it,
+the likelihood of the presses of a left-out sensor is lower."""
 STEEP_ERROR: Final = 0.235
-"""The same where all of the slope is steep; it grows with the root of the steep part."""
+"""The same where all slopes are steep; it grows with the root of the steep share."""
 ROUNDED: Final = 0.014
 """The same of any contact: averaging rounds it off."""
 STEEP: Final = 0.95
-"""A slope is steep from this part of the steepest on that the ball has shown, by the horizontal part of the
+"""A slope is steep above this fraction of the steepest of the calibration, by the horizontal part of the
 normal."""
 
 
 class SurfaceErrors(NamedTuple):
-    """What a calibration says of its heights: the largest horizontal part of a normal that it was learned
-    from, None where not known, and by how much the depths of sensors of its kind differ, relative, if it is
-    of another one than this."""
+    """Errors of a calibration: the largest horizontal part of a normal that it was fitted to, None where not
+    known, and the relative difference of depths between sensors of its kind, if it was made with another
+    one."""
 
     steepest: float | None = None
     between: float = 0.0
@@ -147,7 +147,7 @@ class Surface:
     def _slopes(
         self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None
     ) -> tuple[Floats32, float, Window]:
-        """(2, h, w) float32, the part of all slope that is steeper than the ball has shown, the window."""
+        """(2, h, w) float32, the steep share of the slopes, the window."""
         at_rest = rest.around(image, mask)
         around = surroundings(mask, rest.window, at_rest.margin)
         window = around.window
@@ -211,7 +211,7 @@ def measured(low: Floats32, window: Window, mask: Bytes, scale: Scale, relative_
 
 
 def _steep_part(slope: Floats32, steepest: float | None) -> float:
-    """Part of all slope (2, h, w) that is steep, 0 to 1; 0 where it is not known what is."""
+    """Share of slopes (2, h, w) that are steep, 0 to 1; 0 where `steepest` is not known."""
     if steepest is None:
         return 0.0
     flat = STEEP * steepest

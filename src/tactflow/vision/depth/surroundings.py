@@ -12,17 +12,17 @@ from tactflow.vision.depth.slopes import BAND, Bytes
 from tactflow.vision.geometry.region import measure_region
 
 LEAST_MARGIN: Final = 12
-"""How far the gel may have sunk beyond the contact at least, pixels at half resolution; a calibration looks
-no farther. With 8, errors under `mixed` are two to seven times as large."""
+"""Smallest margin around the contact in which the gel may have sunk, pixels at half resolution; that of a
+calibration. With 8, errors under `mixed` are two to seven times as large."""
 CELL: Final = 8
-"""Side of the cells in which the distance at which the gel is at rest is looked for, px of the picture."""
+"""Side of the cells in which the gel at rest is searched for, px of the picture."""
 FADED: Final = 0.05
-"""Change of the light, over that at the rim of the contact and beyond what it is far away, at which the gel
-counts as at rest: what lies beyond adds a hundredth to the depth."""
+"""Change of the light at which the gel counts as at rest, over that at the rim of the contact, both less that
+far away: what lies beyond adds a hundredth to the depth."""
 
 
 class OpenSides(NamedTuple):
-    """Sides of a window beyond which the surface goes on; beyond the others it is at rest, at height 0."""
+    """Sides beyond which the surface of a window goes on; beyond the others it is at rest, at height 0."""
 
     left: bool = False
     right: bool = False
@@ -69,8 +69,8 @@ class Window(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """Where the gel may have sunk: a window, and what of it is near the contact, as `SlopeModel.slopes` takes
-    it. Elsewhere the gel is at rest."""
+    """Where the gel may have sunk: a window, and its part near the contact, in the form of
+    `SlopeModel.slopes`. Elsewhere the gel is at rest."""
 
     window: Window
     near: Bytes
@@ -103,10 +103,10 @@ class Resting(NamedTuple):
 
 
 def resting(change: Floats32, mask: Bytes) -> Resting:
-    """Find from where on the gel around a contact is at rest.
+    """Find the distance from a contact beyond which the gel is at rest.
 
-    The light changes ever less with the distance from the contact: of all rings around it the gel is at rest
-    from the first on in which the mean change has faded (`FADED`).
+    The change of the light decreases with the distance from the contact: the gel is at rest from the first
+    ring around it in which the mean change has faded (`FADED`).
 
     change : (h, w, 3) float32, relative change of the light in cells of `CELL` x `CELL` pixels. mask : (H, W)
     uint8, 255 in contact; not all 0.
@@ -130,7 +130,7 @@ def resting(change: Floats32, mask: Bytes) -> Resting:
 
 
 def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
-    """(bands, w): what of a window is near the contact, in bands of `BAND` rows; not 0 there."""
+    """(bands, w): the part of a window near the contact, in bands of `BAND` rows; not 0 there."""
     bands = -(-window.height // BAND)
     contact = np.zeros((bands * BAND, window.width), np.uint8)
     size = (window.width, window.height)

@@ -1,4 +1,4 @@
-"""Direction of a region: its principal axis, and whether it has one at all."""
+"""Direction of a region: its principal axis, if it has one."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ from tactflow.vision.arrays import Floats
 from tactflow.vision.geometry.region import Contours, Moments
 
 FALSE_DIRECTION: Final = 1e-3
-"""Share of directionless regions that may be given a direction by chance. Chosen by hand."""
+"""Rate at which regions without a direction get one by chance. Chosen by hand."""
 VERTICAL: Final = 6e-6
-"""Angle to the vertical, degrees, within which an axis has no slope. Derived: 1e-7 rad, where the sign of the
-slope is down to rounding."""
+"""Angle to the vertical, degrees, within which an axis has no slope. Derived: 1e-7 rad, where rounding
+decides the sign of the slope."""
 
 _GRID_NOISE: Final = 0.122
 """Variance of the anisotropy of a disc of radius R px on a pixel grid at random phase, along its stronger
 component, times R^3. Derived in `anisotropy_limit`."""
 _HARMONICS: Final = range(3, 10)
-"""Harmonics that measure how rough the outline is; 0 to 2 are size, place and elongation themselves.
-Where they end is chosen by hand."""
+"""Harmonics that measure the roughness of the outline; 0 to 2 are size, place and elongation. The end is
+chosen by hand."""
 _LINEAR_LIMIT: Final = 0.6
-"""Anisotropy (axis ratio 2) up to which it is proportional to the outline's second harmonic. Chosen by
-hand."""
+"""Anisotropy up to which it is proportional to the second harmonic: axis ratio 2. Chosen by hand."""
 _LEAST_VARIANCE: Final = 1e-12
-"""Variance, px^2, that stands for that across a line of pixels where it is divided by. Chosen by hand."""
+"""Smallest variance that is divided by, px^2: that across a line of pixels is 0."""
 _LEAST_RADIUS: Final = 1e-9
-"""Distance of an outline point from the centre, whitened, that is divided by. Chosen by hand."""
+"""Smallest distance of an outline point from the centre that is divided by, 1."""
 _MEDIAN_RATIO: Final = math.sqrt(1.25 + math.sqrt(1 + 840 / FALSE_DIRECTION)) - 5.5
-"""Power over the median power of seven others, 1, that one harmonic exceeds by chance in a share
-`FALSE_DIRECTION` of cases. Derived in `anisotropy_limit`: the t at which the product equals that share, for
-(t + 4) (t + 5) (t + 6) (t + 7) is a square of (t + 5.5)^2 - 1.25, less 1."""
+"""Power of a harmonic, over the median power of seven others, that chance exceeds at the rate
+`FALSE_DIRECTION`. Derived in `anisotropy_limit`: the t at which the product equals that rate, since
+(t + 4) (t + 5) (t + 6) (t + 7) is the square of (t + 5.5)^2 - 1.25, less 1."""
 
 
 def axis_direction(theta: float) -> tuple[float, float | None]:
@@ -57,23 +56,23 @@ def axis_direction(theta: float) -> tuple[float, float | None]:
 
 
 def anisotropy_limit(contours: Contours, moments: Moments, pixels: int, confidence: float) -> float:
-    """Anisotropy that a directionless region reaches by chance in a share `FALSE_DIRECTION` of cases.
+    """Anisotropy that a region without a direction exceeds by chance at the rate `FALSE_DIRECTION`.
 
-    contours, moments : of the region. pixels : how many it has. confidence : its anisotropy, 0 to 1.
+    contours, moments : of the region. pixels : their number. confidence : its anisotropy, 0 to 1.
 
-    Two causes are known, and the larger limit counts.
+    There are two causes, and the larger limit counts.
 
-    (1) The grid. For a disc of radius R whose centre lies anywhere in a pixel, the sum of x^2 - y^2 over its
-    pixels varies by R^5 / (2 pi^2) times the sum of cos^2(2 phi_k) / |k|^3 over the reciprocal lattice (the
-    argument by which Kendall, 1948, found the variance of the number of lattice points in an oval): 5.94 for
-    this component and 3.08 for 2 x y. Relative to R^2 / 2 and the area, the anisotropy has variance
-    0.122 / R^3, and its length exceeds t with a probability of at most exp(-t^2 / (2 * 0.122 / R^3)).
+    (1) The pixel grid. For a disc of radius R at random phase, the sum of x^2 - y^2 over its pixels has the
+    variance R^5 / (2 pi^2) times the sum of cos^2(2 phi_k) / |k|^3 over the reciprocal lattice, 5.94, and
+    that of 2 x y the same with 3.08 (the argument of Kendall, 1948, for the number of lattice points in an
+    oval). Relative to R^2 / 2 and the area, the anisotropy has variance 0.122 / R^3, and its length exceeds t
+    with a probability of at most exp(-t^2 / (2 * 0.122 / R^3)).
 
-    (2) The outline's roughness: its deviation from the ellipse of the region's second moments. For noise
+    (2) The roughness of the outline, relative to the ellipse of the region's second moments. For noise
     shorter than the outline, the harmonics 2, 3, 4, ... have equal, exponentially distributed power, and an
-    anisotropy c is 4 times the second harmonic. The median power of harmonics 3 to 9 estimates it: the
-    median, because a polygon has a few strong harmonics and is not rough. For n = 7 exponential variables,
-    the chance that an eighth exceeds t times their median is the product of j / (j + t) for j = 4 ... 7.
+    anisotropy c is 4 times the second harmonic. Their power is estimated by the median of harmonics 3 to 9,
+    because a polygon has a few strong harmonics and is not rough. The probability that an exponential
+    variable exceeds t times the median of seven others is the product of j / (j + t) for j = 4 ... 7.
     """
     radius = math.sqrt(pixels / math.pi)
     limit = math.sqrt(-2 * math.log(FALSE_DIRECTION) * _GRID_NOISE / radius**3)

@@ -15,10 +15,10 @@ from tactflow.vision.geometry.region import Contours, Region, measure_region
 from tactflow.vision.types import Contact, Ellipse, Evidence
 
 _FEWEST_PIXELS: Final = 5
-"""Pixels that a region needs for an ellipse. Derived: an ellipse has five parameters."""
+"""Smallest number of pixels with an ellipse. Derived: an ellipse has five parameters."""
 _WIDTH_OF_A_LINE: Final = 1 / 12 + 1e-9
-"""Variance across a region, px^2, up to which it has no ellipse. Derived: a straight line of pixels has up to
-1/12; the rest is for rounding."""
+"""Variance across a region, px^2, up to which it has no ellipse. Derived: that of a straight line of pixels
+is at most 1/12; the rest is for rounding."""
 
 
 def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float = 0.0) -> Contact | None:
@@ -30,18 +30,18 @@ def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float
     min_area : px^2; components (8-connected, holes filled) with fewer pixels are ignored. Larger is safer
         against specks and misses small contacts.
     min_confidence : 0 to 1; a region whose confidence is not above it gets no direction: 0.3 is an axis ratio
-        of 1.36. Light from one side lengthens a mask in a way that no statistics of its outline can tell from
-        shape. Higher withholds the direction of stubby shapes.
+    of
+        1.36. Light from one side lengthens a mask in a way that its outline cannot distinguish from shape.
+        Higher withholds the direction of stubby shapes.
 
     Returns
-    -------
-    Contact or None, where nothing is large enough. `area` counts the pixels whose centre lies in or on the
-        hull (Pick's theorem): for a convex region its number of pixels, without the bias of the half pixel
-        between the outermost centres and the true border. The direction and the ellipse are those of the
-        second central moments; the direction is None where the anisotropy is no larger than chance makes it
-        (see `tactflow.vision.geometry.direction`), the ellipse where the region is no wider than a pixel or
-        has fewer than five. `confidence` is (l1 - l2) / (l1 + l2) of the principal variances l1 >= l2: 0 for
-        a disc, 0.6 for an ellipse of axis ratio 2, 1 for a line.
+    ------- Contact or None, where nothing is large enough. `area` counts the pixels whose centre lies in or
+    on the hull
+        (Pick's theorem): for a convex region its number of pixels. The direction and the ellipse are those of
+        the second central moments; the direction is None where the anisotropy may be due to chance (see
+        `tactflow.vision.geometry.direction`), the ellipse where the region is no wider than a pixel or has
+        fewer than five. `confidence` is (l1 - l2) / (l1 + l2) of the principal variances l1 >= l2: 0 for a
+        disc, 0.6 for an ellipse of axis ratio 2, 1 for a line.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""The similarity (shift, turn and growth) that fits vectors at places in the plane best.
+"""The similarity (shift, turn and growth) that best fits vectors at places in the plane.
 
-Places and vectors are complex numbers, x + iy: a similarity then is a line.
+Places and vectors are complex numbers, x + iy, so that a similarity is a line.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from tactflow.vision.arrays import Floats
 
 Complexes = NDArray[np.complex128]
 _NO_SPREAD: Final = 1e-9
-"""Mean square of the ways from the middle that stands for 0 where it is divided by, in squared units."""
+"""Smallest mean square distance from the middle that is divided by, in squared units."""
 
 
 class Similarity(NamedTuple):

@@ -1,7 +1,7 @@
-"""Valid area: where a picture of the untouched gel shows gel at all.
+"""Valid area: where a picture of the untouched gel shows gel.
 
 Around the gel there may be a black housing, a vignette, a dark corner that the lens does not reach, or a lamp
-that saturates the camera. What changes there says nothing about the gel.
+that saturates the camera. A change there is not one of the gel.
 """
 
 from __future__ import annotations
@@ -20,35 +20,33 @@ BLACK: Final = 24
 """Grey levels below which a pixel is black: video has its black at 16 (ITU-R BT.601), and compression and
 noise add to it; the gel below the white pins of tactip_video is 17. Chosen by hand."""
 DARK: Final = 0.15
-"""Brightness of a dark place, relative to that of the brightest tenth of the picture, at most. Chosen on the
-development recordings: corners of a gel are above 0.2, housings that are seen below 0.12."""
+"""Largest brightness of a dark place, relative to that of the brightest tenth of the picture. Chosen on the
+development recordings: corners of a gel are above 0.2, visible housings below 0.12."""
 BRIGHTEST: Final = 90.0
-"""Percentile of the brightness that stands for the brightest part of the picture. Chosen by hand."""
+"""Percentile of the brightness that represents the brightest part of the picture. Chosen by hand."""
 COARSE: Final = 200
-"""Shorter side of the picture that is looked at, px, at least; larger ones are shrunk by a whole factor. By
+"""Smallest shorter side of the examined picture, px; larger ones are shrunk by a whole factor. Chosen by
 hand: 10 ms instead of 100 for each reference."""
 SMOOTHING: Final = 5
-"""Side of the square over which brightness is averaged, px of that picture: single pixels are noise. Chosen
-by hand."""
+"""Side of the square over which brightness is averaged, px of that picture. Chosen by hand."""
 LEAST_RADIUS: Final = 0.05
-"""Radius of the largest disc that fits into a place without gel, at least, over the shorter side of the
-picture. Smaller places are marks, or the gaps between bright ones. Chosen by hand: the largest marks of the
-development recordings have 0.04."""
-
+"""Smallest radius of a disc that fits into a place without gel, over the shorter side of the picture. Smaller
+places are marks, or the gaps between bright ones. Chosen by hand: the largest marks of the development
+recordings have 0.04."""
 MOST: Final = 0.5
-"""Part of the surroundings of a place that is not black, at least, for the light to say something there:
-marks cover less than half. Derived."""
+"""Smallest share of the surroundings of a place that is not black where the light counts. Derived: marks
+cover less than half."""
 
 
 def valid_area(image: NDArray[np.uint8]) -> Mask:
     """Where the picture of an untouched gel shows gel: neither black nor saturated over some width.
 
-    What lies beyond the picture's border counts as no gel, so that a dark strip along the border is found
-    however thin it is, while a mark that the border cuts stays gel. A picture that shows gel nowhere is valid
-    everywhere: then brightness does not tell.
+    Beyond the border of the picture there is no gel, so that a dark strip along the border is found however
+    thin it is, while a mark that the border cuts stays gel. Where brightness shows no gel at all, the whole
+    picture is valid.
 
     image : (H, W, 3) or (H, W) uint8, grey levels. Returns (H, W) uint8, 255 where there is gel, else 0.
-    Raises ValueError if it is not of that kind.
+    Raises ValueError for another array.
 
     >>> picture = np.full((60, 80, 3), 120, np.uint8)
     >>> bool(valid_area(picture).all())
@@ -76,8 +74,8 @@ def valid_area(image: NDArray[np.uint8]) -> Mask:
 def lit_area(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Where a gel without its marks has light that can change: most of the surroundings are not black.
 
-    On a black gel with white pins the light says nothing, although a pin that was not removed is bright. What
-    most of a place shows is the gel, for marks cover less than half of it.
+    On a black gel with white pins there is none, although a pin that was not removed is bright. Marks cover
+    less than half of a place.
 
     image : (H, W, 3) uint8, grey levels, without markers. Returns (H, W) bool.
 
@@ -111,7 +109,7 @@ def polygon_mask(polygon: Sequence[Sequence[float]], width: int, height: int) ->
 
 
 def bounding_box(valid: Mask) -> tuple[slice, slice]:
-    """Rows and columns of the smallest rectangle that holds all of an area, (H, W) uint8, which is not empty.
+    """Rows and columns of the bounding box of an area, (H, W) uint8, which is not empty.
 
     >>> bounding_box(polygon_mask([(1, 1), (3, 1), (3, 2), (1, 2)], width=5, height=4))
     (slice(1, 3, None), slice(1, 4, None))
@@ -121,13 +119,13 @@ def bounding_box(valid: Mask) -> tuple[slice, slice]:
 
 
 def _opened(region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    """Morphological opening of a region by a disc, the region going on for ever beyond the border.
+    """Morphological opening of a region by a disc; all beyond the border belongs to the region.
 
-    By two distance transforms, whose time does not depend on the radius.
+    Two distance transforms take the same time for any radius.
     """
     if not region.any():
         return region
-    # Beyond the border a disc fits everywhere; two radii of it are all that reaches into the picture.
+    # A margin of two radii is all that reaches into the picture.
     margin = int(np.ceil(2 * radius)) + 2
     wide = np.pad(region, margin, constant_values=True).astype(np.uint8)
     inside = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_5)

@@ -1,7 +1,7 @@
 """The rigid motion between two imprints of an object, by Gauss-Newton.
 
-Three things are compared, each weighted by its own variance: the normals, the mean height, and the gel under
-the contact, which sticks to the object. Normals alone do not see how a ball turns; the gel does.
+The normals, the mean height, and the gel under the contact, which sticks to the object, are compared, each
+weighted by its variance. Normals alone do not show how a ball turns; the gel does.
 
 References
 ----------
@@ -23,29 +23,29 @@ from tactflow.vision.pose.imprint import BLOCKS, PATCH, Imprint, Template
 from tactflow.vision.pose.rigid import rigid, vector
 
 STEPS: Final = 12
-"""Steps of Gauss-Newton at most."""
+"""Largest number of steps of Gauss-Newton."""
 CONVERGED: Final = 0.3
-"""Length of a step, in standard errors, that is the last one: it need not be tried."""
+"""Length of the last step, in standard errors: it need not be tested."""
 FREE: Final = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
-"""Standard deviation of a motion of which nothing is seen, mm and radians."""
+"""Prior standard deviation of a motion, mm and radians."""
 PRIOR: Final = np.column_stack([np.diag(1 / FREE), np.zeros(6)])
-"""(6, 7): rows of the system, see `_Comparison`, for what is known before anything is seen; errors are 0."""
+"""(6, 7): rows of the system, see `_Comparison`, for the prior; errors are 0."""
 NORMAL_NOISE: Final = 0.02
-"""Standard deviation of what is common to the normals of a patch, 1 degree: weighs the parts before residuals
-are known. Normals on other sensors of a kind err by 1 to 4 degrees, most of it alike in both imprints."""
+"""Standard deviation of the common error of the normals of a patch, 1 degree: weights the parts before
+residuals are known. Normals on other sensors of a kind err by 1 to 4 degrees, mostly alike in both
+imprints."""
 HEIGHT_NOISE: Final = 0.005
-"""Standard deviation of the change of mean height, mm, beside that from the scale of heights."""
+"""Standard deviation of the change of mean height, mm, in addition to that from the scale of heights."""
 FEWEST: Final = 12
-"""Points of the template that both imprints must show."""
+"""Smallest number of points of the template that both imprints show."""
 
 
 class Gel(NamedTuple):
-    """How the gel that is in contact in two frames has moved between them: the rigid motion in the plane that
-    fits it best.
+    """The best rigid motion in the plane of the gel that is in contact in two frames.
 
-    before, now : its middle, x + iy, mm. turn : radians. variance : of each coordinate of `now`, mm^2.
-    spread : mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance /
-    spread. overlap : share of the gel in contact now that was before.
+    before, now : its middle, x + iy, mm. turn : radians. variance : of each coordinate of `now`, mm^2. spread
+    : mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance / spread.
+    overlap : share of the gel in contact now that was in contact before.
     """
 
     before: complex
@@ -60,9 +60,8 @@ class Alignment(NamedTuple):
     """A motion from a template to an imprint.
 
     motion : (4, 4), about the template's centre, mm. covariance : (6, 6), see `rigid`. overlap : share of the
-    present contact that both show. misfit : sum of squares of the normals' differences, in units of their
-    expected variances. residual : RMS difference of a normal's component. signal : standard deviation of the
-    same over the template.
+    present contact that both show. misfit : sum of squares of the normals' differences, over their expected
+    variances. residual : RMS difference of a normal's component.
     """
 
     motion: Floats
@@ -70,16 +69,15 @@ class Alignment(NamedTuple):
     overlap: float
     misfit: float
     residual: float
-    signal: float
 
 
 class _Comparison(NamedTuple):
     """Imprints at one motion.
 
-    shown : how many points both show. error : (N, 2), of their normals. weight : (N,), how they count.
-    by_normals : (6, 6), the information of these. system : (7, 7), normal equations: the sum of the outer
-    products of rows of six derivatives and an error, over standard deviations. So it holds the information
-    (6, 6), the gradient (6,), and in the corner the sum of squares.
+    shown : number of points that both show. error, weight : (N, 2), (N,), of their normals. by_normals : (6,
+    6), their information. system : (7, 7), normal equations: the sum of the outer products of rows of six
+    derivatives and an error, over standard deviations. So it holds the information (6, 6), the gradient (6,),
+    and in the corner the sum of squares.
     """
 
     shown: int
@@ -88,32 +86,28 @@ class _Comparison(NamedTuple):
     by_normals: Floats
     system: Floats
 
-    @property
-    def information(self) -> Floats:
-        """(6, 6): of all parts."""
-        return self.system[:6, :6]
-
 
 def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> Alignment | None:
     """The motion from a template to an imprint; None where they do not overlap.
 
     start : (4, 4), a first guess, about the template's centre.
     """
-    # A matrix that is passed on from frame to frame would cease to be a rotation.
+    # Rounding errors of a matrix that is passed from frame to frame would add up.
     motion = rigid(vector(start))
     found = _compared(template, now, motion, gel)
     if found is None:
         return None
     scale = 1.0
     for _ in range(STEPS):
-        step = np.asarray(scale * np.linalg.solve(found.information, -found.system[:6, 6]), np.float64)
+        information = found.system[:6, :6]
+        step = np.asarray(scale * np.linalg.solve(information, -found.system[:6, 6]), np.float64)
         tried = motion @ rigid(step)
-        if step @ found.information @ step < CONVERGED**2:
+        if step @ information @ step < CONVERGED**2:
             motion = tried
             break
         better = _compared(template, now, tried, gel)
         if better is None or better.system[6, 6] > found.system[6, 6]:
-            # The step is too long for normals to change in proportion to it.
+            # The step is too long for a linear change of the normals.
             scale /= 2
         else:
             motion, found, scale = tried, better, 1.0
@@ -123,11 +117,10 @@ def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> A
     honest = _efficiency(found, template.blocks) * _without_noise(found.by_normals, noise, template)
     return Alignment(
         motion,
-        np.asarray(np.linalg.inv(found.information - found.by_normals + honest), np.float64),
+        np.asarray(np.linalg.inv(found.system[:6, :6] - found.by_normals + honest), np.float64),
         found.shown * template.every / now.area,
         misfit,
         math.sqrt(misfit / (2 * total)),
-        template.signal,
     )
 
 
@@ -232,7 +225,7 @@ def _interpolate(planes: Floats32, column: float, row: float, values: Floats) ->
 
 
 def _gel_rows(template: Template, now: Imprint, gel: Gel, motion: Floats) -> Floats:
-    """(3, 7): rows of the system for the gel, at the mean height of both contacts: how it strains from the
+    """(3, 7): rows of the system for the gel, at the mean height of both contacts, since its strain from the
     rim to the deepest point is not known."""
     turn = motion[:3, :3]
     x, y, z = np.array([gel.before.real, gel.before.imag, template.imprint.height]) - template.center
@@ -245,8 +238,8 @@ def _gel_rows(template: Template, now: Imprint, gel: Gel, motion: Floats) -> Flo
 
 
 def _efficiency(found: _Comparison, blocks: Indices) -> float:
-    """Information of the normals over what their weights say, at most 1, from how far the sums over patches
-    scatter."""
+    """Information of the normals over that by their weights, at most 1, from the scatter of sums over
+    patches."""
     weighted = found.weight[:, None] * found.error
     squares = sum(float((np.bincount(blocks, axis) ** 2).sum()) for axis in weighted.T)
     expected = 2 * float(found.weight.sum())
@@ -254,8 +247,8 @@ def _efficiency(found: _Comparison, blocks: Indices) -> float:
 
 
 def _without_noise(information: Floats, misfit: float, template: Template) -> Floats:
-    """Information (6, 6) less what the noise of the template's own gradients adds: where a surface is smooth,
-    noise alone would seem to hold it in place. Half of the misfit is the template's."""
+    """Information (6, 6) less that of the noise in the template's gradients, which would seem to hold a
+    smooth surface in place. Half of the misfit is the template's."""
     patch = PATCH * math.sqrt(float(np.prod(template.imprint.cell)))
     values, axes = np.linalg.eigh(information - misfit / (2 * patch**2) * template.levers)
     return np.asarray((axes * np.maximum(values, 0)) @ axes.T)

@@ -1,4 +1,4 @@
-"""What a frame shows of an object: normals and heights of the gel where it touches."""
+"""Imprint of an object: normals and heights of the gel in contact."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ STEP: Final = 3
 """Processed px per cell. With 2, edges are placed to 0.01 mm instead of 0.02, in half as much time again;
 with 4, they turn by 0.26 degrees in error instead of 0.19."""
 MARGIN: Final = 2
-"""Cells around a contact that gradients are computed from."""
+"""Cells around a contact that are needed for gradients."""
 MOST: Final = 300
-"""Cells of a template at most: neighbours share their errors, and more of them cost time alone."""
+"""Largest number of cells of a template: neighbours share their errors, so that more only cost time."""
 LEAVES: Final = 0.3
-"""Part of the greatest depth at which a gel leaves the object, between a thin layer (0) and a half-space
-(0.5, Hertz). What is less deep does not count, and what is twice as deep counts in full: the gel around a
-ball that rolls moves as if the ball slid. With 0.2, such balls are off by 18 degrees instead of 2."""
+"""Fraction of the greatest depth at which a gel leaves the object, between a thin layer (0) and a half-space
+(0.5, Hertz). Shallower gel does not count, and gel twice as deep counts in full: the gel around a rolling
+ball moves as if the ball slid. With 0.2, the error for such balls is 18 degrees instead of 2."""
 RIM: Final = 2.0
-"""Width of the rim of a contact, cells, in which cells count less; the first one, whose gradient has seen
-what is outside, does not count."""
+"""Width of the rim of a contact, cells, in which cells count less; the outermost, whose gradient includes
+cells outside, does not count."""
 BLOCKS: Final = 5
-"""Patches along each side of a contact within which the errors of normals are taken for common."""
+"""Patches along each side of a contact, within which the errors of normals are common."""
 PATCH: Final = 2.0
-"""Least side of such a patch, cells: the gradients of heights and normals are means over as much."""
+"""Smallest side of such a patch, cells: that over which the gradients of heights and normals are averaged."""
 
 
 class Imprint(NamedTuple):
@@ -95,10 +95,9 @@ class Template(NamedTuple):
 
     imprint : it. center : (3,), mean of its points. every : cells per point.
     points : (N, 6): where each is, x and y of its normal, its weight. blocks : (N,), the patch of each.
-    by : (N, 3, 6): by how much a small motion of the object changes what is seen of each point: x and y of
-        its normal, and the height.
+    by : (N, 3, 6): derivatives of x and y of each point's normal, and of its height, by a small motion.
     signal : standard deviation of x and y of the normals.
-    levers : (6, 6), mean square of how far a small motion moves the points along the gel.
+    levers : (6, 6), mean square displacement of the points along the gel by a small motion.
     """
 
     imprint: Imprint

@@ -16,25 +16,25 @@ from tactflow.vision.pose.rigid import adjoint, inverse, vector
 from tactflow.vision.types import Depth, Pose, Scale
 
 OVERLAP: Final = 0.7
-"""Share of the present contact, of object or gel, that the keyframe shows, below which it is replaced."""
+"""A keyframe that shows a smaller share of the present contact, of object or gel, is replaced."""
 LEAST: Final = 30
-"""Cells inside the rim from which on an object is tracked: a contact of 25 px."""
+"""Smallest number of cells inside the rim of a tracked object: a contact of 25 px."""
 TOLERATED: Final = 82.0
-"""Misfit that errors of the expected size stay below: the mean of chi squared with 44 degrees of freedom (25
-patches, two components, six unknowns) and four standard deviations."""
+"""Largest misfit due to errors of the expected size: the mean of chi squared with 44 degrees of freedom (25
+patches, two components, six unknowns) plus four standard deviations."""
 UNLIKE: Final = 0.6
-"""Residual of the normals, over their spread, from which on an imprint is of something else."""
+"""Residual of the normals, over their spread, above which an imprint is of another object."""
 DEPTH_ERROR: Final = 0.1
-"""Relative error of heights whose own is not known."""
+"""Relative error of heights with an unknown error."""
 BY_SLOPES: Final = np.array([0, 0, 1, 1, 1, 0])
-"""Parts of a small motion that are in error by as much as all slopes and heights are: height and tilts."""
+"""Parts of a small motion with the relative error of all slopes and heights: height and tilts."""
 _TO_DEGREES: Final = np.array([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
 """Degrees per radian of a small motion's last three parts."""
 
 
 class _Frame(NamedTuple):
-    """What a frame shows: the imprint; None or the field of the gel, the share (rows, columns) of it in
-    contact, and the standard error of its mean displacement, px."""
+    """A frame: the imprint; the field of the gel, its share (rows, columns) in contact, and the standard
+    error of its mean displacement, px, or None."""
 
     imprint: Imprint
     gel: tuple[DisplacementField, Floats, float] | None
@@ -59,11 +59,11 @@ class _Keyframe(NamedTuple):
 
 
 class PoseTracker:
-    """Tracks what touches a gel.
+    """Tracks an object on the gel.
 
     Each frame is aligned with a keyframe, at first that in which the contact began. As the contact moves on,
-    the keyframe is replaced, and the errors of both add up; within one they do not grow. Where the gel slides
-    or the normals contradict it, they alone count, until the next keyframe.
+    the keyframe is replaced, and the errors of both add up; within one they do not grow. Where the object
+    slides over the gel, or the normals contradict the gel, only the normals count, until the next keyframe.
 
     scale : mm per px.
 
@@ -88,7 +88,7 @@ class PoseTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing touches the gel: what comes is another object."""
+        """Nothing touches the gel: the next object is another one."""
         self._key: _Keyframe | None = None
         self._since, self._origin = 0, np.zeros(3)
         self._last = np.eye(4)
@@ -142,23 +142,23 @@ class PoseTracker:
         return _Frame(imprint, (field, field.share(mask), motion.stderr))
 
     def _aligned(self, key: _Keyframe, now: _Frame) -> tuple[Alignment | None, Gel | None]:
-        """The alignment, and the gel that it made use of."""
+        """The alignment, and the gel that it used."""
         gel = None if self._slid else self._same_gel(key.frame, now)
         found = self._matched(key, now, gel)
         if gel is not None and (found is None or found.misfit > TOLERATED):
             without = self._matched(key, now, None)
             if without is not None and without.misfit <= TOLERATED:
-                # The object moves otherwise than the gel below it.
+                # The object does not move with the gel below it.
                 self._slid = True
                 return without, None
         return found, gel
 
     def _matched(self, key: _Keyframe, now: _Frame, gel: Gel | None) -> Alignment | None:
-        """From where it was in the frame before; None if it does not fit."""
+        """The alignment, starting from the last motion; None if it does not fit."""
         start = self._last @ key.back
         start[:3, 3] -= key.center
         found = align(key.template, now.imprint, start, gel)
-        return found if found is not None and found.residual < UNLIKE * found.signal else None
+        return found if found is not None and found.residual < UNLIKE * key.template.signal else None
 
     def _keyframe(
         self, frame: _Frame, template: Template, motion: Floats, covariance: Floats, by_slopes: Floats
@@ -191,7 +191,7 @@ class PoseTracker:
         rest = field.grid.points[inside] - self._scale.origin
         old, new = (as_complex(self._mm * (rest + f.displacement[inside])) for f in (old_field, field))
         fit = fit_similarity(old, new, share)
-        # What no rigid motion explains; displacements a pitch apart are independent.
+        # The residual of the rigid motion; displacements a pitch apart are independent.
         square = float(share @ np.abs(new - fit.mean) ** 2)
         stretch = (fit.spread + square) / 2 - abs(fit.slope) * fit.spread
         variance = (old_stderr**2 + stderr**2) * float(self._mm.prod()) + stretch / max(total * CELL**2, 1.0)
@@ -199,7 +199,7 @@ class PoseTracker:
         return Gel(fit.middle, fit.mean, cmath.phase(fit.slope), variance, fit.spread, overlap)
 
     def _pose(self, status: Literal["tracked", "lost"], motion: Floats, covariance: Floats) -> Pose:
-        """For people: in the sensor's axes, in mm and degrees, with the error of the scale."""
+        """The pose in the sensor's axes, in mm and degrees, with the error of the scale."""
         axes = np.zeros((6, 6))
         axes[:3, :3] = axes[3:, 3:] = motion[:3, :3]
         stated = axes @ covariance @ axes.T
