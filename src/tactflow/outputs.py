@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedRandom
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -33,10 +33,6 @@ class OutputParams(StageParams):
         """Whether existing output is an error."""
         return not self.overwrite
 
-    def restarted(self) -> Self:
-        """The parameters after a restart in the same run: for a numbered output beside the one begun."""
-        return self.changed(path=str(next_name(expanded(self.path))), overwrite=False)
-
 
 class AppendParams(OutputParams):
     """Parameters of a sink that can also continue its output."""
@@ -53,10 +49,6 @@ class AppendParams(OutputParams):
     def refuses_existing(self) -> bool:
         """Whether existing output is an error."""
         return not (self.overwrite or self.append)
-
-    def restarted(self) -> Self:
-        """The parameters after a restart in the same run: for the same output, continued."""
-        return self.changed(overwrite=False, append=True)
 
 
 class OutputSink(Sink):
@@ -77,8 +69,11 @@ class OutputSink(Sink):
 
     @classmethod
     def on_restart(cls, params: Any) -> StageParams:
-        """See `OutputParams.restarted`."""
-        return cast(StageParams, params.restarted())
+        """Continue the output, or a numbered one beside it."""
+        if isinstance(params, AppendParams):
+            return params.changed(overwrite=False, append=True)
+        output: OutputParams = params
+        return output.changed(path=str(next_name(expanded(output.path))), overwrite=False)
 
 
 def cannot_write(path: Path | str, error: OSError, kept: str = "") -> StageError:

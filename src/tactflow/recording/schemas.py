@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 
 from tactflow.message.result import Result
 from tactflow.message.schema import message_schema, resolved
-from tactflow.recording.frames import timestamp
+from tactflow.recording.frames import RawFrame, timestamp
 from tactflow.vision.types import Markers, MarkerStatus
 
-RESULT_TYPE = "tactflow.frame"
 CORNER = 0.5
 """Foxglove's origin is the corner of the first pixel, tactflow's is its centre, px."""
 ARROW_SCALE = 3.0
@@ -52,21 +51,22 @@ class ChannelType(NamedTuple):
     packing: str
 
 
-def channel_type(message: type[Message]) -> ChannelType:
-    """The channel type for a protobuf class."""
-    schema = build_file_descriptor_set(message).SerializeToString()
-    return ChannelType(message.DESCRIPTOR.full_name, ("protobuf", schema), "protobuf")
-
-
 @functools.cache
 def channel_types() -> dict[str, ChannelType]:
-    """The channels `image`, `annotations` and `results`."""
-    results = json.dumps(plain_schema(message_schema())).encode()
+    """The channels of a recording."""
+    raw, results = _protobuf(RawFrame), json.dumps(plain_schema(message_schema())).encode()
     return {
-        "image": channel_type(CompressedImage),
-        "annotations": channel_type(ImageAnnotations),
-        "results": ChannelType(RESULT_TYPE, ("jsonschema", results), "json"),
+        "frames": raw,
+        "references": raw,
+        "image": _protobuf(CompressedImage),
+        "annotations": _protobuf(ImageAnnotations),
+        "results": ChannelType("tactflow.frame", ("jsonschema", results), "json"),
     }
+
+
+def _protobuf(message: type[Message]) -> ChannelType:
+    schema = build_file_descriptor_set(message).SerializeToString()
+    return ChannelType(message.DESCRIPTOR.full_name, ("protobuf", schema), "protobuf")
 
 
 def encode_picture(jpeg: bytes, sensor: str, nanoseconds: int) -> bytes:

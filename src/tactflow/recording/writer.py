@@ -13,8 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from tactflow.message.schema import message_schema
 from tactflow.outputs import cannot_write, open_output, refuse_interference
-from tactflow.recording.frames import RawFrame
-from tactflow.recording.schemas import channel_type, channel_types
+from tactflow.recording.schemas import channel_types
 
 MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".npz": "application/octet-stream"}
 NEVER = 1 << 62
@@ -69,9 +68,8 @@ class RecordingWriter:
 
     def _describe(self, sensor: str, facts: Mapping[str, str], files: Mapping[str, bytes]) -> None:
         writer = self._writer
-        raw = channel_type(RawFrame)
         self._channels: dict[str, int] = {}
-        for name, kind in {"frames": raw, "references": raw, **channel_types()}.items():
+        for name, kind in channel_types().items():
             schema = writer.register_schema(kind.name, *kind.schema)
             self._channels[name] = writer.register_channel(f"/{sensor}/{name}", kind.packing, schema)
         writer.add_metadata("tactflow", dict(facts))
