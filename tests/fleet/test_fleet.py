@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import zmq
@@ -33,15 +33,17 @@ sinks:
 """
 
 
-def run(*arguments: str, cwd: Path, command: str = "run") -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tactflow", command, *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+def start(folder: Path, *words: str, **options: Any) -> subprocess.Popen[str]:
+    """Start tactflow in a folder, with its errors in a pipe."""
+    options = {"stderr": subprocess.PIPE, "text": True} | options
+    return subprocess.Popen([sys.executable, "-m", "tactflow", *words], cwd=folder, **options)
+
+
+def run(folder: Path, *words: str, **options: Any) -> tuple[int, str]:
+    """Run tactflow in a folder; its exit code and errors."""
+    process = start(folder, *words, **options)
+    errors = process.communicate(timeout=PATIENCE)[1]
+    return process.returncode, errors
 
 
 def rows(path: Path) -> list[dict[str, object]]:
@@ -148,18 +150,9 @@ def test_all_sensors_publish_at_one_address(folder: Path, monkeypatch: pytest.Mo
         socket.rcvtimeo = round(PATIENCE * 1000)
         socket.subscribe("tactflow.")
         socket.connect(f"tcp://127.0.0.1:{port}")
-        process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "tactflow", "run", "--quiet"),
-                *(
-                    "--set",
-                    f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: {PATIENCE}}}",
-                ),
-                *("--set", "sinks.zmq.backlog=100", "--set", "sinks.zmq.linger=60"),
-            ],
-            cwd=folder,
-            stderr=subprocess.DEVNULL,
-        )
+        sink = f"sinks.zmq={{endpoint: 'tcp://127.0.0.1:{port}', wait_for_subscriber: {PATIENCE}}}"
+        more = ("--set", "sinks.zmq.backlog=100", "--set", "sinks.zmq.linger=60")
+        process = start(folder, "run", "--quiet", "--set", sink, *more, stderr=subprocess.DEVNULL)
         counts: Counter[bytes] = Counter()
         while sum(counts.values()) < 70:
             counts[socket.recv().partition(b" ")[0]] += 1
@@ -197,16 +190,16 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
     for name in ("a-left.mcap", "a-right.mcap"):
         (folder / name).write_bytes(b"old")
     options = ("--out", "a.mcap", "--overwrite", "--jsonl", "more.jsonl", "--quiet")
-    done = run(*options, cwd=folder, command="record")
-    assert done.returncode == 0, done.stderr
-    assert "left failed (exit code 4); starting again in 1 s" in done.stderr
-    assert "the cable is loose" in done.stderr
+    code, errors = run(folder, "record", *options)
+    assert code == 0, errors
+    assert "left failed (exit code 4); starting again in 1 s" in errors
+    assert "the cable is loose" in errors
     assert (folder / "attempts").read_text() == "xx"
     for file in ("out-left.jsonl", "more-left.jsonl"):
         assert [row["seq"] for row in rows(folder / file)] == [*range(10), *range(40)], "nothing is lost"
     for file in ("out-right.jsonl", "more-right.jsonl"):
         assert len(rows(folder / file)) == 30
-    assert done.stderr.count("right failed") == 0
+    assert errors.count("right failed") == 0
     recorded = {path.name: numbers(path) for path in folder.glob("*.mcap")}
     assert recorded == {
         "a-left.mcap": list(range(10)),
@@ -218,22 +211,17 @@ def test_a_sensor_that_fails_is_started_again_and_the_others_are_not_disturbed(f
 def test_a_file_that_may_not_be_touched_is_refused_for_good(folder: Path) -> None:
     old = folder / "out-left.jsonl"
     old.write_text("{}\n")
-    done = run("--quiet", cwd=folder)
-    assert done.returncode == 3
-    assert "this file exists" in done.stderr
-    assert "left failed (exit code 3); given up, as out-left.jsonl may not be replaced" in done.stderr
-    assert "starting again" not in done.stderr
+    code, errors = run(folder, "run", "--quiet")
+    assert code == 3
+    assert "this file exists" in errors
+    assert "left failed (exit code 3); given up, as out-left.jsonl may not be replaced" in errors
+    assert "starting again" not in errors
     assert old.read_text() == "{}\n"
     assert len(rows(folder / "out-right.jsonl")) == 30
 
 
 def test_the_run_goes_on_when_nobody_reads_its_lines_any_more(folder: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tactflow", "run", "--quiet", "--jsonl", "-"],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    process = start(folder, "run", "--quiet", "--jsonl", "-", stdout=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None
     # Before the first line, so that every sensor's lines find nobody.
@@ -242,7 +230,7 @@ def test_the_run_goes_on_when_nobody_reads_its_lines_any_more(folder: Path) -> N
         errors = stream.read()
     assert process.wait(PATIENCE) == 0
     # What is done to the frames is told as ever; nobody complains.
-    assert [line for line in errors.splitlines() if not line.endswith(b": stages.preprocess")] == []
+    assert [line for line in errors.splitlines() if not line.endswith(": stages.preprocess")] == []
     assert len(rows(folder / "out-left.jsonl")) == 40
     assert len(rows(folder / "out-right.jsonl")) == 30
 
@@ -252,18 +240,10 @@ def test_a_full_disk_behind_standard_output_ends_the_run_with_an_error(folder: P
     text = GRAPH.replace("frames=40", "frames=90000").replace("frames=30", "frames=90000")
     (folder / "pipeline.yaml").write_text(text)
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "tactflow", "run", "--quiet", "--jsonl", "-"],
-            cwd=folder,
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=PATIENCE,
-            check=False,
-        )
-    assert done.returncode == 3
+        code, errors = run(folder, "run", "--quiet", "--jsonl", "-", stdout=full)
+    assert code == 3
     # What is done to the frames may be told before the end.
-    complaints = [line for line in done.stderr.splitlines(True) if not line.endswith(": stages.preprocess\n")]
+    complaints = [line for line in errors.splitlines(True) if not line.endswith(": stages.preprocess\n")]
     assert "".join(complaints) == "tactflow: standard output: No space left on device; the run ends\n"
 
 
@@ -272,12 +252,7 @@ def test_one_signal_ends_all_sensors_well(folder: Path, number: int) -> None:
     (folder / "pipeline.yaml").write_text(
         GRAPH.replace("frames=40", "frames=90000").replace("frames=30", "frames=90000")
     )
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tactflow", "run", "--stats", "stats.json"],
-        cwd=folder,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(folder, "run", "--stats", "stats.json")
     files = [folder / "out-left.jsonl", folder / "out-right.jsonl"]
     until(lambda: process.poll() is not None or all(file.exists() and file.stat().st_size for file in files))
     assert process.poll() is None

