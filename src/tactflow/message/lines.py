@@ -40,8 +40,8 @@ class LineStream:
 
     path : a named pipe or device, whose reader the constructor waits for; "-" is standard output.
     control : the run, which is live or not, and may be stopped; or None.
-    delivered, dropped : number of lines. ended : whether there is no reader (any more). For standard output,
-    that is not an error.
+    delivered, dropped : number of lines. ended : whether the reader has left or never came; an error only
+    for a pipe that it has left.
 
     Raises
     ------
@@ -62,7 +62,7 @@ class LineStream:
         waits = False
         while not self.ended:
             try:
-                # Otherwise this could block for ever.
+                # Without O_NONBLOCK, this would block until a reader comes.
                 return os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
             except OSError as error:
                 if error.errno != errno.ENXIO:
@@ -96,7 +96,7 @@ class LineStream:
                 self._write(LOOK_EVERY)
 
     def _write(self, seconds: float) -> None:
-        """Write lines as long as the reader takes them; wait for it at most so long."""
+        """Write lines while the reader takes them; wait up to `seconds` for it."""
         try:
             while self._lines and not self.ended and self._is_ready(seconds):
                 line = self._lines[0]
@@ -114,7 +114,7 @@ class LineStream:
             raise cannot_write(self._name, error, kept) from error
 
     def _is_ready(self, seconds: float) -> bool:
-        # Windows can wait for sockets only: there, writing waits for the reader.
+        # Windows can only wait for sockets: there, the write itself waits for the reader.
         return sys.platform == "win32" or bool(select.select([], [self._descriptor], [], seconds)[1])
 
     def close(self) -> None:
