@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import tactflow
-from benchmarks.skipping import differing, numbers
+from benchmarks.skipping import differing
 from tactflow import Result
 
 FRAMES = 60
@@ -146,17 +146,3 @@ def test_most_of_a_rest_is_left_out_and_every_frame_says_so(pipeline: str, name:
     results = assert_law(pipeline, frames)
     assert sum("at_rest" in result.skipped.values() for result in results) >= 0.85 * 35
     assert all(result.contact is None for result in results)
-
-
-def test_a_sink_that_looks_at_everything_changes_nothing(tmp_path: Path) -> None:
-    recording = tmp_path / "scene.npy"
-    np.save(recording, scene("press"))
-    video = {"sinks.video": {"path": str(tmp_path / "seen.avi")}}
-    settings = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1}
-    alone = list(tactflow.stream("default", source=str(recording), settings=settings))
-    more = settings | {"sinks": {}} | video
-    seen = list(tactflow.stream("default", source=str(recording), settings=more, sinks=True))
-    for one, other in zip(alone, seen, strict=True):
-        assert numbers(one).keys() == numbers(other).keys()
-        for name, values in numbers(one).items():
-            np.testing.assert_array_equal(values, numbers(other)[name])

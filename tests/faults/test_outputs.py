@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import resource
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -92,31 +91,6 @@ def test_something_happens_to_an_output_in_mid_run(
         else:
             left = check_promise(kind, output, seen)
     Seen(seen.exit, seen.said, left).must_be(code, said, kept)
-
-
-@pytest.mark.parametrize(
-    ("kind", "said", "kept"),
-    [
-        ("jsonl", "File too large", "[1-9].* lines"),
-        ("images", "File too large", "[1-9].* pictures"),
-        ("video .avi", "it ends before its 120 frames", "can be played"),
-        ("video .mkv", "it ends before its 120 frames", "can be played"),
-        ("video .mp4", "it cannot be played", "no frame"),
-        ("record", "File too large", "[1-9].* frames can be played"),
-    ],
-)
-def test_the_system_limits_the_size_of_files(kind: str, said: str, kept: str, tmp_path: Path) -> None:
-    output = tmp_path / KINDS[kind].output
-    # Below what each of them writes in a run; the pictures are larger than that one by one.
-    limit = 10_000 if kind == "jsonl" else 50_000
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    set_limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit, before[1]))
-    source = str(array(tmp_path))
-    try:
-        _, seen = run(tmp_path, settings_of(kind, output), lambda _: set_limit(), source=source)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    Seen(seen.exit, seen.said, check_promise(kind, output, seen)).must_be(3, said, kept)
 
 
 @pytest.mark.parametrize("kind", ["jsonl", "images", "video .avi", "record", "parquet"])

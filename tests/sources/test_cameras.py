@@ -66,23 +66,12 @@ def test_the_command_lists_cameras(dev: Path, capsys: pytest.CaptureFixture[str]
     assert re.findall(r"--source (\d+)", capsys.readouterr().out) == ["0", "1", "10"]
 
 
-@pytest.mark.parametrize(
-    ("system", "words"),
-    [
-        ("linux", ["no camera is plugged in", "dmesg"]),
-        ("darwin", ["--source 0"]),
-        ("win32", ["--source 0"]),
-    ],
-)
 def test_without_a_camera_the_command_says_what_to_try(
-    system: str,
-    words: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(command.sys, "platform", system)
-    assert command.run(argparse.Namespace(dev=tmp_path)) == 0
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert all(word in err for word in words)
+    for system, hint in (("linux", "no camera is plugged in"), ("darwin", "--source 0")):
+        monkeypatch.setattr(command.sys, "platform", system)
+        assert command.run(argparse.Namespace(dev=tmp_path)) == 0
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert hint in err

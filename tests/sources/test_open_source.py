@@ -8,7 +8,7 @@ import os
 import struct
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 
 from tactflow.cli.main import main
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import Frame
-from tactflow.message.result import Result
-from tactflow.sinks.record import Record
 from tactflow.sources import FrameReader, base, open_source
 
 Pixels = NDArray[np.uint8]
@@ -128,34 +125,23 @@ def test_16_bit_arrays_have_either_order_of_bytes_and_few_bits_are_pointed_out(
     np.testing.assert_array_equal([image for image, _ in found], FRAMES)
 
 
-def odd_sizes(folder: Path) -> Iterator[tuple[str, str]]:
-    """Recordings whose third picture is smaller than the first, or of one pixel, and the error."""
-    pytest.importorskip("rosbags", reason="the extra bags is not installed")
-    from tests.adapters.bags import TOPIC, write_bag
-    from tests.adapters.test_datasets import write_hdf5
-
-    images = [*FRAMES[:2], FRAMES[2, 4:]]
-    odd = "frame 2: this frame is 32 x 20 pixels, the ones before it are 32 x 24"
-    one = "frame 0: its pictures are 1 x 1; required 2 x 2 pixels or more"
-    sink = Record(Record.Params(path=f"{folder}/a.mcap", preview=0))
-    sink.open()
-    for index, image in enumerate(images):
-        sink.write(Result(Frame("main", index, index / 30, image, reference=not index)))
-    sink.close()
-    yield f"{folder}/a.mcap", f"a.mcap, {odd}"
-    yield f"{write_bag(folder / 'bag', images, 'mcap')}?topic={TOPIC}", f"bag, {TOPIC}, {odd}"
-    pixels = np.full((3, 1, 1, 3), 90, np.uint8)
-    np.save(folder / "a.npy", pixels)
-    yield f"{folder}/a.npy", f"a.npy, {one}"
-    yield f"{write_hdf5(folder / 'a.h5', frames=pixels)}?dataset=/gel/frames", f"a.h5, /gel/frames, {one}"
-
-
-def test_a_picture_of_a_wrong_size_ends_the_run_with_the_recording_and_the_frame(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        (
+            [(24, 32), (24, 32), (20, 32)],
+            "cal-2.png: this frame is 32 x 20 pixels, the ones before it are 32 x 24",
+        ),
+        ([(1, 1)], "cal-0.png: its pictures are 1 x 1; required 2 x 2 pixels or more"),
+    ],
+)
+def test_a_picture_of_a_wrong_size_ends_the_run_and_is_named(
+    shapes: list[tuple[int, int]], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for spec, said in odd_sizes(tmp_path):
-        assert main(["run", "markerless", "--source", spec, "--set", "sinks={}"]) == 4
-        assert said in capsys.readouterr().err
+    for index, shape in enumerate(shapes):
+        (tmp_path / f"cal-{index}.png").write_bytes(encoded(np.full((*shape, 3), 90, np.uint8)))
+    assert main(["run", "markerless", "--source", str(tmp_path), "--set", "sinks={}"]) == 4
+    assert message in capsys.readouterr().err
 
 
 def test_a_relative_path_is_looked_for_here_first_and_then_beside_the_pipeline(

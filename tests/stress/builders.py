@@ -41,65 +41,39 @@ class Gel:
     touched: Image
     origin: Points
     position: Points
-    contact: NDArray[np.bool_]
-
-    @property
-    def mask(self) -> Image:
-        """(H, W) uint8, 255 in contact."""
-        return self.contact.astype(np.uint8) * np.uint8(255)
+    mask: Image
+    """(H, W) uint8, 255 in contact."""
 
 
-@lru_cache(maxsize=32)
-def gel(shift: tuple[int, int] = (0, 0), *, dots: bool = True, noise: float = 1.0) -> Gel:
-    """The same gel, everywhere: `shift` moves the camera by whole pixels, and noise moves with the gel.
+@lru_cache
+def gel(*, dots: bool = True, noise: float = 1.0) -> Gel:
+    """A gel that brightens by 45 grey levels in all channels where it is touched, which every method sees.
 
-    The gel brightens by 45 grey levels in all channels where it is touched, which every method sees. Dots
-    move by up to 2.5 px, and less with the distance from the contact; `dots` = False leaves them out.
+    Dots move by up to 2.5 px, and less with the distance from the contact; `dots` = False leaves them out.
     """
-    margin = 40
     width, height = SIZE
-    x, y = np.meshgrid(
-        np.arange(-margin, width + margin, dtype=np.float64),
-        np.arange(-margin, height + margin, dtype=np.float64),
-    )
-    columns = np.arange(-margin + 4, width + margin, PITCH)
-    rows = np.arange(-margin + 7, height + margin, PITCH)
-    origin = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    dot_grid = np.meshgrid(np.arange(20, width, PITCH), np.arange(23, height, PITCH))
+    origin = np.stack(dot_grid, axis=-1).reshape(-1, 2).astype(np.float64)
     away = np.hypot(*(origin - CONTACT).T)
     position = origin + np.exp(-((away / 45) ** 2))[:, None] * [2.3, 1.1]
-    inside = elliptical(x, y)
-    rise = np.clip((1 - inside) * 8 + 0.5, 0, 1) * 45
-    shade = np.stack([110 + 0.10 * x, 120 + 0.08 * y, 115 - 0.05 * x + 0.05 * y], axis=-1)
-    random = np.random.default_rng(5)
-    grain = [random.normal(0, noise, shade.shape) for _ in range(2)]
-    pictures = []
-    for centers, light, rough in ((origin, 0.0, grain[0]), (position, rise, grain[1])):
-        coverage = np.zeros_like(x)
-        for dot_x, dot_y in centers if dots else ():
-            np.maximum(coverage, np.clip(RADIUS + 0.5 - np.hypot(x - dot_x, y - dot_y), 0, 1), out=coverage)
-        lit = shade + np.asarray(light)[..., None]
-        picture = lit * (1 - 0.85 * coverage[..., None]) + rough
-        pictures.append(np.clip(np.rint(picture), 0, 255).astype(np.uint8))
-    left, top = margin + shift[0], margin + shift[1]
-    view = slice(top, top + height), slice(left, left + width)
-    seen = ((origin >= shift) & (origin < np.array(SIZE) + shift)).all(axis=1)
-    for picture in pictures:
-        picture.flags.writeable = False
-    return Gel(
-        pictures[0][view],
-        pictures[1][view],
-        origin[seen] - shift,
-        position[seen] - shift,
-        np.ascontiguousarray(inside[view] < 1),
-    )
-
-
-def elliptical(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance from the contact's centre in units of its half axis in that direction."""
     turn = np.radians(TURN)
     along = (x - CONTACT[0]) * np.cos(turn) - (y - CONTACT[1]) * np.sin(turn)
     across = (x - CONTACT[0]) * np.sin(turn) + (y - CONTACT[1]) * np.cos(turn)
-    return np.hypot(along / AXES[0], across / AXES[1])
+    inside = np.hypot(along / AXES[0], across / AXES[1])
+    rise = np.clip((1 - inside) * 8 + 0.5, 0, 1) * 45
+    shade = np.stack([110 + 0.10 * x, 120 + 0.08 * y, 115 - 0.05 * x + 0.05 * y], axis=-1)
+    random = np.random.default_rng(5)
+    pictures = []
+    for centers, light in ((origin, np.zeros_like(rise)), (position, rise)):
+        coverage = np.zeros_like(x)
+        for dot_x, dot_y in centers if dots else ():
+            np.maximum(coverage, np.clip(RADIUS + 0.5 - np.hypot(x - dot_x, y - dot_y), 0, 1), out=coverage)
+        picture = (shade + light[..., None]) * (1 - 0.85 * coverage[..., None])
+        picture += random.normal(0, noise, picture.shape)
+        pictures.append(np.clip(np.rint(picture), 0, 255).astype(np.uint8))
+        pictures[-1].flags.writeable = False
+    return Gel(*pictures, origin, position, (inside < 1).astype(np.uint8) * np.uint8(255))
 
 
 # -- every method of every stage that looks at pictures ---------------------------------------------------
