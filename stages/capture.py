@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,11 +67,6 @@ class Capture(Source):
             description="reopen a camera or stream that is gone, frozen or black; if false, the end of a "
             "stream ends the run, and a camera that stops is an error",
         )
-        on_reconnect: Literal["keep", "retake"] = Field(
-            "keep",
-            description="after a reconnection, keep the reference, or retake it from the first frames, which "
-            "must show the untouched gel",
-        )
         no_frame_timeout: float | None = Field(
             30.0,
             ge=0,
@@ -120,7 +115,6 @@ class Capture(Source):
             params.source,
             params.reference if isinstance(params.reference, int) else 1,
             params.settle,
-            retakes=params.on_reconnect == "retake",
         )
 
     def open(self) -> None:
@@ -191,10 +185,7 @@ class Capture(Source):
             )
 
     def _unskipped(self, source: FrameReader) -> Iterator[Arrival]:
-        """The frames without the first ones of the source, and of each connection to it."""
-        connection, begins = 0, self.params.skip
+        """The frames without the first ones of the source."""
         while not self._stop.is_set() and (arrival := source.read_arrival()) is not None:
-            if arrival.connection != connection:
-                connection, begins = arrival.connection, arrival.seq + self.params.skip
-            if arrival.seq >= begins:
+            if arrival.seq >= self.params.skip:
                 yield arrival

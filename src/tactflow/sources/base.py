@@ -37,8 +37,7 @@ class Arrival(NamedTuple):
 
     image, t : as from `FrameReader.read`. seq, reference, epoch : as in `Frame`; for a live source, seq also
     counts frames that were never read. paced : False for a reference that is delivered ahead of its time.
-    connection : number of reconnections so far. captured : monotonic time (`time.perf_counter`) of its
-    arrival, s; 0 for a recording.
+    captured : monotonic time (`time.perf_counter`) of its arrival, s; 0 for a recording.
     """
 
     image: BgrImage
@@ -47,7 +46,6 @@ class Arrival(NamedTuple):
     reference: bool = False
     epoch: int = 0
     paced: bool = True
-    connection: int = 0
     captured: float = 0.0
 
 
@@ -85,8 +83,7 @@ class FrameReader:
         self.name = name
         self._picture = ""
         """Name of the next picture of `_frames` in messages; if empty, its index."""
-        self._items: Iterator[tuple[Any, ...]] = self._converted()
-        self._count = itertools.count()
+        self._arrivals: Iterator[Arrival] = self._converted()
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
         """Yield all pictures, as accepted by `to_bgr`, and their times, s."""
@@ -105,31 +102,27 @@ class FrameReader:
         SourceError
             If the next frame cannot be read.
         """
-        item = next(self._items, None)
-        return None if item is None else (item[0], item[1])
+        arrival = self.read_arrival()
+        return None if arrival is None else (arrival.image, arrival.t)
 
     def read_arrival(self) -> Arrival | None:
         """Like `read`, with the metadata for `capture`."""
-        item = next(self._items, None)
-        if item is None:
-            return None
-        image, t, *stamp = item
-        return Arrival(image, t, *(stamp or [next(self._count)]))
+        return next(self._arrivals, None)
 
     def peek(self) -> tuple[BgrImage, float] | None:
         """The next frame, without consuming it; None at the end. Raises as `read`."""
-        item = next(self._items, None)
-        if item is None:
+        arrival = self.read_arrival()
+        if arrival is None:
             return None
-        self._items = itertools.chain([item], self._items)
-        return item[0], item[1]
+        self._arrivals = itertools.chain([arrival], self._arrivals)
+        return arrival.image, arrival.t
 
     def stop(self) -> None:
         """End a read that waits for a live source. Thread-safe."""
 
     def close(self) -> None:
         """Release the file or device; `read` then returns None. Idempotent."""
-        self._items = iter(())
+        self._arrivals = iter(())
 
     def _read_first(self, empty: str = "there is no picture in it") -> None:
         """Read the first frame ahead to determine `size`. Raises SourceError if there is none."""
@@ -140,11 +133,11 @@ class FrameReader:
             self.close()
             raise
 
-    def _converted(self) -> Iterator[tuple[Any, ...]]:
-        """The items of `_frames`, with pictures in BGR and of one size."""
+    def _converted(self) -> Iterator[Arrival]:
+        """The frames of `_frames`, with pictures in BGR and of one size."""
         first = None
         try:
-            for index, (image, *rest) in enumerate(self._frames()):
+            for index, (image, t, *stamp) in enumerate(self._frames()):
                 place = self._picture or f"{self.name}, frame {index}"
                 bgr = to_bgr(image, place, note=first is None)
                 size = (bgr.shape[1], bgr.shape[0])
@@ -162,7 +155,7 @@ class FrameReader:
                         f"{first[0]} x {first[1]}; a source must keep its size. "
                         "Remove the odd frame, or run the two recordings one after the other"
                     )
-                yield bgr, *rest
+                yield Arrival(bgr, t, *(stamp or [index]))
         except SourceError:
             raise
         except self.parser_errors as error:

@@ -19,16 +19,15 @@ class References:
     """Chooses the reference frames, and reports if they are not the first ones.
 
     name : of the source, for messages. count : number of reference frames. settle : longest time until the
-    light is steady, s; 0 takes the first frames. retakes : whether a reconnection starts a new epoch.
+    light is steady, s; 0 takes the first frames.
 
     left_out : number of frames of a live source that were examined but not delivered.
     """
 
-    def __init__(self, name: str, count: int, settle: float, *, retakes: bool = False) -> None:
+    def __init__(self, name: str, count: int, settle: float) -> None:
         self._name = name
         self._count = count
         self._settle = settle
-        self._retakes = retakes
         self._requested = threading.Event()
         self._left = 0
         self._epoch = 0
@@ -48,18 +47,12 @@ class References:
 
         image : (H, W, 3) uint8 BGR, a reference that replaces the first frames; or None.
         """
-        first = None
-        if image is None:
-            first = self._begin_settling()
-            self._left = self._count if first is None else 0
+        first = Settling() if image is None and self._settle > 0 else None
+        self._left = self._count if image is None and first is None else 0
         held: list[Arrival] = []
-        connection, failure = 0, None
+        failure = None
         try:
             for arrival in arrivals:
-                if arrival.connection != connection and self._retakes:
-                    self.retake()
-                    first, held = self._begin_settling(), []
-                connection = arrival.connection
                 if image is not None:
                     yield self._shown_before(image, arrival)
                     image = None
@@ -89,10 +82,6 @@ class References:
             self._requested.clear()
             self._epoch += 1
         self._left = count
-
-    def _begin_settling(self) -> Settling | None:
-        """The test for the first frames; None if they are delivered immediately."""
-        return Settling() if self._settle > 0 else None
 
     def _goes_on(self, first: Settling, held: list[Arrival]) -> bool:
         """Examine the newest frame; returns whether more frames are needed."""

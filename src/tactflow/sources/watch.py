@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -91,6 +91,7 @@ class Watched(FrameReader):
         self, opener: Callable[[], FrameReader], watch: Watch, name: str, clock: Clock = SYSTEM
     ) -> None:
         super().__init__(name)
+        self._arrivals = iter(self._next_arrival, None)
         self._opener = opener
         self._watch = watch
         self._clock = clock
@@ -101,7 +102,7 @@ class Watched(FrameReader):
         self._ended = False
         self._failure: Exception | None = None
         self._newest: Arrival | None = None
-        self._seq, self._t, self._connection = -1, -math.inf, 0
+        self._seq, self._t = -1, -math.inf
         self._fault: _Fault | None = None
         self._arrived_at = self._good_at = self._lit_at = self._changed_at = clock.now()
         self._lit = False
@@ -121,7 +122,7 @@ class Watched(FrameReader):
         word = "reconnecting" if fault.attempts or fault.kind == "gone" else "waiting"
         return f"{word} since {fault.hour} ({fault.kind}{attempts})"
 
-    def read_arrival(self) -> Arrival | None:
+    def _next_arrival(self) -> Arrival | None:
         """Wait for a new frame, and return the newest; None at the end and after `stop`."""
         with self._changed:
             while not self._stopped.is_set():
@@ -148,10 +149,6 @@ class Watched(FrameReader):
         super().close()
         self.stop()
         self._reader.join(CLOSE_SECONDS)
-
-    def _frames(self) -> Iterator[tuple[BgrImage, float]]:
-        while (arrival := self.read_arrival()) is not None:
-            yield arrival.image, arrival.t
 
     # -- faults; callers hold the lock --------------------------------------------------------------------
 
@@ -242,7 +239,6 @@ class Watched(FrameReader):
         source = self._opener()
         with self._changed:
             if self._fault is not None:
-                self._connection += 1
                 self._fault.detail = "it was opened, but gave no good frame"
         return source
 
@@ -271,7 +267,7 @@ class Watched(FrameReader):
             self._good_at = now
             self._t = max(t, float(np.nextafter(self._t, np.inf)))
             self.missed += self._newest is not None
-            self._newest = Arrival(image, self._t, self._seq, connection=self._connection, captured=now)
+            self._newest = Arrival(image, self._t, self._seq, captured=now)
             self._changed.notify_all()
             return False
 
