@@ -1,4 +1,4 @@
-"""Judge the grip force on objects and days that the calibration has not seen.
+"""Measure the error of the grip force on objects and days unknown to the calibration.
 
     python benchmarks/force.py [--data ../shared/data] [--keep FOLDER]
 
@@ -35,7 +35,7 @@ SESSIONS = ("wedge_grip", "wedge_grasp")
 WIDTH = 18.6
 """Of the gel, mm. It only gives the stiffnesses their unit."""
 TOUCHING = 0.75
-"""Force, N, from which on a contact should be found."""
+"""Minimum force at which a contact should be found, N."""
 RIDGE = 1.0
 """Weight of the squared coefficients of features between 0 and 1."""
 
@@ -93,7 +93,7 @@ def watch(path: Path) -> Watched:
 
 
 def read(data: Path, keep: Path | None) -> list[Grasp]:
-    """All recordings that have a force. keep : folder for what was seen of them, or None."""
+    """All recordings with a force. keep : folder in which their features are cached, or None."""
     grasps: dict[str, Grasp] = {}
     for day in SESSIONS:
         for path in sorted((data / day).glob("*.avi")):

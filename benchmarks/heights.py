@@ -1,4 +1,4 @@
-"""Draw the heights of ten real objects on four Minis, with those of the pixel network of gs_sdk beside them.
+"""Draw the heights of ten real objects on four Minis, next to those of the pixel network of gs_sdk.
 
     .venv-peers/bin/python -m benchmarks.heights --data ../shared/data [--out docs/accuracy/heights.jpg]
 

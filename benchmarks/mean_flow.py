@@ -51,7 +51,7 @@ class Comparison(NamedTuple):
 
 
 def compare(result: Result, truth: Floats, contact: Floats) -> Comparison | None:
-    """A frame beside the truth; None where no mean flow is stated."""
+    """Compare a frame with the truth; None without a mean flow."""
     flow, mask = result.flow, result.contact_mask
     if mask is None or flow is None or flow.mean is None or flow.stderr is None:
         return None

@@ -41,7 +41,7 @@ from tactflow.vision.types import Pose, Scale
 
 Motion = NDArray[np.float64]
 SEEN = np.repeat([0.3, 5.0], 3)
-"""Stated errors, mm and degrees, above which a number counts as not seen."""
+"""Standard errors, mm and degrees, above which a number counts as unknown."""
 FRAMES = 300
 NOISE = 1.0
 """Camera noise that is added to a picture that was moved, grey levels."""
@@ -64,7 +64,7 @@ SCENARIOS = {
 
 @dataclass
 class Row:
-    """What a table's row is made of."""
+    """Values of a row of the table."""
 
     errors: list[Any] = field(default_factory=list)
     stated: list[Any] = field(default_factory=list)
@@ -240,7 +240,7 @@ def edges(session: Session, names: list[str], base: Calibration, data: Path) -> 
 
 
 def simulated_calibration(folder: Path) -> Path:
-    """The calibration file of the simulated sensor in a folder, made if it is not there."""
+    """The calibration file of the simulated sensor in a folder; created if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     calibration = folder / "calibration" / "main.yaml"
     if not calibration.exists():

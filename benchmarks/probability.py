@@ -27,7 +27,7 @@ from tactflow.vision.contact.certainty import contact_evidence
 from tactflow.vision.markers import NoMarkersError, detect_markers
 
 WITHIN: Final = 0.2
-"""Least part of a region that an outline covers if the region is of that contact. Chosen by hand."""
+"""Minimum fraction of a region that the outline of its contact covers. Chosen by hand."""
 RIDGE: Final = 0.5
 """Ridge penalty: without it, evidence that separates the places of few labs would get infinite weights."""
 STEPS: Final = (0, 0.25, 0.5, 0.8, 0.9, 0.95, 0.99, 1)

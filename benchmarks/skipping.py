@@ -144,7 +144,7 @@ class Tally:
 
 
 def plot(pairs: Pairs, path: Path) -> None:
-    """Draw the cost of each frame along a recording, beside what happens in it."""
+    """Plot the cost of each frame of a recording, and the events in it."""
     from matplotlib import pyplot
 
     pairs = [pair for pair in pairs if not pair[1].frame.reference]

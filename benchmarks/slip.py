@@ -3,14 +3,14 @@
     python -m benchmarks.slip                      # the simulator
     python -m benchmarks.slip --data RECORDINGS    # RECORDINGS/gels/franka_mini, with franka_slip.csv
 
-Simulated: frames in which slip is told, of those that slip and of all others, and which of these; RMS errors
-of translation and rotation since the touch; shares of errors within one and two stated ones. The scenes in
-which nothing slips have 12,000 frames. Frames in which the gel under an object is only just dragged along, or
-released, count for neither.
+Simulated: how often slip is reported in slipping and in other frames, and in which of the latter; RMS errors
+of translation and rotation since the touch; shares of errors within one and two standard errors. The scenes
+without slip have 12,000 frames. Frames in which the gel under an object is only dragged along, or released,
+are left out.
 
-Real: `franka_slip.csv` only says which recordings their authors called slip, and not wiggle. `slips.json`
-marks by eye the frames [from, to] in which the picture of the object visibly moves against the dots, in 25
-recordings of either class. Nothing is fitted to either, so that every object is left out.
+Real: `franka_slip.csv` contains the authors' labels of whole recordings, slip or wiggle. `slips.json` contains
+the frames [from, to] in which the picture of the object visibly moves against the dots, labelled by eye in 25
+recordings of each class. Nothing is fitted to either, so that every object is unknown.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from tactflow.vision.arrays import Floats
 from tactflow.vision.geometry import PixelMapping
 
 ROLLS = ("roll", "tumble")
-"""Scenes in which the contact moves on without sliding: what it moves is not compared."""
+"""Scenes in which the contact moves without sliding: its motion is not compared."""
 STILL = 0.1
-"""Motion over the gel in a frame, px, from which on a contact that is pressed or released is neither one that
-slips nor one that sticks: the simulated gel follows an object only once it is pressed."""
+"""Motion over the gel in a frame, px, above which a contact that is being pressed or released counts as neither
+slipping nor sticking: the simulated gel follows an object only once it is pressed."""
 LATE = 0.1
-"""How late slip may be told, and for how long after it ended, s."""
+"""How late slip may be reported, and for how long after it ended, s."""
 MARKS = Path(__file__).with_name("slips.json")
 
 
 class Row(NamedTuple):
-    """Of a scene: frames that slip, and those of them in which it is told; other frames, and the numbers of
-    those in which it is told; errors (n, 3) of translation, px, and rotation, degrees; stated ones."""
+    """Counts of a scene: slipping frames, and those in which slip is reported; other frames, and the indices of
+    those in which it is reported; errors (n, 3) of translation, px, and rotation, degrees; standard errors."""
 
     slipping: int
     found: int
@@ -56,8 +56,8 @@ class Row(NamedTuple):
 
 
 def over_gel(scene: Scene, seq: int, mapping: PixelMapping) -> Floats | None:
-    """(3,): where on the gel at rest the middle of the first indenter lies, px, and how it is turned there,
-    degrees; None without one."""
+    """Position of the first indenter's centre on the gel at rest, px, and its rotation there, degrees, (3,);
+    None without an indenter."""
     presses = scene.presses(seq)
     if not presses:
         return None
@@ -87,12 +87,12 @@ def simulated(name: str, frames: int) -> Row:
         moves = before is not None and true is not None and math.dist(true[:2], before[:2]) > STILL
         slipped = result.t if truth.slipping or (moves and name not in ROLLS) else slipped
         before = true
-        told = slip is not None and slip.slipping
+        reported = slip is not None and slip.slipping
         if truth.slipping:
-            slipping, found = slipping + 1, found + told
+            slipping, found = slipping + 1, found + reported
         elif result.t - slipped > LATE:
             others += 1
-            false += [result.seq] * told
+            false += [result.seq] * reported
         if true is None or slip is None or slip.translation is None or slip.translation_stderr is None:
             continue
         if slip.since == result.seq:
@@ -107,8 +107,8 @@ def simulated(name: str, frames: int) -> Row:
 
 
 def report_simulated(frames: int) -> None:
-    """Print a line for each scene, and the sums."""
-    print("| scene | told of those that slip | told of others | px | degrees | within one, two |")
+    """Print a line for each scene, and the totals."""
+    print("| scene | reported of slipping | reported of others | px | degrees | within one, two |")
     print("| --- | --- | --- | --- | --- | --- |")
     every = []
     for name, recipe in SCENES.items():
@@ -124,18 +124,20 @@ def report_simulated(frames: int) -> None:
         print(f"| {name} | {row.found} of {row.slipping} | {other} | {known or '| |'} |", flush=True)
     quiet = [row for row in every if not row.slipping]
     false, others = sum(len(row.false) for row in quiet), sum(row.others for row in quiet)
-    print(f"Scenes without slip: told in {false} of {others} frames.")
-    print(f"Scenes with slip, errors within one, two stated: {within(r for r in every if r.slipping)}")
+    print(f"Scenes without slip: reported in {false} of {others} frames.")
+    print(
+        f"Scenes with slip, errors within one, two standard errors: {within(r for r in every if r.slipping)}"
+    )
 
 
 def within(rows: Iterable[Row]) -> str:
-    """Shares of errors, of translation and rotation, within one and two stated ones."""
+    """Shares of errors of translation and rotation within one and two standard errors."""
     ratio = np.concatenate([np.abs(row.errors) / np.maximum(row.stated, 1e-9) for row in rows])
     return ", ".join(f"{100 * np.mean(ratio < bound):.0f} %" for bound in (1, 2))
 
 
-def told_frames(path: Path) -> tuple[list[int], float]:
-    """Frames of a recording in which an object is said to slip; frames a second."""
+def reported_frames(path: Path) -> tuple[list[int], float]:
+    """Frames of a recording in which slip is reported; frames per second."""
     settings: dict[str, Any] = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1}
     settings["stages.slip"] = {}
     results = [(r.seq, r.t, r.slip) for r in tactflow.stream(source=str(path), settings=settings)]
@@ -144,7 +146,7 @@ def told_frames(path: Path) -> tuple[list[int], float]:
 
 
 def report_real(data: Path) -> None:
-    """Print how many recordings of each class are told, per object, and what becomes of the marks."""
+    """Print in how many recordings of each class slip is reported, per object, and how labels are met."""
     with (data / "gels" / "franka_slip.csv").open() as file:
         classes = {row["recording"]: row["slipped"] == "1" for row in csv.DictReader(file)}
     marks: dict[str, list[list[int]]] = json.loads(MARKS.read_text())
@@ -152,7 +154,7 @@ def report_real(data: Path) -> None:
     onsets: list[float | None] = []
     quiet = false = 0
     for recording, slipped in classes.items():
-        frames, rate = told_frames(data / "gels" / "franka_mini" / f"{recording}.avi")
+        frames, rate = reported_frames(data / "gels" / "franka_mini" / f"{recording}.avi")
         objects[recording.split("-")[0]][slipped].append(bool(frames))
         if recording not in marks:
             continue
@@ -171,14 +173,14 @@ def report_real(data: Path) -> None:
     known = [onset for onset in onsets if onset is not None]
     near = sum(abs(onset) <= LATE for onset in known)
     print(
-        f"marks: {len(known)} of {len(onsets)} motions found, {near} within {LATE} s of their begin, "
-        f"median {np.median(known):+.2f} s; frames told outside of them: {false}; recordings without "
-        f"motion that are quiet: {quiet} of {sum(not spans for spans in marks.values())}"
+        f"marks: {len(known)} of {len(onsets)} motions found, {near} within {LATE} s of their start, "
+        f"median {np.median(known):+.2f} s; frames reported outside of them: {false}; recordings without "
+        f"motion and without a report: {quiet} of {sum(not spans for spans in marks.values())}"
     )
 
 
 def main() -> None:
-    """Judge the simulator, or the recordings of a folder."""
+    """Measure on the simulator, or on the recordings of a folder."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder of the recordings")
     parser.add_argument("--frames", type=int, default=270, help="of each simulated scene")

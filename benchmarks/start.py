@@ -1,4 +1,4 @@
-"""What `tactflow start` proposes for sensors that it has not seen, against the pipeline chosen by hand.
+"""Proposals of `tactflow start` for unknown sensors, compared with the pipeline chosen by hand.
 
     python benchmarks/start.py --data RECORDINGS
 
@@ -51,7 +51,7 @@ RECORDED = {
 }
 """Source -> the pipeline that a person who knows the sensor chooses."""
 JUDGED_SEED = 99
-"""Seed of the simulated frames that judge; proposals are made on the default one."""
+"""Seed of the simulated test frames; proposals are made with the default seed."""
 
 
 def main() -> int:

@@ -253,7 +253,7 @@ def _relief(rng: Generator, x: Plane, y: Plane, contact: NDArray[np.bool_], dept
 
 
 def _wrinkles(rng: Generator, contact: NDArray[np.bool_], x: Plane, y: Plane, depth: float) -> Plane:
-    """Waves of the skin beside a contact that drags it along."""
+    """Waves of the skin next to a contact that drags it along."""
     away = cv2.distanceTransform((~contact).astype(np.uint8), cv2.DIST_L2, 5) / np.float32(max(contact.shape))
     rows, columns = np.nonzero(contact)
     middle = x[0, int(columns.mean())], y[int(rows.mean()), 0]
@@ -544,7 +544,7 @@ def _dirt(rng: Generator, shape: tuple[int, ...], count: int) -> Plane:
 
 
 def _housing(rng: Generator, x: Plane, y: Plane) -> NDArray[np.bool_] | None:
-    """Where the gel is seen (H, W) if not everywhere: an ellipse or a trapezoid."""
+    """Mask (H, W) of the visible gel if it does not fill the picture: an ellipse or a trapezoid."""
     if rng.random() < 0.65:
         return None
     half_x, half_y = np.ptp(x) / 2 * rng.uniform(0.6, 1.0), np.ptp(y) / 2 * rng.uniform(0.6, 1.0)

@@ -1,4 +1,4 @@
-"""tactflow beside what users would take instead, from the package index, on the same frames.
+"""tactflow and its alternatives from the package index, on the same frames.
 
     make peers          # an environment with the peers, .venv-peers
     make peers-page     # measures, and writes docs/peers.md with its plots and docs/peers.json

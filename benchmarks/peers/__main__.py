@@ -39,7 +39,7 @@ ATTEMPTS: Final = {
     "opentouch-interface": "import opentouch_interface",
     "xensesdk": "from xensesdk import Sensor; Sensor.create(0)",
 }
-"""Package -> what is tried of it, in an environment of its own where there is one."""
+"""Package -> what is measured of it, in an environment of its own if there is one."""
 OWN: Final = Path(".venv-peers-others")
 
 

@@ -57,7 +57,7 @@ DEPTH: Final[Sequence[Column]] = (
 
 
 def write(numbers: Numbers, path: Path) -> None:
-    """The page, and the plot beside it."""
+    """Write the page, and the plot next to it."""
     plot(numbers, path.with_suffix(".jpg"))
     path.write_text(text(numbers, path.with_suffix(".jpg").name), encoding="utf-8")
 
@@ -88,7 +88,7 @@ class Page(Template):
 
 
 class Values(dict[str, str]):
-    """What stands in the page: tables, and every number by its path, "-" where there is none."""
+    """Values of the page: tables, and every number by its path; "-" if there is none."""
 
     numbers: Numbers
 
@@ -99,7 +99,7 @@ class Values(dict[str, str]):
 
 
 def at(numbers: Numbers, path: str, method: str = "") -> Any:
-    """What stands at a path, with the method in place of *; None if there is nothing."""
+    """The value at a path, with the method in place of *; None if there is none."""
     value: Any = numbers
     for step in path.split("|"):
         value = value.get(method if step == "*" else step, {})
