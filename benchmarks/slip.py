@@ -8,9 +8,9 @@ of translation and rotation since the touch; shares of errors within one and two
 without slip have 12,000 frames. Frames in which the gel under an object is only dragged along, or released,
 are left out.
 
-Real: `franka_slip.csv` contains the authors' labels of whole recordings, slip or wiggle. `slips.json` contains
-the frames [from, to] in which the picture of the object visibly moves against the dots, labelled by eye in 25
-recordings of each class. Nothing is fitted to either, so that every object is unknown.
+Real: `franka_slip.csv` has the authors' labels of whole recordings, slip or wiggle. `slips.json` has the frames
+[from, to] in which the picture of the object visibly moves against the dots, labelled by eye in 25 recordings
+of each class. Nothing is fitted to either, so that every object is unknown.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tactflow.vision.geometry import PixelMapping
 ROLLS = ("roll", "tumble")
 """Scenes in which the contact moves without sliding: its motion is not compared."""
 STILL = 0.1
-"""Motion over the gel in a frame, px, above which a contact that is being pressed or released counts as neither
+"""Motion over the gel in a frame, px, above which a contact being pressed or released counts as neither
 slipping nor sticking: the simulated gel follows an object only once it is pressed."""
 LATE = 0.1
 """How late slip may be reported, and for how long after it ended, s."""
@@ -44,8 +44,8 @@ MARKS = Path(__file__).with_name("slips.json")
 
 
 class Row(NamedTuple):
-    """Counts of a scene: slipping frames, and those in which slip is reported; other frames, and the indices of
-    those in which it is reported; errors (n, 3) of translation, px, and rotation, degrees; standard errors."""
+    """Counts of a scene: slipping frames, and those of them with a report; other frames, and the indices of
+    those with a report; errors (n, 3) of translation, px, and rotation, degrees; standard errors."""
 
     slipping: int
     found: int
