@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import errno
-import glob
 import io
 import os
-import platform
 import re
 import shutil
 import stat
@@ -81,20 +79,16 @@ def completed(path: Path, *, make_parent: bool = True) -> Iterator[Path]:
     """A temporary path for a file or folder, renamed to `path` on success and removed on error.
 
     It replaces an existing file or folder, but a file never replaces a folder; if nothing was written,
-    nothing is replaced. Its name begins with a dot and has the suffix of `path`. Leftovers of killed
-    processes of this machine for the same path are removed first.
+    nothing is replaced. Its name begins with a dot and has the suffix of `path`. What a killed process
+    left there is removed first.
 
     make_parent : whether to create missing parent folders.
     Raises OSError.
     """
     if make_parent:
         path.parent.mkdir(parents=True, exist_ok=True)
-    front, end = f".{path.stem}.{platform.node()[:16]}-", f".partial{path.suffix}"
-    for left in path.parent.glob(f"{glob.escape(front)}*{glob.escape(end)}"):
-        process = left.name[len(front) : -len(end)]
-        if process.isdecimal() and _has_ended(int(process)):
-            _remove(left)
-    partial = path.with_name(f"{front}{os.getpid()}{end}")
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    _remove(partial)
     try:
         yield partial
         if path.is_dir() and partial.is_dir():
@@ -103,20 +97,6 @@ def completed(path: Path, *, make_parent: bool = True) -> Iterator[Path]:
             os.replace(partial, path)
     finally:
         _remove(partial)
-
-
-def _has_ended(process: int) -> bool:
-    if sys.platform == "win32":
-        # Signal 0 would terminate the process.
-        return False
-    else:  # noqa: RET505 (mypy knows branches)
-        try:
-            os.kill(process, 0)
-        except (ProcessLookupError, OverflowError):
-            return True
-        except PermissionError:
-            pass
-        return False
 
 
 def _remove(path: Path) -> None:
