@@ -207,7 +207,6 @@ def test_set_adds_and_removes_stages_and_changes_the_top_level(load: Load) -> No
     ("override", "words"),
     [
         ("stages.prepare.gamma=x", "stages.prepare.gamma: should be a valid number, got 'x'"),
-        ("stages.prepare.gama=3", "stages.prepare.gama: unknown parameter; did you mean gamma?"),
         ("stages.outlin=null", "there is no stage 'outlin' to remove; did you mean outline?"),
         ("sink.out.path=a", "sink: unknown key; did you mean sinks?"),
         ("stages.prepare.gamma.x=3", "stages.prepare.gamma is 2, so it has no x"),

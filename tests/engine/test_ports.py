@@ -120,16 +120,16 @@ class Found(Tick):
 
 def test_a_sink_may_take_a_result_with_the_ports_that_its_class_names() -> None:
     class Sink:
-        def write(self, image: Image, result: Found, touching: Touching) -> None: ...
+        def write(self, result: Found, touching: Touching, image: Image) -> None: ...
 
     ports = read_ports(Sink, "write")
     # A port that is named beside the result is required or not as it stands there.
     assert [(p.name, p.optional) for p in ports.inputs] == [
-        ("image", False),
         ("contact", True),
         ("touching", False),
+        ("image", False),
     ]
-    assert ports.result == ResultParameter(1, 1, Found)
+    assert ports.result == ResultParameter(1, Found)
     assert ports.outputs == ()
 
 

@@ -228,13 +228,6 @@ class Rare(Counted, Stage):
         return Absent("third") if level.value % 3 == 0 else level
 
 
-class LateTick(Counted, Sink):
-    """A sink that asks for the tick behind its inputs."""
-
-    def write(self, number: Number | None, total: Number, tick: Tick) -> None:
-        self.rows.append((tick.frame.seq, number and number.value, total.value))
-
-
 class Vandal(Counted, Stage):
     """Writes into its input, which a stage must not do."""
 

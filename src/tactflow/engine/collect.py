@@ -63,7 +63,7 @@ def with_collector(
     inputs = {port: ref for port, ref in outputs.items() if port in known or ref not in read}
     passive = {port: ref for port, ref in outputs.items() if port not in inputs}
     # Accept any value: the stage that returns it checks it.
-    ports = Ports([Port(port, object, True) for port in inputs], (), ResultParameter(0, len(inputs), kind))
+    ports = Ports([Port(port, object, True) for port in inputs], (), ResultParameter(len(inputs), kind))
     policy = {"threaded": True, "when_live": "latest"} if background else {}
     cls: type[Collect] = type("Collect", (Collect,), {"takes_references": references, **policy})
     component = Component(name, "sink", cls, cls.Params, ports, "pure", "tactflow")

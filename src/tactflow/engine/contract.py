@@ -189,9 +189,9 @@ class Publication:
 class Sink(Part):
     """Writes, publishes or shows results.
 
-    Its inputs are the annotations of `write`, which every sink defines: single ports as for a stage, or a
-    result with the frame, the ports that its class names, and the reasons for missing values; `tick: Tick`
-    has the frame and the ports that are named next to it.
+    Its inputs are the annotations of `write`, which every sink defines: ports as for a stage. The first
+    parameter may be a result: the frame, the ports that its class names, and the reasons for missing values.
+    `tick: Tick` has the frame and the ports that follow.
 
     >>> from tactflow import Result
     >>> class Print(Sink):

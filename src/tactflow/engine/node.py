@@ -145,8 +145,7 @@ class RunningNode:
         """Run it. Returns one value per output port, `Absent` if missing."""
         arguments = [read_only(value) for value in inputs] if self._check else inputs
         if (result := self._ports.result) is not None:
-            end = result.place + result.count
-            arguments = [*arguments[: result.place], self._tick(result.kind, tick), *arguments[end:]]
+            arguments = [self._tick(result.kind, tick), *arguments[result.count :]]
         outputs = _outputs(self._function(*arguments), len(self.slots))
         if self._check:
             check_values(self._ports, inputs, outputs)

@@ -61,9 +61,8 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class ResultParameter:
-    """A parameter of a sink that takes a result: `count` of the inputs, from index `place`, as a `kind`."""
+    """The first parameter of a sink if it takes a result: the first `count` inputs, as a `kind`."""
 
-    place: int
     count: int
     kind: type[Tick]
 
@@ -201,12 +200,12 @@ def _ports(function: Callable[..., Any], method: str) -> Ports:
         annotation = hints.get(parameter.name)
         if not (inspect.isclass(annotation) and issubclass(annotation, Tick)):
             inputs.append(_parameter(parameter, annotation))
-        elif method != "write" or result is not None:
-            raise _PortError("only a sink may take a result, once; a stage can take the port frame: Frame")
+        elif method != "write" or parameter is not parameters[0]:
+            raise _PortError("only a sink may take a result, first; a stage can take the port frame: Frame")
         else:
             # A port that is also a parameter of its own is passed there.
             ports = [port for port in ports_of(annotation) if port.name not in named]
-            result = ResultParameter(len(inputs), len(ports), annotation)
+            result = ResultParameter(len(ports), annotation)
             inputs += ports
     if method == "write":
         return Ports(inputs, (), result)
