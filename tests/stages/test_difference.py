@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 import tactflow
@@ -28,23 +29,19 @@ def _touched() -> tuple[Image, Image]:
     return scene.frame(0), scene.frame(25)
 
 
-def test_a_touched_gel_is_told_from_the_reference() -> None:
+@pytest.mark.parametrize("marked", [True, False])
+def test_a_touched_gel_is_told_from_the_reference_or_else_from_the_first_frame(marked: bool) -> None:
     untouched, touched = _touched()
     stage = _stage()
-    mask, touching, _ = stage.process(untouched, _frame(untouched, 0, reference=True))
+    mask, touching, _ = stage.process(untouched, _frame(untouched, 0, reference=marked))
     assert not touching
     assert not mask.any()
     mask, touching, _ = stage.process(touched, _frame(touched, 1))
     assert touching
     assert mask.shape == touched.shape[:2]
     assert set(np.unique(mask)) == {0, 255}
-
-
-def test_the_first_frame_serves_as_reference_where_none_is_marked() -> None:
-    untouched, touched = _touched()
-    stage = _stage()
-    assert not stage.process(untouched, _frame(untouched, 0)).touching
-    assert stage.process(touched, _frame(touched, 1)).touching
+    stage.reset()
+    assert not stage.process(touched, _frame(touched, 2, reference=True)).touching
 
 
 def test_all_marked_frames_are_learned_from() -> None:
@@ -59,14 +56,6 @@ def test_all_marked_frames_are_learned_from() -> None:
     # The mean of eight frames is less noisy than one frame, and their spread is known rather than guessed.
     assert many.process(change, _frame(change, 9)).touching
     assert not one.process(change, _frame(change, 9)).touching
-
-
-def test_reset_forgets_the_reference() -> None:
-    untouched, touched = _touched()
-    stage = _stage()
-    stage.process(untouched, _frame(untouched, 0, reference=True))
-    stage.reset()
-    assert not stage.process(touched, _frame(touched, 1, reference=True)).touching
 
 
 def test_a_reference_that_was_touched_is_replaced_after_the_release() -> None:

@@ -17,8 +17,6 @@ ORIGIN = np.column_stack([X.ravel(), Y.ravel()])
 MARKERS = Markers(ORIGIN, ORIGIN + np.array([3.0, 0]), np.zeros(100, np.uint8), np.full(100, 0.02))
 FIELD = FieldModel(ORIGIN, (200, 200))(MARKERS)
 NOTHING = np.zeros((200, 200), np.uint8)
-
-
 REST = np.zeros((200, 200, 3), np.uint8)
 
 

@@ -147,7 +147,7 @@ def test_where_nothing_can_be_kept_loops_are_compiled_in_each_run(folder: Path) 
     }
     done = run(folder, **nowhere)
     assert done.stdout == f"3 3 {RESULTS}"
-    assert done.stderr.count("compiled in each run, since they cannot be kept on disk") == 1
+    assert done.stderr.count("loops are compiled in each run: they cannot be cached") == 1
 
 
 def test_without_the_compiler_loops_run_as_plain_python(folder: Path) -> None:

@@ -5,12 +5,8 @@ A loop is worth compiling where that saves a frame 0.1 ms or more; everything el
     @kernel("void(uint8[:, ::1], float32[::1])")
     def column_sums(picture, sums):
         for row in range(picture.shape[0]):
-            _add(picture[row], sums)
-
-    @helper
-    def _add(line, sums):
-        for column in range(sums.size):
-            sums[column] += line[column]
+            for column in range(sums.size):
+                sums[column] += picture[row, column]
 
 A kernel names the types of its arguments, so that it has one version. Helpers are compiled into the kernels
 of their own file that call them. A kernel is compiled, or read from disk, on its first call or by `load`,
@@ -83,7 +79,8 @@ class Kernel(Generic[P, R]):
                 found.recompile()
                 found.compile(self._signature)
         except (OSError, RuntimeError) as error:
-            _warn_of_disk((isinstance(error, OSError) and error.strerror) or "no folder can be written to")
+            reason = (isinstance(error, OSError) and error.strerror) or "no folder can be written to"
+            _warn("loops are compiled in each run: they cannot be cached (set NUMBA_CACHE_DIR): " + reason)
             found = numba.njit(self._signature, **_OPTIONS)(self.plain)
         found.disable_compile()
         if not found.stats.cache_hits:
@@ -99,10 +96,9 @@ def _announce() -> None:
 
 
 @cache
-def _warn_of_disk(reason: str) -> None:
-    """Say once, not for each loop, that compiled code cannot be cached."""
-    text = "loops are compiled in each run, since they cannot be kept on disk (set NUMBA_CACHE_DIR): %s"
-    logging.getLogger("tactflow").warning(text, reason)
+def _warn(text: str) -> None:
+    """Log a warning once, not for each loop."""
+    logging.getLogger("tactflow").warning("%s", text)
 
 
 def _writable(value: object) -> object:

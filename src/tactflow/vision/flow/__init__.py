@@ -1,9 +1,8 @@
-"""Flow of the gel and its markers: whether they move, how the gel moves between them and in the contact.
+"""Flow of the gel and its markers.
 
-`motion` tests whether markers move as something that touches the gel moves them. `displacement_field` tells
-how the gel moves between them; `in_mask` sums that up for the contact, or else the motions of the markers
-that are `inside` of it; `slip` measures how the object moves against the gel, by the
-`registration` of its picture.
+`motion` tests whether markers move as a contact moves them. `displacement_field` interpolates their motion;
+`in_mask` summarises it for the contact, or else the motion of the markers `inside`. `slip` measures how the
+object moves against the gel, by `registration` of its picture.
 """
 
 from tactflow.vision.flow.displacement_field import DisplacementField, FieldModel

@@ -72,11 +72,6 @@ class Grid(NamedTuple):
         y = self.first[1] + self.spacing * np.arange(rows)
         return np.stack(np.meshgrid(x, y), axis=-1)
 
-    def coarser(self) -> Grid:
-        """Every other row and column, from the first on. It may reach half a cell less far."""
-        rows, columns = self.shape
-        return Grid(((rows + 1) // 2, (columns + 1) // 2), self.first, 2 * self.spacing)
-
 
 class Samples(NamedTuple):
     """A grid of cells over which the field is summed.
@@ -186,12 +181,17 @@ class FieldModel:
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)
         self.inverse: Floats = np.asarray(np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64)
-        grid = _grid(size, self.pitch)
-        self.margin = OVERSHOOT * self.pitch + grid.spacing
+        width, height = size
+        spacing = max(CELL * self.pitch, math.sqrt(width * height / MOST_CELLS))
+        columns, rows = math.ceil(width / spacing), math.ceil(height / spacing)
+        first = (width - 1 - spacing * (columns - 1)) / 2, (height - 1 - spacing * (rows - 1)) / 2
+        self.margin = OVERSHOOT * self.pitch + spacing
         """How much farther a cell may have moved than any tracked marker, px."""
-        self.fine, self.coarse = self._samples(grid), self._samples(grid.coarser())
-        """For small and for large regions. Both are fixed to the frame, so that the motion of a region does
-        not depend on where its bounding box begins."""
+        self.fine = self._samples(Grid((rows, columns), first, spacing))
+        self.coarse = self._samples(Grid(((rows + 1) // 2, (columns + 1) // 2), first, 2 * spacing))
+        """For small and for large regions; the second has every other row and column of the first. Both are
+        fixed to the frame, so that the motion of a region does not depend on where its bounding box
+        begins."""
 
     def _samples(self, grid: Grid) -> Samples:
         rows, columns = grid.shape
@@ -503,12 +503,3 @@ def matern(distance: Floats) -> Floats:
     """
     scaled = math.sqrt(5) * distance
     return np.asarray((1 + scaled + scaled * scaled / 3) * np.exp(-scaled))
-
-
-def _grid(size: tuple[int, int], pitch: float) -> Grid:
-    """A grid in the middle of a frame of (width, height), px."""
-    width, height = size
-    spacing = max(CELL * pitch, math.sqrt(width * height / MOST_CELLS))
-    columns, rows = math.ceil(width / spacing), math.ceil(height / spacing)
-    first = (width - 1 - spacing * (columns - 1)) / 2, (height - 1 - spacing * (rows - 1)) / 2
-    return Grid((rows, columns), first, spacing)

@@ -6,6 +6,7 @@ import cmath
 import math
 from collections import deque
 from dataclasses import replace
+from statistics import NormalDist
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -49,6 +50,7 @@ UNSURE: Final = 6.0
 ASIDE: Final = 2.0
 """The same, relative to the RMS of how far the gel departs sideways: a press that spreads the gel does both
 alike, slip only the first. Chosen on the simulator."""
+_normal: Final = NormalDist().cdf
 _ROUNDS: Final = 2
 """Fits of a rigid motion, each to the gel that sticks by the one before. Chosen by hand."""
 
@@ -322,11 +324,6 @@ def _correlation(first: Floats32, second: Floats32) -> float:
     """Correlation of the residuals of two registrations with one template, 0 to 1."""
     power = math.sqrt(float(np.vdot(first, first)) * float(np.vdot(second, second)))
     return max(float(np.vdot(first, second)), 0.0) / max(power, 1e-9)
-
-
-def _normal(value: float) -> float:
-    """The cumulative distribution function of the standard normal distribution."""
-    return math.erfc(-value / math.sqrt(2)) / 2
 
 
 def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, noise: float) -> float:
