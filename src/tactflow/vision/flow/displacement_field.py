@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats, Mask, Points, check_mask
+from tactflow.vision.arrays import Flags, Floats, Indices, Mask, Points, check_mask
 from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
@@ -234,36 +234,34 @@ class DisplacementField:
         known = seen & np.isfinite(markers.stderr)
         errors = np.sort(markers.stderr[known])
         self.noise = float(errors[len(errors) // 2]) if len(errors) else 0.0
-        self._variance = np.where(known, markers.stderr, self.noise) ** 2
+        self._variance = np.square(np.where(known, markers.stderr, self.noise))
         self._moved = np.where(seen[:, None], markers.position - model.origin, 0.0)
-        self._removed = np.empty((0, len(seen)))
-        """(S, N): the inverse of this frame is that of the model less removed.T @ removed."""
-        poor = seen & (self._variance > (POOR * self.noise) ** 2)
-        doubtful = ~seen | poor
-        if doubtful.any():
-            self._removed = self._without(doubtful, 0.0)
-        if poor.any():
+        doubtful = ~seen | (self._variance > (POOR * self.noise) ** 2)
+        chosen = np.flatnonzero(doubtful)
+        self._left_out: Floats = model.inverse[chosen]
+        """(S, N): rows of the inverse of markers that are not seen, or seen poorly."""
+        self._removed = self._without(chosen, 0.0)
+        if seen[chosen].any():
             # The variance of the field, to which theirs is compared, is estimated from all others.
             moved = self._moved[~doubtful]
             scale = float(np.vdot(moved, self._weights(self._moved.T).T[~doubtful])) / moved.size
-            self._removed = self._without(doubtful, scale)
+            self._removed = self._without(chosen, scale)
         self._coefficients = self._weights(self._moved.T).T
-        information = np.diagonal(model.inverse) - np.square(self._removed).sum(axis=0)
+        information = np.diagonal(model.inverse) - (self._left_out * self._removed).sum(axis=0)
         self._precision = np.where(seen, 0.5 / np.maximum(information, _LEAST_PRECISION), 0.0)
 
-    def _without(self, doubtful: Flags, scale: float) -> Floats:
-        """(S, N): rows of `_removed` that leave out the doubtful markers (N,).
+    def _without(self, chosen: Indices, scale: float) -> Floats:
+        """(S, N): the inverse of this frame is that of the model less left_out.T @ these rows.
 
-        scale : variance of the field, px^2, with which tracked ones among them keep some weight; 0: none.
+        chosen : (S,), markers. scale : variance of the field, px^2, with which those of them that are seen
+        keep some weight; 0: none.
         """
-        chosen = np.flatnonzero(doubtful)
-        rows = self._model.inverse[chosen]
         precision = scale * self._seen[chosen] / np.maximum(self._variance[chosen], 1e-300)
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(rows[:, chosen] + np.diag(precision)), rows))
+        return np.asarray(np.linalg.solve(self._left_out[:, chosen] + np.diag(precision), self._left_out))
 
     def _weights(self, kernel: Floats) -> Floats:
         """(M, N): weights of the markers in M values of the field, whose kernel to the markers is (M, N)."""
-        return np.asarray(kernel @ self._model.inverse - kernel @ self._removed.T @ self._removed)
+        return np.asarray(kernel @ self._model.inverse - (kernel @ self._left_out.T) @ self._removed)
 
     @cached_property
     def displacement(self) -> Floats:
@@ -346,11 +344,11 @@ class DisplacementField:
 
     def _near(self, box: Sequence[int], grid: Grid) -> tuple[slice, slice]:
         """Rows and columns of the cells whose gel may be in a box (left, top, width, height)."""
-        slices = []
-        for axis in (0, 1):
-            moved, margin = self._moved[:, axis], self._model.margin
-            low = (box[axis] - float(moved.max()) - margin - grid.first[axis]) / grid.spacing
-            high = (box[axis] + box[axis + 2] - float(moved.min()) + margin - grid.first[axis]) / grid.spacing
+        slices, margin = [], self._model.margin
+        extent = zip(self._moved.min(axis=0).tolist(), self._moved.max(axis=0).tolist(), strict=True)
+        for axis, (least, most) in enumerate(extent):
+            low = (box[axis] - most - margin - grid.first[axis]) / grid.spacing
+            high = (box[axis] + box[axis + 2] - least + margin - grid.first[axis]) / grid.spacing
             cells = grid.shape[1 - axis]
             start = min(max(int(low), 0), cells - 1)
             slices.append(slice(start, min(max(int(high) + 2, start + 1), cells)))

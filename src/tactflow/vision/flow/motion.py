@@ -142,9 +142,10 @@ class MotionTest:
             raise ValueError(f"required {len(self._origin)} markers, got {len(markers.position)}")
         left = self._unexplained(markers)
         bound = self._limit * np.sqrt(np.square(markers.stderr) + self._variance)
-        # Where the standard error is not known, nothing exceeds it.
-        ratio = np.where(left > self._relaxation * self._strongest, left / bound, 0.0)
-        ratio = np.append(np.fmax(ratio, 0.0), 0.0)
+        ratio = np.zeros(self.count + 1)
+        # Nothing exceeds an unknown standard error.
+        exceeds = (left > self._relaxation * self._strongest) & (bound > 0)
+        np.divide(left, bound, out=ratio[:-1], where=exceeds)
         second = np.sort(ratio[self._neighbours], axis=1)[:, -2]
         chain = float(np.minimum(ratio[:-1], second).max(initial=0.0))
         largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
