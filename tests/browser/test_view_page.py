@@ -405,10 +405,8 @@ def test_a_tab_per_sensor_and_honest_empty_states(
     assert re.match(r"no frames for \d+ s", page.inner_text("#status-text"))
     stage.send(frame("left", 3, 100))
     status(page, "live")
-    deadline = time.monotonic() + PATIENCE / 1000
-    while len(stage.heard) < 3 and time.monotonic() < deadline:
-        page.wait_for_timeout(20)
-    assert [message.get("ack") for message in stage.heard] == [1, 2, 3]
+    until_heard(page, stage, {"ack": 3})
+    assert stage.heard == [{"ack": 1}, {"ack": 2}, {"ack": 3}]
     stage.send(state("left", end="eos"))
     status(page, "ended")
     assert "The source has ended." in page.inner_text("#empty-text")
@@ -420,16 +418,9 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
     stage = staged(hello("main"), state("main"), frame("main", 1, 120, contact=True, directed=True))
     page = open_page(stage.url)
     watch(page)
-    for absent in (
-        "unit",
-        "layer-field",
-        "layer-surface",
-        "tile-depth",
-        "tile-force",
-        "tile-slip",
-        "tile-pose",
-    ):
-        assert page.is_hidden(f"#{absent}"), absent
+    absent = ("unit", *(f"layer-{name}" for name in ("field", "surface")))
+    for name in (*absent, *(f"tile-{name}" for name in ("depth", "force", "slip", "pose"))):
+        assert page.is_hidden(f"#{name}"), name
     page.keyboard.press("u")
     assert page.inner_text("#value-area") == "300"
     stage.send(calibrated(2))

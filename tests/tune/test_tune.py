@@ -139,7 +139,7 @@ def test_no_line_of_a_recordings_name_becomes_part_of_the_pipeline(
         (["--source", "still", "--out", "readonly/tuned.yaml"], 2, "readonly cannot be written into"),
     ],
 )
-def test_what_cannot_be_tuned_is_said(
+def test_unusable_recordings_and_options_are_rejected(
     arguments: list[str],
     code: int,
     says: str,

@@ -1,4 +1,4 @@
-"""`tactflow calibrate`: make the calibration file of a sensor, add the force, see whether it still fits."""
+"""`tactflow calibrate`: make the calibration file of a sensor, add a force fit, or check it."""
 
 from __future__ import annotations
 
@@ -45,14 +45,13 @@ from tactflow.system.terminal import notes, say, show, typed
 from tactflow.vision.types import Scale
 
 WORSE: Final = 1.5
-"""Error on new presses over that in the file above which a calibration counts as drifted."""
+"""Ratio of the error on new presses to the stored one above which a calibration counts as drifted."""
 LOOSE: Final = 0.02
 """Relative error of a scale by pitch above which a better method is advised: grids of the simulator have less
 than 0.01, the rings of a TacTip 0.1 to 0.15."""
 ENOUGH: Final = {"slopes": 30, "refine": 9, "darkness": 1}
-"""Presses after which a live session ends by itself, by what is learned from them. With 9, the errors of a
-refined default on two Minis are those of a calibration of their own; one curve of darkness holds all over the
-gel."""
+"""Number of presses that ends a live session, by the fit. With 9, a refined default has the errors of a
+calibration of its own on two Minis; one curve of darkness holds all over the gel."""
 # Gels and balls have 1 to 100.
 _millimetres = number(float, 1e-3, 1e4, "millimetres from 0.001 to 10000")
 
@@ -161,7 +160,9 @@ def _make(args: argparse.Namespace, pipeline: str | None = None) -> int:
         raise ConfigError("calibrate: required one of --pitch MM and --area WIDTH HEIGHT, for the scale")
     if args.darkness and (args.refine or args.ball_radius is None):
         raise ConfigError("calibrate --darkness: required --ball-radius MM, and not --refine")
-    args.presses = args.presses or ENOUGH[_way(args)]
+    args.presses = (
+        args.presses or ENOUGH["darkness" if args.darkness else "refine" if args.refine else "slopes"]
+    )
     base = _base(args, pipeline)
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
@@ -176,11 +177,6 @@ def _make(args: argparse.Namespace, pipeline: str | None = None) -> int:
         f"or to the command: {typed('--set', f'calibration={out}')}"
     )
     return 0
-
-
-def _way(args: argparse.Namespace) -> str:
-    """How depth is learned, a key of `ENOUGH`."""
-    return "darkness" if args.darkness else "refine" if args.refine else "slopes"
 
 
 def _base(args: argparse.Namespace, pipeline: str | None) -> Calibration | None:
@@ -389,14 +385,13 @@ def _quality(part: LinearForceEntry, left_out: str) -> str:
     groups = {"object": "objects", "recording": "recordings", "press": "presses"}[left_out]
     return (
         f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
-        f"{100 * part.r2:.0f} % of the variance explained, by {groups} that the fit has not seen; "
+        f"{100 * part.r2:.0f} % of the variance explained, on {groups} left out of the fit; "
         f"standard error {absolute:.2f} N and {100 * relative:.0f} % of the force"
     )
 
 
 def _scale(args: argparse.Namespace, session: Session, base: Calibration | None) -> tuple[Scale, str]:
-    """Millimetres per pixel, and how they were found. base : its scale is kept unless an
-    option gives another."""
+    """Millimetres per pixel, and how they were found. base : its scale is kept unless an option gives one."""
     width, height = session.mapping.size
     try:
         if base is not None and args.pitch is None and args.area is None:
@@ -440,7 +435,7 @@ def _run(
 
 
 def _watch(pipeline: Pipeline, calibration: Path) -> force.Watched:
-    """The features that the force follows from. calibration : the file, with a scale."""
+    """Features for the force fit. calibration : the file, with a scale."""
     watcher = force.Watcher()
     _run(pipeline, lambda result, _: watcher.add(result), force.NEEDED, calibration)
     return watcher.watched()
