@@ -211,12 +211,6 @@ def add_arguments_record(parser: argparse.ArgumentParser) -> None:
     existing = parser.add_mutually_exclusive_group()
     add_overwrite(existing, "FILE.mcap")
     existing.add_argument("--number", action="store_true", help="if it exists, record to FILE-001.mcap, ...")
-    parser.add_argument(
-        "--rotate-after",
-        type=float,
-        metavar="SECONDS",
-        help="continue in FILE-001.mcap, ... when a file has this length",
-    )
 
 
 def run_record(args: argparse.Namespace) -> int:
@@ -244,4 +238,4 @@ def _recording_options(args: argparse.Namespace, out: Path) -> dict[str, Any]:
         raise ConfigError(
             f"--out: {out} already exists; give --overwrite to replace it or --number to record beside it"
         )
-    return {"path": str(out), "overwrite": args.overwrite, "rotate_after": args.rotate_after}
+    return {"path": str(out), "overwrite": args.overwrite}
