@@ -8,9 +8,9 @@ of translation and rotation since the touch; shares of errors within one and two
 without slip have 12,000 frames. Frames in which the gel under an object is only dragged along, or released,
 are left out.
 
-Real: `franka_slip.csv` has the authors' labels of whole recordings, slip or wiggle. `slips.json` has the frames
-[from, to] in which the picture of the object visibly moves against the dots, labelled by eye in 25 recordings
-of each class. Nothing is fitted to either, so that every object is unknown.
+Real: `franka_slip.csv` has the authors' labels of whole recordings, slip or wiggle. `slips.json` has the
+frames [from, to] in which the picture of the object visibly moves against the dots, labelled by eye in 25
+recordings of each class. Nothing is fitted to either, so that every object is unknown.
 """
 
 from __future__ import annotations
