@@ -91,15 +91,6 @@ def pictures(_: Path) -> Parser:
     return [cv2.imencode(kind, np.tile(IMAGE, (6, 6, 1)))[1].tobytes() for kind in kinds], ".png", play
 
 
-def videos(folder: Path) -> Parser:
-    file = folder / "sample.avi"
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
-    for shade in range(4):
-        writer.write(np.full((48, 64, 3), shade, np.uint8))
-    writer.release()
-    return [file.read_bytes()], ".avi", play
-
-
 def bags(folder: Path) -> Parser:
     """A recording of ROS."""
     pytest.importorskip("rosbags", reason="the extra bags is not installed")
@@ -133,7 +124,7 @@ def damage(data: bytes, rng: random.Random) -> bytes:
     return bytes(damaged[: rng.randrange(len(damaged) + 1)]) if rng.random() < 0.1 else bytes(damaged)
 
 
-@pytest.mark.parametrize("make", [pipelines, recordings, arrays, pictures, videos, bags, messages])
+@pytest.mark.parametrize("make", [pipelines, recordings, arrays, pictures, bags, messages])
 @pytest.mark.parametrize("inputs", [40, pytest.param(3000, marks=pytest.mark.slow)])
 def test_damaged_input_is_refused(make: Callable[[Path], Parser], inputs: int, tmp_path: Path) -> None:
     samples, suffix, read = make(tmp_path)

@@ -47,24 +47,39 @@ class References:
 
         image : (H, W, 3) uint8 BGR, a reference that replaces the first frames; or None.
         """
-        first = Settling() if image is None and self._settle > 0 else None
-        self._left = self._count if image is None and first is None else 0
+        if image is not None:
+            first = next(arrivals, None)
+            if first is None:
+                return
+            yield self._shown_before(image, first)
+            yield self.marked(first)
+        elif self._settle > 0:
+            yield from self._settled(arrivals, source)
+        else:
+            self._left = self._count
+        yield from map(self.marked, arrivals)
+
+    def _settled(self, arrivals: Iterator[Arrival], source: FrameReader) -> Iterator[Arrival]:
+        """The first frames, once the reference is chosen; for a live source, only the references."""
+        settling, goes_on, failure = Settling(), True, None
         held: list[Arrival] = []
-        failure = None
         try:
-            for arrival in arrivals:
-                if image is not None:
-                    yield self._shown_before(image, arrival)
-                    image = None
+            while goes_on and (arrival := next(arrivals, None)) is not None:
                 held.append(arrival)
-                if first is not None and self._goes_on(first, held):
-                    continue
-                yield from self._released(first, held, source)
-                first, held = None, []
+                goes_on = self._goes_on(settling, held)
         except SourceError as error:
+            # The frames before it are delivered first.
             failure = error
-        if not source.live:
-            yield from self._released(first, held, source)
+        if held and not (source.live and goes_on):
+            chosen = self._choose(settling, source)
+            if source.live:
+                self.left_out += len(held) - len(chosen)
+                held = [held[index] for index in chosen]
+            if source.live or chosen == list(range(len(chosen))):
+                self._begin(len(chosen))
+            else:
+                yield from (self._shown_before(held[index].image, held[0]) for index in chosen)
+            yield from map(self.marked, held)
         if failure is not None:
             raise failure
 
@@ -83,28 +98,14 @@ class References:
             self._epoch += 1
         self._left = count
 
-    def _goes_on(self, first: Settling, held: list[Arrival]) -> bool:
+    def _goes_on(self, settling: Settling, held: list[Arrival]) -> bool:
         """Examine the newest frame; returns whether more frames are needed."""
         image, t = held[-1].image, held[-1].t
-        first.add(image, t)
-        decided = first.touched or first.unrelated or (first.steady and len(first) >= self._count)
+        settling.add(image, t)
+        steady = settling.steady and len(settling) >= self._count
+        decided = settling.touched or settling.unrelated or steady
         full = sum(arrival.image.nbytes for arrival in held) > MEMORY
         return not (decided or full or t - held[0].t >= self._settle)
-
-    def _released(
-        self, first: Settling | None, held: list[Arrival], source: FrameReader
-    ) -> Iterator[Arrival]:
-        """The frames that were held back; for a live source, only the references."""
-        if first is not None and held:
-            chosen = self._choose(first, source)
-            if source.live:
-                self.left_out += len(held) - len(chosen)
-                held = [held[index] for index in chosen]
-            if source.live or chosen == list(range(len(chosen))):
-                self._begin(len(chosen))
-            else:
-                yield from (self._shown_before(held[index].image, held[0]) for index in chosen)
-        yield from map(self.marked, held)
 
     def _choose(self, first: Settling, source: FrameReader) -> list[int]:
         """Indices of frames that show the untouched gel, in order: `count` of them, or fewer."""
