@@ -28,7 +28,7 @@ def stream(
     """Run a pipeline and iterate over its results.
 
     The run continues in the background while the loop processes a result. A recording waits for the loop, so
-    nothing is lost; from a live source the loop always gets the newest result. Leaving the loop ends the run.
+    nothing is lost; a live source gives the loop the newest result. Leaving the loop ends the run.
 
     Parameters
     ----------

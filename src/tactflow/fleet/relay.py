@@ -22,22 +22,13 @@ LONGEST_END = 5.0
 def relay(publication: Publication, upstream: Sequence[str]) -> Iterator[None]:
     """Bind the address of a publication, and forward messages and subscriptions while the block lasts.
 
-    The upstream publishers must have ended when the block ends; what they sent is still forwarded.
-
-    upstream : addresses of the publishers.
-
-    Raises
-    ------
-    StageError : the address cannot be bound, or the keys are invalid.
+    upstream : addresses of the publishers, which must have ended when the block ends; what they sent is still
+    forwarded. Raises StageError if the address cannot be bound, or the keys are invalid.
     """
     publisher = Publisher(publication.address, publication.backlog, publication.keys)
     stop = threading.Event()
-    thread = threading.Thread(
-        target=_forward,
-        args=(publisher, upstream, publication.backlog, stop),
-        name="tactflow-relay",
-        daemon=True,
-    )
+    arguments = (publisher, upstream, publication.backlog, stop)
+    thread = threading.Thread(target=_forward, args=arguments, name="tactflow-relay", daemon=True)
     thread.start()
     print(f"tactflow: publishing {len(upstream)} sensors on {publication.address}", file=sys.stderr)
     try:

@@ -11,13 +11,7 @@ from pathlib import Path
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.fleet.relay import relay
-from tactflow.fleet.sinks import (
-    Shared,
-    WatchedSink,
-    changes,
-    clash_problems,
-    shared_addresses,
-)
+from tactflow.fleet.sinks import Shared, WatchedSink, changes, clash_problems, shared_addresses
 from tactflow.fleet.supervisor import Member, Supervisor
 from tactflow.system.signals import ending_handled
 
@@ -26,10 +20,7 @@ def run_fleet(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequenc
     """Run every sensor's pipeline in a process of its own until all have ended.
 
     pipelines : sensor -> its pipeline, checked. arguments : sensor -> command line of its process.
-
-    Returns
-    -------
-    0 if all ended well, 130 after a second signal, else the exit code of the first sensor that was given up.
+    Returns the exit code of `Supervisor.run`.
 
     Raises
     ------

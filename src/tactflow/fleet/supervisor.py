@@ -8,9 +8,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
 from types import FrameType
-from typing import IO, TextIO
+from typing import IO, NamedTuple, TextIO
 
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.fleet.sinks import WatchedSink
@@ -46,9 +45,8 @@ def start_process(command: Sequence[str]) -> Process:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
-    """A sensor: the command that runs it, and its sinks, which say how it is restarted."""
+class Member(NamedTuple):
+    """A sensor: the command that runs it, and its sinks, which determine how it is restarted."""
 
     sensor: str
     command: Sequence[str]
@@ -80,9 +78,8 @@ class Supervisor:
     def run(self, members: Sequence[Member]) -> int:
         """Supervise until every process has ended for good.
 
-        Returns
-        -------
-        The exit code: 0 if all ended well, 130 after a second signal, else that of the first failed sensor.
+        Returns the exit code: 0 if all ended well, 130 after a second signal, else that of the first failed
+        sensor.
         """
         running = {member.sensor: self._keep_running(member) for member in members}
         codes = dict.fromkeys(running, 0)
@@ -106,9 +103,9 @@ class Supervisor:
         return max(self._signals, int(self._refused or self._unwritten))
 
     def _keep_running(self, member: Member) -> Generator[None, None, int]:
-        """Run a sensor, again after each failure, until it has ended for good.
+        """Run a sensor, again after each failure, until it has ended for good. Returns the exit code.
 
-        Yields while there is nothing to do. Returns the exit code.
+        Yields while there is nothing to do.
         """
         failures = 0
         while not self._ends:
