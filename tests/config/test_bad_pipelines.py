@@ -236,10 +236,7 @@ def test_a_file_that_cannot_be_read(argument: str, words: str, terminal: Termina
         ("import no_such_thing\n", r"own\.py:1: cannot load \./own\.py: ModuleNotFoundError"),
         ("x = 1\ny = x / 0\n", r"own\.py:2: cannot load \./own\.py: ZeroDivisionError"),
         ("raise SystemExit(5)\n", r"own\.py:1: cannot load \./own\.py: SystemExit"),
-        (
-            "class _A:\n    def process(self): ...\n",
-            r"own\.py has no public class that inherits from Stage",
-        ),
+        ("class _A:\n    def process(self): ...\n", r"own\.py has no public class that inherits from Stage"),
     ],
 )
 def test_a_mistake_in_an_own_file_is_shown_with_its_line(body: str, words: str, terminal: Terminal) -> None:

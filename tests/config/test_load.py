@@ -46,7 +46,7 @@ def load(tmp_path: Path) -> Load:
     return from_text
 
 
-def test_a_loose_file_named_on_the_command_line_stands_in_the_current_folder(
+def test_a_loose_file_of_the_command_line_is_relative_to_the_current_folder(
     load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = tmp_path / "here"
@@ -91,7 +91,7 @@ def test_the_nearest_stage_above_wins_and_sinks_take_the_last(load: Load) -> Non
     assert load(last).nodes["out"].inputs["image"] == Ref("invert", "image")
 
 
-def test_in_names_outputs_and_can_take_an_optional_one_away(load: Load) -> None:
+def test_in_names_outputs_and_null_disconnects_an_optional_input(load: Load) -> None:
     text = BODY.replace("sinks:", "  invert: {use: './parts.py:Invert'}\nsinks:")
     for reference, stage in (("image", "invert"), ("prepare.image", "prepare")):
         inputs = load(text, f"sinks.out.in.image={reference}").nodes["out"].inputs
@@ -119,7 +119,7 @@ def test_when_makes_gates(text: str, expected: list[Gate], load: Load) -> None:
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_a_gate_on_a_held_signal_means_what_the_signal_itself_means(times: int, load: Load) -> None:
+def test_a_gate_on_a_held_signal_has_the_reason_of_the_signal(times: int, load: Load) -> None:
     text = BODY
     for count in range(times):
         giver = f"held_{count - 1}.held" if count else "compare.touching"
@@ -295,11 +295,7 @@ def test_two_sinks_do_not_write_the_same_file(second: str, clash: bool, load: Lo
 
 @pytest.mark.parametrize("link", [None, os.symlink])
 @pytest.mark.parametrize(
-    ("read", "what"),
-    [
-        ("press[1].npy", "what stages.capture reads"),
-        ("p.yaml", "the pipeline file"),
-    ],
+    ("read", "what"), [("press[1].npy", "what stages.capture reads"), ("p.yaml", "the pipeline file")]
 )
 def test_a_sink_never_writes_over_what_the_run_reads(
     read: str, what: str, link: Callable[[Path, Path], None] | None, load: Load, tmp_path: Path

@@ -39,7 +39,7 @@ def test_a_shipped_pipeline_sees_a_simulated_press(name: str) -> None:
     assert (found[-1].markers is None) == (name in PLAIN)
 
 
-def test_a_name_that_is_no_file_finds_the_shipped_pipeline(
+def test_a_name_without_a_file_finds_the_shipped_pipeline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -48,7 +48,7 @@ def test_a_name_that_is_no_file_finds_the_shipped_pipeline(
     assert find_pipeline("mini") == Path("mini")
 
 
-def test_a_calibration_that_is_missing_is_told_with_both_places_where_it_may_lie(
+def test_a_missing_calibration_is_reported_with_both_places_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -51,12 +51,7 @@ def toy_runner(tmp_path: Path) -> MakeRunner:
             else:
                 merged[name] = {**merged.get(name, {}), **body}
         chosen = {name: dict(body) for name, body in (sinks or {"out": {"use": "Collect"}}).items()}
-        document = {
-            "sensor": "toy",
-            **top,
-            "stages": merged,
-            "sinks": chosen,
-        }
+        document = {"sensor": "toy", **top, "stages": merged, "sinks": chosen}
         for body in (*document["stages"].values(), *document["sinks"].values()):
             body["use"] = f"./toys.py:{body['use']}"
         path = tmp_path / "toy.yaml"

@@ -45,7 +45,7 @@ def test_a_class_that_breaks_the_contract_is_refused(base: type, changes: Any, w
     assert words in wrong(base, **changes)
 
 
-def test_a_class_that_inherits_from_nothing_is_told_what_to_inherit_from() -> None:
+def test_a_class_without_a_base_is_refused_with_its_place() -> None:
     class Loose:
         def write(self, image: Image) -> None: ...
 

@@ -11,15 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.frame import Absent, Frame, Tick
-from tactflow.engine.ports import (
-    ArrayPort,
-    Port,
-    ResultParameter,
-    SignalPort,
-    fits,
-    port_type,
-    read_ports,
-)
+from tactflow.engine.ports import ArrayPort, Port, ResultParameter, SignalPort, fits, port_type, read_ports
 from tactflow.ports import ContactMask, Image, Picture, Touching
 from tactflow.vision.types import Contact, Flow
 

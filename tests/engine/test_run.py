@@ -142,7 +142,7 @@ def test_a_gate_spares_nothing_in_other_segments(toy_runner: MakeRunner) -> None
     assert seen(runner, "gated") == [i for i in range(20) if 3 <= i % 10 <= 6]
 
 
-def test_behind_a_closed_gate_another_gate_is_not_even_looked_at(toy_runner: MakeRunner) -> None:
+def test_behind_a_closed_gate_another_gate_is_not_evaluated(toy_runner: MakeRunner) -> None:
     stages: dict[str, Any] = {
         "behind": {"use": "Gated", "when": "pulse.active"},
         "even": {"use": "Even"},
@@ -193,7 +193,9 @@ def test_a_pure_stage_is_not_run_again_on_inputs_it_has_seen(
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_what_one_gate_says_is_nothing_is_not_repeated_by_another(toy_runner: MakeRunner, order: int) -> None:
+def test_outputs_that_one_gate_makes_absent_are_not_repeated_by_another(
+    toy_runner: MakeRunner, order: int
+) -> None:
     gates = ["pulse.active", "even.repeating"]
     runner = toy_runner({"even": {"use": "Even"}, "gated": {"when": gates[::order]}})
     ran(runner)
@@ -223,7 +225,7 @@ def test_only_what_a_sink_wants_is_computed_but_memory_is_kept(
     assert result.stats["stages"]["join"]["skips"] == {"no_demand": 20 - len(wanted)}
 
 
-def test_a_stage_that_no_sink_needs_is_not_built_and_the_user_is_told(toy_runner: MakeRunner) -> None:
+def test_a_stage_that_no_sink_needs_is_not_built_and_gives_a_warning(toy_runner: MakeRunner) -> None:
     runner = toy_runner(sinks={"out": {"use": "OnlyLevel"}})
     assert {node.id for node in runner.plan.pruned} == {"pulse", "heavy", "gated", "total", "join"}
     assert "toy.yaml:" in runner.plan.warnings[0]
@@ -232,7 +234,9 @@ def test_a_stage_that_no_sink_needs_is_not_built_and_the_user_is_told(toy_runner
     assert set(runner.nodes) == {"level", "out"}
 
 
-def test_an_absent_value_skips_who_requires_it_with_the_same_reason(toy_runner: MakeRunner) -> None:
+def test_an_absent_value_skips_the_stages_that_require_it_with_the_same_reason(
+    toy_runner: MakeRunner,
+) -> None:
     stages = {"rare": {"use": "Rare"}, "heavy": {"in": {"level": "rare.number"}}, "gated": {"when": []}}
     runner = toy_runner(stages)
     result = ran(runner)
@@ -298,9 +302,7 @@ def test_a_new_reference_resets_other_stages_and_reaches_sinks_that_take_referen
     assert rows(runner, "kept") == [0, 8]
 
 
-def test_where_other_stages_run_ahead_the_source_is_asked_for_a_new_reference(
-    toy_runner: MakeRunner,
-) -> None:
+def test_where_other_stages_run_ahead_the_source_is_asked_for_a_new_reference(toy_runner: MakeRunner) -> None:
     runner = toy_runner({"doubtful": {"use": "Doubtful", "segment": "other"}}, FRAMES)
     ran(runner)
     assert not any(row[2] for row in rows(runner))
@@ -365,7 +367,7 @@ def test_a_failing_data_sink_ends_the_run_and_a_failing_viewer_does_not(toy_runn
     assert len(rows(runner, "view")) == 5
 
 
-def test_what_cannot_be_opened_is_named_with_its_line(toy_runner: MakeRunner) -> None:
+def test_a_source_that_cannot_be_opened_is_named_with_its_line(toy_runner: MakeRunner) -> None:
     result = toy_runner({"capture": {"refuse": True}}).run()
     assert result.exit_code == 4
     assert "cannot be opened: OSError: no such device" in str(result.error)

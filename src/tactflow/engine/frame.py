@@ -102,10 +102,7 @@ class Tick(Mapping[str, Any]):
     __slots__ = ("_values", "frame", "skipped")
 
     def __init__(
-        self,
-        frame: Frame,
-        values: Mapping[str, Any] | None = None,
-        skipped: Mapping[str, str] | None = None,
+        self, frame: Frame, values: Mapping[str, Any] | None = None, skipped: Mapping[str, str] | None = None
     ) -> None:
         self.frame = frame
         self._values = {} if values is None else values

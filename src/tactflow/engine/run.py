@@ -67,13 +67,7 @@ class Runner:
         If the pipeline cannot be planned, or `max_frames` is less than 1. Nothing was started.
     """
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        *,
-        max_frames: int | None = None,
-        check: bool = False,
-    ) -> None:
+    def __init__(self, pipeline: Pipeline, *, max_frames: int | None = None, check: bool = False) -> None:
         if max_frames is not None and max_frames < 1:
             raise ConfigError(f"max_frames: required a whole number from 1, got {max_frames}")
         self.pipeline = pipeline
