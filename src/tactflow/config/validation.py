@@ -89,7 +89,7 @@ def report(
         kind, name = detail["type"], str(place[-1]) if place else ""
         is_own = len(place) == len(keys) + 1
         if kind == "missing" and not rest:
-            about = named[name].description if is_own else None
+            about = named[name].description if is_own and name in named else None
             message = _message(detail) + (f" ({about})" if about else "")
             document.report_at(document.mark(*place[:-1]), f"{dotted(place)}: {message}")
         elif kind == "extra_forbidden" and not rest:
