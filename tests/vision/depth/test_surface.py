@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactflow.vision.depth.poisson import integrate
+from tactflow.vision.depth.poisson import ALL_OPEN, Sides, integrate
 from tactflow.vision.depth.slopes import BAND, STEEPEST, SlopeModel, coordinates, place_terms
 from tactflow.vision.depth.surface import Rest, Surface, colour_change
-from tactflow.vision.depth.surroundings import OpenSides, resting, surroundings
+from tactflow.vision.depth.surroundings import resting, surroundings
 from tactflow.vision.types import Scale
 
 GEL = np.full((80, 120, 3), (90, 120, 100), np.uint8)
@@ -21,22 +21,27 @@ def test_heights_are_those_of_the_surface_that_has_the_slopes() -> None:
     slope_y, slope_x = np.gradient(surface)
     slope = np.stack([slope_x, slope_y]).astype(np.float32)
     assert np.abs(integrate(slope, (1, 1)) - surface).max() < 0.2
-    open_sides = integrate(slope, (1, 1), OpenSides(True, True, True, True))
+    open_sides = integrate(slope, (1, 1), ALL_OPEN)
     assert np.abs(open_sides - open_sides[0, 0] - (surface - surface[0, 0])).max() < 0.2
 
 
-@pytest.mark.parametrize("cut", OpenSides._fields)
-def test_a_surface_that_one_side_of_the_window_cuts_off_is_at_rest_at_the_others(cut: str) -> None:
+@pytest.mark.parametrize(
+    ("part", "sides"),
+    [
+        (np.s_[:, 40:], ((True, False), (False, False))),
+        (np.s_[:, :40], ((False, True), (False, False))),
+        (np.s_[40:, :], ((False, False), (True, False))),
+        (np.s_[:40, :], ((False, False), (False, True))),
+    ],
+    ids=["left", "right", "top", "bottom"],
+)
+def test_a_surface_that_one_side_of_the_window_cuts_off_is_at_rest_at_the_others(
+    part: tuple[slice, slice], sides: Sides
+) -> None:
     y, x = np.mgrid[:80, :80].astype(np.float32)
     surface = 8 * np.exp(-((x - 40) ** 2 + (y - 40) ** 2) / 90)
     slope = np.stack(np.gradient(surface)[::-1]).astype(np.float32)
-    part = {
-        "left": np.s_[:, 40:],
-        "right": np.s_[:, :40],
-        "top": np.s_[40:, :],
-        "bottom": np.s_[:40, :],
-    }[cut]
-    found = integrate(slope[(slice(None), *part)], (1, 1), OpenSides(**{cut: True}))
+    found = integrate(slope[(slice(None), *part)], (1, 1), sides)
     assert np.abs(found - surface[part]).max() < 0.25
 
 
@@ -50,7 +55,7 @@ def test_sides_of_any_length_are_integrated(size: tuple[int, int]) -> None:
         slope[0, :, column] = 2 * np.diff(surface, axis=1)[:, column - 1] - slope[0, :, column - 1]
     for row in range(1, size[0]):
         slope[1, row] = 2 * np.diff(surface, axis=0)[row - 1] - slope[1, row - 1]
-    found = integrate(slope.astype(np.float32), (1, 1), OpenSides(True, True, True, True))
+    found = integrate(slope.astype(np.float32), (1, 1), ALL_OPEN)
     assert found - found[0, 0] == pytest.approx(surface - surface[0, 0], abs=1e-2)
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import scipy.fft
 
 from tactflow.vision.arrays import Floats32
-from tactflow.vision.depth.surroundings import OpenSides
 
 _Transform = Callable[..., Any]
 
-AT_REST: Final = OpenSides()
-"""No side is open."""
+Sides = tuple[tuple[bool, bool], tuple[bool, bool]]
+"""Whether the surface goes on beyond the left and right, and beyond the top and bottom; else it is at rest
+there, at height 0."""
+ALL_OPEN: Final = ((True, True), (True, True))
 _TRANSFORMS: Final[Mapping[tuple[bool, bool], tuple[_Transform, _Transform, int, float]]] = {
     (True, True): (scipy.fft.dct, scipy.fft.idct, 2, 0.0),
     (True, False): (scipy.fft.dct, scipy.fft.idct, 4, 0.5),
@@ -26,7 +27,9 @@ frequency of the first component, in half waves. All of them mirror the surface 
 where it goes on, upside down where it is at rest."""
 
 
-def integrate(slope: Floats32, step: tuple[float, float], sides: OpenSides = AT_REST) -> Floats32:
+def integrate(
+    slope: Floats32, step: tuple[float, float], sides: Sides = ((False, False), (False, False))
+) -> Floats32:
     """Heights whose slopes are closest to the measured ones, in least squares.
 
     Poisson's equation, solved by cosine and sine transforms. Where all sides are open the mean height is 0.
@@ -35,7 +38,7 @@ def integrate(slope: Floats32, step: tuple[float, float], sides: OpenSides = AT_
     ----------
     slope : (2, h, w) float32, growth to the right and down; quick where h and w are products of 2, 3 and 5.
     step : from a pixel to the next one, to the right and down, in the unit of the heights.
-    sides : which of them are open.
+    sides : open ones.
 
     Returns
     -------
@@ -49,20 +52,20 @@ def integrate(slope: Floats32, step: tuple[float, float], sides: OpenSides = AT_
     Examples
     --------
     >>> slope = np.stack([np.full((4, 6), 2, np.float32), np.zeros((4, 6), np.float32)])
-    >>> np.round(integrate(slope, (0.5, 0.5), OpenSides(True, True, True, True))[0], 3).tolist()
+    >>> np.round(integrate(slope, (0.5, 0.5), ALL_OPEN)[0], 3).tolist()
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
-    >>> np.round(integrate(slope, (0.5, 0.5), OpenSides(False, True, True, True))[0], 3).tolist()
+    >>> np.round(integrate(slope, (0.5, 0.5), ((False, True), (True, True)))[0], 3).tolist()
     [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
     """
-    across, across_back, across_type, first_across = _TRANSFORMS[sides.left, sides.right]
-    down, down_back, down_type, first_down = _TRANSFORMS[sides.top, sides.bottom]
-    divergence = _rise(slope[0].T, step[0], (sides.left, sides.right)).T
-    divergence = divergence + _rise(slope[1], step[1], (sides.top, sides.bottom))
+    across, across_back, across_type, first_across = _TRANSFORMS[sides[0]]
+    down, down_back, down_type, first_down = _TRANSFORMS[sides[1]]
+    divergence = _rise(slope[0].T, step[0], sides[0]).T
+    divergence = divergence + _rise(slope[1], step[1], sides[1])
     spectrum = across(divergence, across_type, axis=1, norm="ortho", overwrite_x=True)
     spectrum = down(spectrum, down_type, axis=0, norm="ortho", overwrite_x=True)
     height, width = spectrum.shape
     eigenvalues = np.add.outer(_eigenvalues(height, first_down), _eigenvalues(width, first_across))
-    if all(sides):
+    if sides == ALL_OPEN:
         # The mean is not known from slopes.
         eigenvalues[0, 0] = np.inf
     spectrum /= eigenvalues

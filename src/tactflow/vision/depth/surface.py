@@ -166,12 +166,12 @@ class Surface:
 
     def _integrated(self, slope: Floats32, window: Window, whole: Window) -> Floats32:
         # Only here: runs without a calibration do not need SciPy's transforms.
-        from tactflow.vision.depth.poisson import integrate
+        from tactflow.vision.depth.poisson import ALL_OPEN, integrate
 
         # A step is two processed pixels. Slopes rise towards the camera, into which the gel is pushed.
-        sides = window.cut_by(whole)
+        sides = window.open_sides(whole)
         heights = integrate(slope, (-2 * self._scale.x, -2 * self._scale.y), sides)
-        if all(sides):
+        if sides == ALL_OPEN:
             # The picture shows no border at rest; most of its border lies outside the contact.
             border = np.concatenate([heights[0], heights[-1], heights[:, 0], heights[:, -1]])
             heights -= np.median(border)

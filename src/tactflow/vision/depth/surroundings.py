@@ -21,15 +21,6 @@ FADED: Final = 0.05
 far away: what lies beyond adds a hundredth to the depth."""
 
 
-class OpenSides(NamedTuple):
-    """Sides beyond which the surface of a window goes on; beyond the others it is at rest, at height 0."""
-
-    left: bool = False
-    right: bool = False
-    top: bool = False
-    bottom: bool = False
-
-
 class Window(NamedTuple):
     """Part of a picture at half resolution, px."""
 
@@ -48,14 +39,10 @@ class Window(NamedTuple):
         """Columns."""
         return self.right - self.left
 
-    def cut_by(self, whole: Window) -> OpenSides:
-        """Which of its sides the picture cuts off. whole : the picture."""
-        return OpenSides(
-            self.left == whole.left,
-            self.right == whole.right,
-            self.top == whole.top,
-            self.bottom == whole.bottom,
-        )
+    def open_sides(self, whole: Window) -> tuple[tuple[bool, bool], tuple[bool, bool]]:
+        """Whether the picture `whole` cuts off its left and right, and its top and bottom."""
+        across = self.left == whole.left, self.right == whole.right
+        return across, (self.top == whole.top, self.bottom == whole.bottom)
 
     @property
     def part(self) -> tuple[slice, slice]:
