@@ -143,3 +143,21 @@ def test_the_markers_must_be_those_of_the_reference() -> None:
 def test_parameters_out_of_range_are_refused(values: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="required"):
         MotionTest(ORIGIN, **values)
+
+
+@pytest.mark.parametrize("count", [3, 4, 60, 61])
+@pytest.mark.parametrize("digits", [0, 15])
+def test_the_motion_of_the_whole_gel_is_taken_by_medians(count: int, digits: int) -> None:
+    rng = np.random.default_rng(count)
+    origin = rng.uniform(0, 300, (count, 2))
+    displacement = np.round(rng.normal(0, 2, (count, 2)), digits)
+    motion = MotionTest(origin)(
+        Markers(origin, origin + displacement, np.zeros(count, np.uint8), np.full(count, 0.02))
+    )
+    arms = origin - origin.mean(axis=0)
+    rest = displacement - np.median(displacement, axis=0)
+    levers = arms / np.maximum((arms**2).sum(axis=1, keepdims=True), 1)
+    turn = np.median(levers[:, 0] * rest[:, 1] - levers[:, 1] * rest[:, 0])
+    rest -= turn * arms[:, ::-1] * [-1, 1]
+    np.testing.assert_allclose(motion.left, np.hypot(*rest.T), atol=1e-9)
+    assert motion.largest == pytest.approx(np.sort(motion.left)[-3])

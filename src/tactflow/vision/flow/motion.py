@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Indices, Points
+from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.markers.lattice import LONGEST_LINK, neighbour_graph, pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -117,15 +118,13 @@ class MotionTest:
         self.count = count = len(self._origin)
         """Number of markers."""
         arms = self._origin - (self._origin.mean(axis=0) if count else 0.0)
-        # Motion of each marker in a turn by 1 radian about the centre; the same over its squared length.
-        self._turning = arms[:, ::-1] * [-1.0, 1.0]
-        self._levers = self._turning / np.maximum((arms * arms).sum(axis=1, keepdims=True), 1.0)
+        levers = arms / np.maximum((arms * arms).sum(axis=1, keepdims=True), 1.0)
+        self._rest = np.ascontiguousarray(np.hstack([self._origin, arms, levers]).T)
         self._variance = steadiness**2
         self._relaxation = relaxation
         self.pitch = pitch_of(self._origin) if count > 1 else 0.0
         """Median distance of a marker to its nearest neighbour, px; 0 for fewer than two."""
         self._links = neighbour_graph(self._origin, LONGEST_LINK * self.pitch)
-        self._neighbours = _neighbours(self._links, count)
         # A motion in a plane exceeds k standard deviations with exp(-k^2 / 2); three must at once.
         alone = (false_alarms / (TRIPLES * max(1, count))) ** (1 / TOGETHER)
         self._limit = math.sqrt(-2 * math.log(alone))
@@ -140,15 +139,17 @@ class MotionTest:
         """
         if len(markers.position) != len(self._origin):
             raise ValueError(f"required {len(self._origin)} markers, got {len(markers.position)}")
-        left = self._unexplained(markers)
-        bound = self._limit * np.sqrt(np.square(markers.stderr) + self._variance)
-        ratio = np.zeros(self.count + 1)
-        # Nothing exceeds an unknown standard error.
-        exceeds = (left > self._relaxation * self._strongest) & (bound > 0)
-        np.divide(left, bound, out=ratio[:-1], where=exceeds)
-        second = np.sort(ratio[self._neighbours], axis=1)[:, -2]
-        chain = float(np.minimum(ratio[:-1], second).max(initial=0.0))
-        largest = float(np.sort(left)[-TOGETHER]) if len(left) >= TOGETHER else 0.0
+        left, bound = np.zeros(self.count), np.empty(self.count)
+        largest, chain = rate_motion(
+            np.ascontiguousarray(markers.position, np.float64),
+            markers.status == _TRACKED,
+            np.ascontiguousarray(markers.stderr, np.float64),
+            self._rest,
+            self._links,
+            (self._limit, self._variance, self._relaxation * self._strongest),
+            left,
+            bound,
+        )
         self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
         alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
         self._largest = largest
@@ -157,16 +158,6 @@ class MotionTest:
         self._moving = self._clearly or chain > (STAY if self._moving else 1.0)
         self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
         return Motion(self._moving, self._clearly, largest, left, bound)
-
-    def _unexplained(self, markers: Markers) -> Floats:
-        """(N,), `Motion.left`: the residual after a shift and a turn, estimated by medians."""
-        seen = markers.status == _TRACKED
-        if np.count_nonzero(seen) < TOGETHER:
-            return np.zeros(self.count)
-        moved = markers.position - self._origin
-        moved -= _median(moved[seen])
-        moved -= _median((self._levers * moved).sum(axis=1)[seen]) * self._turning
-        return np.where(seen, np.hypot(moved[:, 0], moved[:, 1]), 0.0)
 
     def stretched(self, markers: Markers) -> Points:
         """Positions (K, 2), px, of the markers at the most strained links between tracked ones.
@@ -183,17 +174,87 @@ class MotionTest:
         return np.asarray(markers.position[np.unique(most)], np.float64)
 
 
-def _median(values: Floats) -> Floats:
-    """Median of numbers or of rows, along the first axis. `np.median` takes four times as long."""
-    ordered, count = np.sort(values, axis=0), len(values)
-    return np.asarray((ordered[(count - 1) // 2] + ordered[count // 2]) / 2)
+@kernel(
+    "UniTuple(float64, 2)(float64[:, ::1], boolean[::1], float64[::1], float64[:, ::1], int64[:, ::1],"
+    " UniTuple(float64, 3), float64[::1], float64[::1])"
+)
+def rate_motion(
+    position: Points,
+    tracked: Flags,
+    stderr: Floats,
+    rest: Floats,
+    links: Indices,
+    limits: tuple[float, float, float],
+    left: Floats,
+    bound: Floats,
+) -> tuple[float, float]:
+    """The third largest motion, px, and the largest multiple of its threshold that each marker of a chain of
+    three neighbours reaches.
+
+    position : (N, 2), px. tracked : (N,). stderr : (N,), px, NaN where unknown. rest : (6, N), of each marker
+    in the reference: x and y, and its arm, x and y from the middle of all, px; the arm over its square, 1/px.
+    links : (L, 2), neighbours. limits : threshold, standard deviations; variance of markers of an untouched
+    gel, px^2; motion up to which a marker of a released gel is at rest, px. left : (N,) of 0, filled, see
+    `Motion`; stays 0 with fewer than three tracked markers. bound : (N,), filled, see `Motion`.
+    """
+    shift_x = shift_y = middle = 0.0
+    count: Any = np.int64(0)
+    # The shift by x and by y, then the turn: each marker's motion across its arm, over the arm's length.
+    for part in range(3):
+        count = np.int64(0)
+        for i in range(left.size):
+            if tracked[i]:
+                x, y = position[i, 0] - rest[0, i] - shift_x, position[i, 1] - rest[1, i] - shift_y
+                bound[count] = x if part == 0 else y if part == 1 else y * rest[4, i] - x * rest[5, i]
+                count += 1
+        middle = _median(bound, count) if count else 0.0
+        shift_x, shift_y = middle if part == 0 else shift_x, middle if part == 1 else shift_y
+    most = second = third = chain = 0.0
+    # The two largest ratios among the neighbours of each marker.
+    ratio, largest, second_largest = np.zeros((3, left.size))
+    for i in range(left.size):
+        if tracked[i] and count >= TOGETHER:
+            x = position[i, 0] - rest[0, i] - shift_x + middle * rest[3, i]
+            y = position[i, 1] - rest[1, i] - shift_y - middle * rest[2, i]
+            left[i] = math.sqrt(x * x + y * y)
+        third = max(third, min(left[i], second))
+        second = max(second, min(left[i], most))
+        most = max(most, left[i])
+        bound[i] = limits[0] * math.sqrt(stderr[i] * stderr[i] + limits[1])
+        # Nothing exceeds an unknown standard error, NaN.
+        if left[i] > limits[2] and bound[i] > 0:
+            ratio[i] = left[i] / bound[i]
+    for k in range(len(links)):
+        for end in range(2):
+            i, other = links[k, end], ratio[links[k, 1 - end]]
+            second_largest[i] = max(second_largest[i], min(other, largest[i]))
+            largest[i] = max(largest[i], other)
+    for i in range(left.size):
+        chain = max(chain, min(ratio[i], second_largest[i]))
+    return third, chain
 
 
-def _neighbours(links: Indices, count: int) -> Indices:
-    """(N, K), K >= 2, neighbours of each of `count` markers, filled up with `count`. links : (L, 2)."""
-    both = np.concatenate([links, links[:, ::-1]])
-    first, second = both[np.argsort(both[:, 0], kind="stable")].T
-    place = np.arange(len(first)) - np.searchsorted(first, first)
-    neighbours = np.full((count, max(place.max(initial=0) + 1, 2)), count)
-    neighbours[first, place] = second
-    return neighbours
+@helper
+def _median(values: Floats, count: int) -> float:
+    """The median of the first `count` values, which it reorders (Hoare's selection).
+
+    With `np.median`, the kernel takes several times as long to compile.
+    """
+    upper = count // 2
+    first, last = 0, count - 1
+    while first < last:
+        middle, i, j = values[upper], first, last
+        while i <= j:
+            while values[i] < middle:
+                i += 1
+            while values[j] > middle:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        first, last = i if j < upper else first, j if i > upper else last
+    lower = values[upper if count % 2 else 0]
+    for i in range(0 if count % 2 else upper):
+        lower = max(lower, values[i])
+    return float(lower + values[upper]) / 2
