@@ -144,7 +144,7 @@ def test_one_that_fails_stops_no_other_and_is_tried_again(call: Call) -> None:
     assert "1 done now, 1 done before, 0 failed" in call.stderr
 
 
-def test_one_signal_finishes_what_runs_and_leaves_the_rest_for_the_next_call(
+def test_one_signal_finishes_running_recordings_and_leaves_the_rest(
     call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     submit = InThisProcess.submit

@@ -36,7 +36,7 @@ def test_a_folder_is_searched_and_one_of_pictures_is_a_recording(data: Path) -> 
     assert all(Path(recording.source).is_absolute() for recording in found)
 
 
-def test_a_pattern_stands_for_what_matches_and_pictures_are_one_recording(data: Path) -> None:
+def test_a_pattern_names_its_matches_and_pictures_are_one_recording(data: Path) -> None:
     assert names("*/press-2.npy") == ["a/press-2.npy", "b/press-2.npy"]
     (one,) = find_recordings(["pictures/*.png"])
     assert one.source.endswith("pictures/*.png")
@@ -64,13 +64,13 @@ def test_options_behind_a_pattern_hold_for_all_that_match(data: Path) -> None:
         (["pictures/1.png"], "name its folder"),
     ],
 )
-def test_what_names_no_recording_is_said(data: Path, words: list[str], message: str) -> None:
+def test_words_that_name_no_recording_are_rejected(data: Path, words: list[str], message: str) -> None:
     (data / "a" / "empty").mkdir()
     with pytest.raises(ConfigError, match=message):
         find_recordings(words)
 
 
-def test_all_mistakes_are_told_at_once(data: Path) -> None:
+def test_all_mistakes_are_reported_at_once(data: Path) -> None:
     (data / "empty").mkdir()
     with pytest.raises(ConfigError) as raised:
         find_recordings(["no.npy", "none.npy", "empty"])

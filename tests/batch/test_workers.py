@@ -98,7 +98,9 @@ def endless(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
         process.communicate()
 
 
-def test_a_second_signal_gives_up_what_runs(folder: Path, endless: tuple[subprocess.Popen[str], int]) -> None:
+def test_a_second_signal_aborts_running_recordings(
+    folder: Path, endless: tuple[subprocess.Popen[str], int]
+) -> None:
     process, worker = endless
     process.send_signal(signal.SIGINT)
     time.sleep(1.0)

@@ -74,7 +74,7 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(termin
 
 
 @pytest.mark.parametrize(("rows_apart", "warned"), [(30, False), (28, True)])
-def test_a_scale_from_dots_in_no_square_grid_is_told(
+def test_a_scale_from_an_irregular_grid_is_reported_as_inaccurate(
     rows_apart: int, warned: bool, terminal: Terminal
 ) -> None:
     picture = np.full((240, 320, 3), 150, np.uint8)
@@ -101,7 +101,7 @@ def test_a_scale_from_dots_in_no_square_grid_is_told(
         (["force", "nowhere.yaml", "--from", "sim:idle"], "nowhere.yaml"),
     ],
 )
-def test_what_gives_no_calibration_is_refused_in_words(
+def test_unusable_options_and_recordings_are_rejected(
     words: list[str], message: str, tmp_path: Path, terminal: Terminal
 ) -> None:
     assert terminal("calibrate", *words) == 2

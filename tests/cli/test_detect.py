@@ -13,7 +13,7 @@ from tests.terminal import Terminal
 GEL = "sim:press?frames=2"
 
 
-def test_what_was_found_is_told_and_drawn(tmp_path: Path, terminal: Terminal) -> None:
+def test_detected_dots_are_described_and_drawn(tmp_path: Path, terminal: Terminal) -> None:
     file = tmp_path / "found.png"
     assert terminal("detect", GEL, "--downsample", "2", "--picture", str(file)) == 0
     title, *lines = terminal.out.splitlines()

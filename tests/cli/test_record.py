@@ -132,7 +132,7 @@ def test_repair_leaves_a_whole_file_alone_and_replaces_nothing_unasked(
 
 
 @pytest.mark.parametrize(("content", "words"), [(b"no", "is not an MCAP file"), (None, "no such file")])
-def test_repair_refuses_what_is_no_recording(
+def test_repair_rejects_other_files(
     tmp_path: Path, content: bytes | None, words: str, terminal: Terminal
 ) -> None:
     path = tmp_path / "a.mcap"

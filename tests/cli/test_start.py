@@ -82,7 +82,7 @@ def test_a_gel_whose_presses_no_pipeline_finds_is_not_set_up(terminal: Terminal)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="cameras have no list outside Linux")
-def test_without_a_camera_it_is_said_what_to_do(tmp_path: Path) -> None:
+def test_without_a_camera_the_error_says_what_to_do(tmp_path: Path) -> None:
     args = make_parser("start").parse_args(["start", "--out", str(tmp_path / "made.yaml")])
     args.dev = tmp_path
     with pytest.raises(SourceError, match="no camera is plugged in") as caught:

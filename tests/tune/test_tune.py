@@ -53,7 +53,7 @@ def test_the_simulated_sensor_looks_like_the_recorded_one(recorded: Recording) -
     assert look.levels == pytest.approx((1.0, 1.0, 1.0), abs=0.05)
 
 
-def test_what_is_chosen_keeps_the_budget_in_truth_and_nothing_cheaper_does(
+def test_the_choice_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal
 ) -> None:
     monkeypatch.setattr(space, "AXES", FIELD)
@@ -86,7 +86,7 @@ def test_the_order_follows_the_goal() -> None:
     assert Goal().order(trials)[0].name == "slow"
 
 
-def test_an_impossible_budget_tells_what_is_possible(recorded: Recording) -> None:
+def test_an_impossible_budget_is_answered_with_what_is_possible(recorded: Recording) -> None:
     trials = [make_trial("exact", 9, 0.1), make_trial("fast", 1, 2.0)]
     possible = "Possible: 0.1 px in 9 ms (exact), or 2 px in 1 ms (fast)"
     assert Tuned(recorded, SMALL, trials).impossible().endswith(possible)
@@ -101,9 +101,7 @@ def test_a_pipeline_that_misses_contacts_is_not_sound() -> None:
     assert "40 (best 0)" in trials[1].fault
 
 
-def test_what_is_changed_stands_in_the_file_and_removed_stages_are_gone(
-    recorded: Recording, tmp_path: Path
-) -> None:
+def test_the_file_lists_the_changes_and_lacks_removed_stages(recorded: Recording, tmp_path: Path) -> None:
     settings = {"stages.preprocess.downsample": 4, "stages.fusion": None, "skipping": False}
     pipeline = tactflow.load("default", settings=settings)
     chosen = make_trial("chosen", 1, 1, settings=settings, pipeline=pipeline)

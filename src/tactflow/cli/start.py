@@ -204,7 +204,7 @@ def _press(reader: FrameReader, observation: Observation, questions: Questions, 
 def _decide(
     args: argparse.Namespace, best: Attempt, sample: Sample, remarks: Sequence[str], questions: Questions
 ) -> str:
-    """Show the proposal; returns write, again or quit. Raises StageError with --yes if there is none."""
+    """Show the proposal; returns write, again or quit. Raises StageError if --yes has nothing to accept."""
     choices = {"write": f"Write {args.out}" + ("" if args.no_run else " and go on live")}
     if questions.reader is not None:
         choices["again"] = "Look again"

@@ -2,5 +2,5 @@
 
 `recording` extracts the part with a contact, `sensor` fits the simulator to it, `space` lists candidates,
 `measure` evaluates them, `search` chooses one, `report` writes the result. `propose` picks a shipped pipeline
-for a sensor of which nothing is known.
+for an unknown sensor.
 """
