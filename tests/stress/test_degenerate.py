@@ -105,8 +105,7 @@ def test_frames_of_two_megapixels_have_an_answer(method: str) -> None:
 def test_markers_far_outside_the_picture_have_a_defined_flow_and_are_drawn() -> None:
     at = np.array([[-500, 1e9], [40, 30], [1e300, 0]])
     markers = Markers(at, at + 1, np.zeros(3, np.uint8), np.full(3, np.nan))
-    for dilate in (0.0, 7.5, 1e6):
-        assert_defined(flow_in_mask(markers, np.full((HEIGHT, WIDTH), 255, np.uint8), dilate=dilate))
+    assert_defined(flow_in_mask(markers, np.full((HEIGHT, WIDTH), 255, np.uint8)))
     near = Markers(np.clip(at, -1e7, 1e7), np.clip(at, -1e7, 1e7) + 1, markers.status, markers.stderr)
     assert Annotator()(np.zeros((HEIGHT, WIDTH, 3), np.uint8), markers=near).shape == (HEIGHT, WIDTH, 3)
 
