@@ -64,18 +64,16 @@ def plain_scaled_change(
     down: Float,
     mean: Float,
     scale: Float,
-    pattern: Float,
     change: Float,
 ) -> None:
-    """The change less that of light and pattern, in standard deviations, smoothed along x."""
+    """The change less that of the light, in standard deviations, smoothed along x."""
     high, wide = len(change), change.shape[1] // 3
     rows, columns = slice(top, top + high), slice(left, left + wide)
-    planes, usual, unit, toward = (
+    planes, usual, unit = (
         array.reshape(len(array), -1, 3)[rows, columns].transpose(2, 0, 1)
-        for array in (picture, mean, scale, pattern)
+        for array in (picture, mean, scale)
     )
     scaled = _change(planes, usual, coefficients, across[columns], down[rows]) * unit
-    scaled -= toward * (toward * scaled).sum(axis=0)
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
     smooth = cv2.sepFilter2D(np.stack(list(scaled), axis=2), cv2.CV_32F, weights, np.ones(1))
     change[:] = smooth.reshape(change.shape)

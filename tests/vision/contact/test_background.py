@@ -237,7 +237,7 @@ def test_the_first_contact_waits_for_nothing_that_the_untouched_gel_could_tell(
     pressed[20:40, 20:40] = 160
     model = BackgroundModel(gel, repeatability=0.025, tint=0.01, shift=1.0)
     model.compare(gel, None, None)
-    monkeypatch.delattr(background, "_steepness_of_pattern")
+    monkeypatch.delattr(background, "_steepness")
     change = model.compare(pressed, None, None)
     window = model.window_change(change, slice(0, 16), slice(0, 12), np.ones((16, 12), np.bool_))
     # Measured: 20 against 3.6, what is left of the gain that is taken out.

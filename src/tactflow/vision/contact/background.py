@@ -71,13 +71,11 @@ class Change(NamedTuple):
 class _Untouched:
     """The untouched gel at half resolution, for outlines; (h, 3 w) float32 each.
 
-    mean : grey levels. scale : one over the standard deviation. pattern : direction in which a change is
-    ignored, see `scaled_change`.
+    mean : grey levels. scale : one over the standard deviation.
     """
 
     mean: Floats32
     scale: Floats32
-    pattern: Floats32
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +254,6 @@ class BackgroundModel:
             positions(len(change.half)),
             self._untouched.mean,
             self._untouched.scale,
-            self._untouched.pattern,
             scaled,
         )
         smooth = cv2.sepFilter2D(
@@ -278,20 +275,14 @@ class BackgroundModel:
         """The untouched gel at half resolution, for outlines.
 
         The variation of the light is relative to the brightness of the whole picture, as in `signed_change`.
-        Where a pattern on the gel has moved, all channels change in proportion: in that direction, of length
-        e in standard deviations, the variance is 1 + e^2, in all others it remains 1.
         """
-        mean, shift = self._half, self._shift / 2
+        mean = self._half
         light = self._repeatability * mean.mean()
-        together, apart = _steepness_of_pattern(mean)
-        variance = _fine_noise(mean) + light**2 + (shift * apart) ** 2
+        variance = _fine_noise(mean) + light**2 + (self._shift / 2 * _steepness(mean)) ** 2
         scale = np.asarray(1 / np.sqrt(variance), np.float32)
-        pattern = shift * together * scale
-        square = (pattern * pattern).sum(axis=0)
-        left_out = (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, np.float32(1e-6))
         if self._gel is not None:
             scale = scale * self._gel.repeat(2, axis=0).repeat(2, axis=1)
-        return _Untouched(*map(_interleaved, (mean, scale, pattern * np.sqrt(left_out))))
+        return _Untouched(_interleaved(mean), _interleaved(scale))
 
 
 def _interleaved(planes: Floats32) -> Floats32:
@@ -334,32 +325,12 @@ def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDAr
 
 def _steepness(planes: Floats32) -> Floats32:
     """Largest gradient of the brightness in 3 x 3 cells, grey levels per cell; (3, h, w)."""
-    return np.stack([_length_around(*_gradient(plane)) for plane in planes])
-
-
-def _steepness_of_pattern(planes: Floats32) -> tuple[Floats32, Floats32]:
-    """The part of `_steepness` in which all channels change in proportion, and the remainder of each channel;
-    (3, h, w) each."""
-    gradients = [_gradient(plane) for plane in planes]
-    total = np.maximum(planes.sum(axis=0), np.float32(1))
-    across, down = (np.asarray(sum(parts) / total, np.float32) for parts in zip(*gradients, strict=True))
-    apart = [
-        _length_around(x - plane * across, y - plane * down)
-        for plane, (x, y) in zip(planes, gradients, strict=True)
-    ]
-    return planes * _length_around(across, down), np.stack(apart)
-
-
-def _gradient(plane: Floats32) -> tuple[Floats32, Floats32]:
-    """Gradient per cell along x and y, (h, w) each."""
-    across = cv2.Scharr(plane, cv2.CV_32F, 1, 0, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
-    down = cv2.Scharr(plane, cv2.CV_32F, 0, 1, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(across, np.float32), np.asarray(down, np.float32)
-
-
-def _length_around(across: Floats32, down: Floats32) -> Floats32:
-    """(h, w): the largest magnitude of a gradient in 3 x 3 cells."""
-    return np.asarray(cv2.dilate(cv2.magnitude(across, down), np.ones((3, 3), np.uint8)), np.float32)
+    steepness = np.empty_like(planes)
+    for plane, largest in zip(planes, steepness, strict=True):
+        across = cv2.Scharr(plane, cv2.CV_32F, 1, 0, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
+        down = cv2.Scharr(plane, cv2.CV_32F, 0, 1, scale=1 / 32, borderType=cv2.BORDER_REPLICATE)
+        cv2.dilate(cv2.magnitude(across, down), np.ones((3, 3), np.uint8), dst=largest)
+    return steepness
 
 
 def _spatial_noise(picture: NDArray[np.uint8]) -> Floats32:

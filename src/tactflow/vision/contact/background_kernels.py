@@ -132,7 +132,7 @@ def weigh_change(
 
 @kernel(
     "void(Array(uint8, 2, 'C', readonly=True), int64, int64, float32[:, ::1], float32[::1], float32[::1],"
-    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
+    " float32[:, ::1], float32[:, ::1], float32[:, ::1])",
 )
 def scaled_change(
     picture: Byte,
@@ -143,15 +143,13 @@ def scaled_change(
     down: Floats32,
     mean: Floats32,
     scale: Floats32,
-    pattern: Floats32,
     change: Floats32,
 ) -> None:
     """Signed change in a window, in standard deviations, smoothed along x.
 
     picture : (H, 3 W), the frame at the window's resolution. top, left : of the window. coefficients :
     (3, 4), of `IlluminationModel.fit`. across, down : positions, (W,) and (H,). mean, scale : (H, 3 W).
-    pattern : (H, 3 W), direction p in which the channels change where the gel's pattern moves; the component
-    (p . v) p of a change v is subtracted. change : (h, 3 w), filled.
+    change : (h, 3 w), filled.
     """
     high, wide = change.shape
     light = _light_along(coefficients, across[left : left + wide // 3])
@@ -160,9 +158,8 @@ def scaled_change(
     line = np.empty(wide + 6, np.float32)
     for y in range(high):
         row = top + y
-        values, usual = picture[row, first:last], mean[row, first:last]
-        unit, toward = scale[row, first:last], pattern[row, first:last]
-        _scale_line(values, usual, unit, toward, light, down[row], line[3:])
+        values, usual, unit = picture[row, first:last], mean[row, first:last], scale[row, first:last]
+        _scale_line(values, usual, unit, light, down[row], line[3:])
         for c in range(3):
             line[c], line[wide + 3 + c] = line[3 * min(2, wide // 3) + c], line[max(wide - 3, 3) + c]
         smooth = change[y]
@@ -186,7 +183,6 @@ def _scale_line(
     values: Byte,
     mean: Floats32,
     scale: Floats32,
-    pattern: Floats32,
     light: Floats32,
     place: np.float32,
     changes: Floats32,
@@ -198,9 +194,3 @@ def _scale_line(
         change = value - usual - (usual * (gain[i] + slope[i] * place) + offset[i])
         least = value - WHITE
         changes[i] = (change if change > least else least) * scale[i]
-    for x in range(values.size // 3):
-        blue, green, red = changes[3 * x], changes[3 * x + 1], changes[3 * x + 2]
-        along = blue * pattern[3 * x] + green * pattern[3 * x + 1] + red * pattern[3 * x + 2]
-        changes[3 * x] = blue - along * pattern[3 * x]
-        changes[3 * x + 1] = green - along * pattern[3 * x + 1]
-        changes[3 * x + 2] = red - along * pattern[3 * x + 2]

@@ -28,8 +28,6 @@ SHALLOW: Final = 0.2
 """Depth at the border of a contact, as a fraction of its local maximum. Under a ball it is 0.32 on a
 half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap equally well with
 real outlines within 0.02."""
-FAINT: Final = 0.3
-"""Lower bound of the local maximum, as a fraction of the maximum of the contact. Chosen by hand."""
 
 
 def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
@@ -75,7 +73,7 @@ def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
 
 
 def largest_nearby(values: Floats32) -> Floats32:
-    """Local maximum (h, w), smoothed; at least `FAINT` of the global maximum.
+    """Local maximum (h, w) > 0, smoothed.
 
     The neighbourhood reaches as far as the radius of a disc with the area of the clearly changed pixels, so
     that it holds one side of the contact but not the other. There is no change beyond the window.
@@ -90,7 +88,7 @@ def largest_nearby(values: Floats32) -> Floats32:
     largest = cv2.dilate(padded, square)
     around = cv2.blur(largest, square.shape, borderType=cv2.BORDER_CONSTANT)
     around = around[reach : reach + coarse.shape[0], reach : reach + coarse.shape[1]]
-    nearby = cv2.resize(np.maximum(around, np.float32(FAINT * peak)), values.shape[::-1])
+    nearby = cv2.resize(np.maximum(around, np.float32(1e-3 * peak)), values.shape[::-1])
     return np.asarray(nearby, np.float32)
 
 
