@@ -14,7 +14,7 @@ import pytest
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Gate, Mark, Pipeline, Queue, Ref
+from tactflow.engine.graph import Gate, Mark, OnError, Pipeline, Queue, Ref
 
 PARTS = Path(__file__).with_name("parts.py")
 BODY = """\
@@ -135,7 +135,8 @@ def test_a_gate_on_a_held_signal_has_the_reason_of_the_signal(times: int, load: 
         ("segment=heavy", "segment", "heavy"),
         ("queue={capacity: 4, when_full: drop_oldest}", "queue", Queue(capacity=4, when_full="drop_oldest")),
         ("queue.when_full=latest", "queue", Queue(when_full="latest")),
-        ("on_error=skip_frame", "on_error", "skip_frame"),
+        ("on_error=disable", "on_error", OnError(action="disable")),
+        ("on_error={action: skip_frame, budget: 3}", "on_error", OnError(action="skip_frame", budget=3)),
         ("max_rate=12.5", "max_rate", 12.5),
     ],
 )
@@ -145,7 +146,8 @@ def test_the_engine_keys_of_a_sink(override: str, attribute: str, expected: Any,
 
 def test_a_viewer_is_disabled_by_an_error_and_other_sinks_stop_the_run(load: Load) -> None:
     nodes = load(BODY + "  view: {use: './parts.py:Viewer'}\n").nodes
-    assert (nodes["view"].on_error, nodes["out"].on_error) == ("disable", "stop")
+    assert nodes["view"].on_error == OnError(action="disable")
+    assert nodes["out"].on_error == OnError(action="stop")
 
 
 def test_anchors_and_merge_keys_share_settings(load: Load) -> None:

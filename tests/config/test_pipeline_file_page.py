@@ -13,7 +13,7 @@ import yaml
 
 from tactflow.cli.main import main
 from tactflow.config.models import PipelineFile, SinkEntry
-from tactflow.engine.graph import Queue
+from tactflow.engine.graph import OnError, Queue
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "pipeline-file.md").read_text()
@@ -47,7 +47,7 @@ def test_every_command_is_right(command: str, tmp_path: Path, monkeypatch: pytes
     assert main(shlex.split(command)) == 0
 
 
-@pytest.mark.parametrize("model", [PipelineFile, SinkEntry, Queue])
+@pytest.mark.parametrize("model", [PipelineFile, SinkEntry, Queue, OnError])
 def test_every_key_stands_on_the_page(model: type[Any]) -> None:
     for name, field in model.model_fields.items():
         key = field.alias or name

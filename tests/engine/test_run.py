@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
+import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -334,15 +335,21 @@ def test_a_stage_that_raises_ends_the_run_with_what_and_where(
     assert runner.source.closed == 1
 
 
-def test_frames_that_fail_can_be_skipped(toy_runner: MakeRunner, caplog: pytest.LogCaptureFixture) -> None:
-    runner = toy_runner({"total": {"fail_at": 7, "on_error": "skip_frame"}})
+def test_skipping_frames_has_a_budget(toy_runner: MakeRunner, caplog: pytest.LogCaptureFixture) -> None:
+    runner = toy_runner({"total": {"fail_at": 7, "on_error": {"action": "skip_frame", "budget": 2}}})
     with caplog.at_level(logging.WARNING, "tactflow"):
         result = ran(runner)
     assert rows(runner)[6][2] == 21
     assert len(rows(runner)) == 20
     assert rows(runner)[7][4]["total"] == "error"
     assert result.stats["stages"]["total"]["errors"] == 1
-    assert "frame skipped (1 so far)" in caplog.text
+    assert "frame skipped (1 of 2)" in caplog.text
+
+    runner = toy_runner({"total": {"fail_from": 7, "on_error": {"action": "skip_frame", "budget": 2}}})
+    failed = runner.run()
+    assert failed.exit_code == 3
+    assert "budget of 2 skipped frames is used up" in str(failed.error)
+    assert [row[0] for row in rows(runner)] == list(range(9))
 
 
 def test_a_disabled_stage_lets_the_rest_go_on(toy_runner: MakeRunner) -> None:
@@ -581,10 +588,16 @@ def test_segments_that_form_a_cycle_are_refused(toy_runner: MakeRunner) -> None:
     assert type(caught.value).__name__ == "ConfigError"
 
 
-def test_a_frame_without_a_capture_time_gets_that_of_its_arrival(toy_runner: MakeRunner) -> None:
-    stats = ran(toy_runner()).stats
-    # Quantiles are exact to 1 %.
-    assert 0 < stats["latency_ms"]["p50"] <= stats["latency_ms"]["p99"] < stats["wall_s"] * 1000 * 1.01
+def test_a_frame_whose_source_does_not_say_when_it_was_captured_gets_the_time_at_which_it_came(
+    toy_runner: MakeRunner,
+) -> None:
+    runner = toy_runner({"capture": {"says_when": False}})
+    before = time.perf_counter()
+    ran(runner)
+    captured = runner.nodes["out"].instance.captured
+    assert captured
+    assert captured == sorted(captured)
+    assert before <= captured[0] <= captured[-1] <= time.perf_counter()
 
 
 def test_statistics_have_the_promised_shape(toy_runner: MakeRunner) -> None:
@@ -594,4 +607,4 @@ def test_statistics_have_the_promised_shape(toy_runner: MakeRunner) -> None:
         assert {"runs", "skips", "p50_ms", "p99_ms"} <= set(stage)
     for link in stats["links"].values():
         assert {"policy", "capacity", "high_water", "drops", "blocked_s"} <= set(link)
-    assert {"p50", "p99"} == set(stats["latency_ms"])
+    assert stats["latency_ms"]["p50"] <= stats["latency_ms"]["p99"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
@@ -38,6 +39,7 @@ class Ramp(contract.Source):
         retake_at: int = -1
         preroll: bool = False
         overtaken: int = 0
+        says_when: bool = True
 
     def __init__(self, params: Params, sensor: str) -> None:
         self.params, self.sensor = params, sensor
@@ -66,7 +68,8 @@ class Ramp(contract.Source):
     def frame(self, seq: int, epoch: int) -> Frame:
         image = np.full((4, 6, 3), max(seq, 0) % 256, np.uint8)
         image.flags.writeable = False
-        return Frame(self.sensor, seq, seq / 50, image, reference=seq <= 0, epoch=epoch)
+        captured = time.perf_counter() if self.params.says_when else 0.0
+        return Frame(self.sensor, seq, seq / 50, image, captured, seq <= 0, epoch)
 
     def stop(self) -> None:
         self.stopped.set()
@@ -85,12 +88,14 @@ class Counted:
 
     class Params(StageParams):
         fail_at: int = -99
+        fail_from: int = 10**9
         seconds: float = 0.0
 
     def __init__(self, params: Params) -> None:
         self.params = params
         self.seen: list[int] = []
         self.rows: list[Any] = []
+        self.captured: list[float] = []
         self.opened = self.closed = self.resets = 0
         self.release = threading.Event()
 
@@ -103,7 +108,7 @@ class Counted:
     def saw(self, seq: int) -> None:
         if self.params.seconds:
             self.release.wait(self.params.seconds)
-        if seq == self.params.fail_at:
+        if seq == self.params.fail_at or seq >= self.params.fail_from:
             raise ArithmeticError(f"cannot count {seq}")
         self.seen.append(seq)
 
@@ -252,6 +257,7 @@ class Collect(Counted, Sink):
         self.saw(tick.frame.seq)
         values = (None if n is None else n.value for n in (joined, total, gated))
         self.rows.append((tick.frame.seq, *values, dict(tick.skipped)))
+        self.captured.append(tick.frame.captured)
 
     def wants(self) -> bool:
         return self.wanted

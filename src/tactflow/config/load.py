@@ -21,7 +21,7 @@ from tactflow.config.wiring import Draft
 from tactflow.engine.conformance import configured, declares
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import ErrorAction, Node, Pipeline
+from tactflow.engine.graph import Node, OnError, Pipeline
 from tactflow.engine.plan import plan_problem
 from tactflow.system.files import expanded
 
@@ -236,7 +236,7 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
     assert draft.params is not None, "parameters that are wrong were reported"
     cls = draft.component.cls
     # A viewer must never stop the run.
-    default: ErrorAction = "disable" if issubclass(cls, Sink) and cls.observer else "stop"
+    default = OnError(action="disable" if issubclass(cls, Sink) and cls.observer else "stop")
     mark = draft.mark
     if draft.component.kind == "source" and not (origin := document.mark(*draft.keys, "source")).line:
         # A source of the command line that cannot be opened is not an error in the file.

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
-from tactflow.engine.graph import ErrorAction, Queue
+from tactflow.engine.graph import ErrorAction, OnError, Queue
 
 STATISTICS = "stats"
 """Reserved name of a sensor: the topic of statistics."""
@@ -47,6 +47,10 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
+def _on_error(value: Any) -> Any:
+    return value if isinstance(value, dict | None) else {"action": value}
+
+
 class Entry(Part):
     """Keys of stages and sinks. All other keys are parameters."""
 
@@ -67,10 +71,12 @@ class Entry(Part):
     queue: Annotated[Queue, _EMPTY] = Field(
         {}, validate_default=True, description="the queue in front of its segment"
     )
-    on_error: ErrorAction | None = Field(
+    on_error: Annotated[
+        OnError | None, BeforeValidator(_on_error, json_schema_input_type=ErrorAction | OnError | None)
+    ] = Field(
         None,
-        description="when it fails: stop ends the run; skip_frame continues the frame without its outputs; "
-        "disable does not call it again; null: stop, for a viewer disable",
+        description="what happens when it fails: an action, or action and budget; null: stop, for a "
+        "viewer disable",
     )
 
 

@@ -85,15 +85,25 @@ class Queue(BaseModel, frozen=True, extra="forbid", strict=True):
     )
 
 
+class OnError(BaseModel, frozen=True, extra="forbid", strict=True):
+    """What happens when a stage or sink fails."""
+
+    action: ErrorAction = Field(
+        default="stop",
+        description="stop: the run ends; skip_frame: the frame continues without its outputs; disable: it is "
+        "not called again",
+    )
+    budget: int = Field(default=10, ge=0, description="frames that skip_frame may skip before the run ends")
+
+
 @dataclass(frozen=True, slots=True)
 class Node:
     """One stage or sink of a pipeline.
 
     inputs : every input port of the component -> connected output, or None for an unconnected optional input.
     mark : location of its definition. gates : all must be open for it to run. segment : name in the file, or
-    None. queue : in front of its segment. on_error : reaction to a failure. max_rate : limit of a sink, Hz.
-    passive_inputs : names in a sink's result -> outputs that are included if they were computed for other
-    nodes, but never requested.
+    None. queue : in front of its segment. max_rate : limit of a sink, Hz. passive_inputs : names in a sink's
+    result -> outputs that are included if they were computed for other nodes, but never requested.
     """
 
     id: str
@@ -104,7 +114,7 @@ class Node:
     gates: Sequence[Gate] = ()
     segment: str | None = None
     queue: Queue = field(default_factory=Queue)
-    on_error: ErrorAction = "stop"
+    on_error: OnError = field(default_factory=OnError)
     max_rate: float | None = None
     passive_inputs: Mapping[str, Ref] = field(default_factory=dict[str, Ref])
 

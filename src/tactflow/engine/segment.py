@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("tactflow")
 
-REPORTED_FAILURES = 10
-"""Warnings about skipped frames of a node; the statistics count all of them."""
-
 _DISABLED = Absent("disabled")
 _ERROR = Absent("error")
 
@@ -199,17 +196,20 @@ class Segment:
 
     def _failed(self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception) -> None:
         node.stats.errors += 1
+        policy = node.node.on_error
         failure = _failure(node.node, tick.frame, inputs, error)
-        action = node.node.on_error
-        if action == "disable":
+        if policy.action == "disable":
             node.disabled = True
             logger.warning("%s\n  %s is disabled for the rest of the run", failure, node.id)
             node.skip(tick, _DISABLED)
-        elif action == "skip_frame":
-            level = logging.WARNING if node.stats.errors <= REPORTED_FAILURES else logging.DEBUG
-            logger.log(level, "%s\n  frame skipped (%d so far)", failure, node.stats.errors)
+        elif policy.action == "skip_frame" and node.stats.errors <= policy.budget:
+            logger.warning("%s\n  frame skipped (%d of %d)", failure, node.stats.errors, policy.budget)
             node.skip(tick, _ERROR)
         else:
+            if policy.action == "skip_frame":
+                failure = StageError(
+                    f"{failure}\n  (the budget of {policy.budget} skipped frames is used up)"
+                )
             self.run.fail(failure, error)
             raise NodeFailedError
 
