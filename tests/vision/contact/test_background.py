@@ -214,21 +214,6 @@ def test_saturated_blocks_tell_nothing_of_the_light() -> None:
     assert left.max() < 0.025 * 255
 
 
-def test_a_pattern_that_moves_counts_little_beside_a_change_of_colour() -> None:
-    """Blotches darken all channels alike: where they have moved, a tilt still shows its colour."""
-    draw = np.random.default_rng(3).normal(0, 1, (160, 164))
-    smooth = cv2.GaussianBlur(draw, (0, 0), 3)
-    shade = (0.75 + 0.25 * np.tanh(2 * smooth / smooth.std()))[..., None]
-    gel = np.asarray(shade * [140.0, 120.0, 100.0], np.uint8)
-    model = BackgroundModel(np.ascontiguousarray(gel[:, :160]), 0.025, 0.01, 1.0)
-    moved = shade[:, 2:162] * [140.0, 120.0, 100.0]
-    moved[60:100, 60:100] *= [0.7, 1.0, 1.3]
-    change = model.compare(moved.astype(np.uint8), None, None)
-    window = model.window_change(change, slice(0, 40), slice(0, 40), np.ones((40, 40), np.bool_))
-    strength = np.linalg.norm(window, axis=2)
-    assert np.percentile(strength[32:48, 32:48], 10) > 2 * np.percentile(strength[:28], 90)
-
-
 def test_the_first_contact_waits_for_nothing_that_the_untouched_gel_could_tell(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
