@@ -70,8 +70,7 @@ def plain_scaled_change(
     high, wide = len(change), change.shape[1] // 3
     rows, columns = slice(top, top + high), slice(left, left + wide)
     planes, usual, unit = (
-        array.reshape(len(array), -1, 3)[rows, columns].transpose(2, 0, 1)
-        for array in (picture, mean, scale)
+        array.reshape(len(array), -1, 3)[rows, columns].transpose(2, 0, 1) for array in (picture, mean, scale)
     )
     scaled = _change(planes, usual, coefficients, across[columns], down[rows]) * unit
     weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
