@@ -43,7 +43,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = ["--out", str(out), "--task", "press", "--pipeline", "markerless"]
     with redirect_stderr(StringIO()) as said:
         assert main(["export", "lerobot", *SPECS, *options]) == 0
-    assert "tactflow: INFO: 800 x 600 turned by 90 degrees" in said.getvalue()
+    assert "tactflow: INFO: 800 x 600 becomes 300 x 400 by downsample and rotate" in said.getvalue()
     return out
 
 

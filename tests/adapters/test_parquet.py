@@ -156,6 +156,7 @@ def test_the_example_of_the_page_runs(
 
 def test_a_run_puts_its_pipeline_and_calibration_into_every_table(tmp_path: Path) -> None:
     (tmp_path / "left.yaml").write_text("sensor: left\n")
+    (tmp_path / "left.npz").write_bytes(b"arrays")
     pipeline = SimpleNamespace(settings={}, file=tmp_path / "no.yaml", calibration=tmp_path / "left.yaml")
     control: Any = SimpleNamespace(pipeline=pipeline, source=None)
     sink = Parquet(Parquet.Params(path=str(tmp_path / "calibrated")), "left", control)
