@@ -117,7 +117,7 @@ def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:
 def check(pipeline: str | Path | None = None, *, settings: Settings | None = None) -> list[str]:
     """All mistakes in a pipeline file, each with its position; empty if it can be run.
 
-    pipeline, settings : as for `load`.
+    pipeline, settings : as for `load`; it raises no errors, but returns them.
 
     Examples
     --------

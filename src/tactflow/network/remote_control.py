@@ -40,8 +40,12 @@ class RemoteControl(Connection):
 
     Examples
     --------
-    with tactflow.RemoteControl("tcp://127.0.0.1:5557") as run:
-        print(run.take_reference()["message"])
+    >>> with RemoteControl("tcp://127.0.0.1:5557", timeout=0.1) as run:
+    ...     try:
+    ...         print(run.take_reference()["message"])
+    ...     except TimeoutError as error:
+    ...         print(error)
+    no answer from tcp://127.0.0.1:5557 within 0.1 s; is tactflow running with sinks.zmq.control set to it?
     """
 
     def __init__(

@@ -139,9 +139,9 @@ class Subscriber(Connection):
 
     Examples
     --------
-    with tactflow.Subscriber(latest=True, timeout=5) as results:
-        for result in results:
-            print(result.seq, result.contact)
+    >>> with Subscriber("tcp://127.0.0.1:5556", latest=True, timeout=5) as results:
+    ...     results.received, results.lost  # `for result in results:` waits for them
+    (0, 0)
     """
 
     def __init__(
