@@ -181,6 +181,8 @@ class FieldModel:
         self._length = LENGTH * self.pitch
         kernel = self._kernel(self.origin)
         self.inverse: Floats = np.asarray(np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64)
+        self.precision: Floats = np.diagonal(self.inverse).copy()
+        """(N,), of each marker given all others, relative to the field's."""
         width, height = size
         spacing = max(CELL * self.pitch, math.sqrt(width * height / MOST_CELLS))
         columns, rows = math.ceil(width / spacing), math.ceil(height / spacing)
@@ -240,14 +242,17 @@ class DisplacementField:
         chosen = np.flatnonzero(doubtful)
         self._left_out: Floats = model.inverse[chosen]
         """(S, N): rows of the inverse of markers that are not seen, or seen poorly."""
-        self._removed = self._without(chosen, 0.0)
-        if seen[chosen].any():
-            # The variance of the field, to which theirs is compared, is estimated from all others.
-            moved = self._moved[~doubtful]
-            scale = float(np.vdot(moved, self._weights(self._moved.T).T[~doubtful])) / moved.size
-            self._removed = self._without(chosen, scale)
+        self._removed = self._left_out
+        information = model.precision
+        if len(chosen):
+            self._removed = self._without(chosen, 0.0)
+            if seen[chosen].any():
+                # The variance of the field, to which theirs is compared, is estimated from all others.
+                moved = self._moved[~doubtful]
+                scale = float(np.vdot(moved, self._weights(self._moved.T).T[~doubtful])) / moved.size
+                self._removed = self._without(chosen, scale)
+            information = information - (self._left_out * self._removed).sum(axis=0)
         self._coefficients = self._weights(self._moved.T).T
-        information = np.diagonal(model.inverse) - (self._left_out * self._removed).sum(axis=0)
         self._precision = np.where(seen, 0.5 / np.maximum(information, _LEAST_PRECISION), 0.0)
 
     def _without(self, chosen: Indices, scale: float) -> Floats:
@@ -261,7 +266,10 @@ class DisplacementField:
 
     def _weights(self, kernel: Floats) -> Floats:
         """(M, N): weights of the markers in M values of the field, whose kernel to the markers is (M, N)."""
-        return np.asarray(kernel @ self._model.inverse - (kernel @ self._left_out.T) @ self._removed)
+        weights = np.asarray(kernel @ self._model.inverse)
+        if len(self._left_out):
+            weights -= (kernel @ self._left_out.T) @ self._removed
+        return weights
 
     @cached_property
     def displacement(self) -> Floats:
