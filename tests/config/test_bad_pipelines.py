@@ -147,6 +147,12 @@ CASES = [
         "  refine: {use: @Refine, segment: a}",
         "compare: the segments a (compare, refine) and b (outline) form a cycle",
     ),
+    (
+        "source",
+        "  prepare: {use: @Prepare, queue: {capacity: 2}}\n"
+        "  §compare: {use: @Compare, queue: {capacity: 3}}\n  outline: {use: @Outline}",
+        "compare.queue: its segment has a queue already, that of prepare",
+    ),
 ]
 """Base, lines with the mark where the mistake is, and what the message says, in parts."""
 

@@ -293,6 +293,14 @@ def test_a_stage_gets_the_very_next_frame_as_a_new_reference(
     assert "frame 7: doubtful takes a new reference: light changed" in caplog.messages
 
 
+def test_a_stage_that_runs_in_another_segment_does_not_change_which_frame_becomes_the_reference(
+    toy_runner: MakeRunner,
+) -> None:
+    runner = toy_runner({**ASKING, "heavy": {"segment": "other"}}, FRAMES)
+    ran(runner)
+    assert [row[0] for row in rows(runner) if row[1]] == [0, 8]
+
+
 def test_a_new_reference_resets_other_stages_and_reaches_sinks_that_take_references(
     toy_runner: MakeRunner,
 ) -> None:

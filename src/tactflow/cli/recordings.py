@@ -81,7 +81,7 @@ def run_export(args: argparse.Namespace) -> int:
     fps = args.fps if args.fps or keeps_every_frame else _rate(args.recordings[0])
     started: list[str] = []
     try:
-        with notes(), writing(args.out), locked_folder(args.out), completed(args.out) as folder:
+        with notes(), writing(args.out), locked_folder(args.out), completed(args.out.resolve()) as folder:
             episodes = _episodes(args.recordings, args.pipeline, started)
             exporter(folder, episodes, fps=fps, task=args.task, pictures=args.pictures)
     except StageError as error:

@@ -122,8 +122,15 @@ def make_plan(pipeline: Pipeline, *, live: bool = False) -> Plan:
 
 
 def plan_problem(pipeline: Pipeline) -> tuple[Mark, str] | None:
-    """The error that prevents a plan, with the location of its cause: segments that form a cycle."""
+    """The error that prevents a plan, with the location of its cause."""
     _, members, before = _cut(pipeline)
+    return _cycle(pipeline, members, before) or _idle_queue(pipeline, members)
+
+
+def _cycle(
+    pipeline: Pipeline, members: Mapping[str, Sequence[str]], before: Mapping[str, Iterable[str]]
+) -> tuple[Mark, str] | None:
+    """Segments that form a cycle."""
     cycle = [name for name in before if name in _ancestors(name, before)]
     placed = [pipeline.nodes[id_] for name in cycle for id_ in members[name] if pipeline.nodes[id_].segment]
     if not placed:
@@ -133,6 +140,19 @@ def plan_problem(pipeline: Pipeline) -> tuple[Mark, str] | None:
         placed[0].mark,
         f"{placed[0].id}: the segments {contents} form a cycle, so none could start; move a stage to another",
     )
+
+
+def _idle_queue(pipeline: Pipeline, members: Mapping[str, Sequence[str]]) -> tuple[Mark, str] | None:
+    """A queue setting without effect."""
+    for ids in members.values():
+        queued = [node for node in map(pipeline.nodes.__getitem__, ids) if node.queue != Queue()]
+        for node in queued:
+            if node.component.kind == "source":
+                return node.mark, f"{node.id}.queue: nothing comes before the source"
+            if node is not queued[0]:
+                taken = f"its segment has a queue already, that of {queued[0].id} ({queued[0].mark})"
+                return node.mark, f"{node.id}.queue: {taken}; a segment has one queue in front of it"
+    return None
 
 
 def _cut(pipeline: Pipeline) -> tuple[list[Node], dict[str, list[str]], dict[str, set[str]]]:

@@ -252,11 +252,16 @@ class Runner:
             thread.start()
 
     def _lead_new_references(self) -> None:
-        """If all stages are in one segment, let it turn frames into references on request."""
-        with_stages = [segment for segment in self._segments.values() if not segment.only_sinks]
-        if len(with_stages) == 1:
-            takers = [id_ for id_, node in self.nodes.items() if node.sink and node.sink.takes_references]
-            with_stages[0].references = NewReferences(self._source_slot, takers)
+        """Let the first segment with stages turn frames into references on request: a source runs ahead."""
+        first = self._segments[self._source_segment]
+        if first.only_sinks:
+            consumers = [link.consumer for link in self.plan.links if link.producer == first.name]
+            with_stages = [s for s in map(self._segments.get, consumers) if s and not s.only_sinks]
+            if len(with_stages) != 1:
+                return
+            first = with_stages[0]
+        takers = [id_ for id_, node in self.nodes.items() if node.sink and node.sink.takes_references]
+        first.references = NewReferences(self._source_slot, takers)
 
     @property
     def _is_live(self) -> bool:

@@ -65,7 +65,8 @@ class LineStream:
                 # Without O_NONBLOCK, this would block until a reader comes.
                 return os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
             except OSError as error:
-                if error.errno != errno.ENXIO:
+                # For a named pipe, it means that there is no reader yet.
+                if error.errno != errno.ENXIO or not path.is_fifo():
                     raise cannot_write(path, error) from error
             if not waits:
                 log.info("%s: waits for a reader", path)
@@ -105,6 +106,9 @@ class LineStream:
                     self._lines.popleft()
                     self._begun = 0
                     self.delivered += 1
+        except BlockingIOError:
+            # Another process that writes to the same pipe has filled it since.
+            return
         except OSError as error:
             self.ended = True
             if self._name == "standard output" and isinstance(error, BrokenPipeError | ConnectionResetError):

@@ -25,6 +25,8 @@ BLACK_STEP = 8
 """Sampling step for that mean, px. Chosen by hand."""
 FIRST_FRAME_SECONDS = 3.0
 """Stall timeout for the first frame, s. Chosen by hand."""
+SILENT_FRAMES = 3.0
+"""Minimum stall timeout of a slow camera, frames. Chosen by hand."""
 CLOSE_SECONDS = 3.0
 """Longest time that `close` waits for a pending read, s. Chosen by hand."""
 POLL_SECONDS = 0.1
@@ -40,7 +42,7 @@ class Watch:
     no_frame_timeout : time without a good frame after which reading fails; None or 0: never.
     frozen_after : time with identical pictures that is a fault; None: never.
     black_after : time with black pictures that is a fault; None: never.
-    silent_after : stall timeout: time without a picture that is a fault.
+    silent_after : stall timeout: time without a picture that is a fault, if it is longer than three frames.
     retry : time between attempts to reopen the source.
     """
 
@@ -155,7 +157,8 @@ class Watched(FrameReader):
     def _check_time(self, now: float) -> None:
         """Detect stalls and timeouts."""
         watch = self._watch
-        longest = max(FIRST_FRAME_SECONDS if self._seq < 0 else 0.0, watch.silent_after)
+        usual = SILENT_FRAMES / self.fps if self.fps else 0.0
+        longest = max(FIRST_FRAME_SECONDS if self._seq < 0 else 0.0, watch.silent_after, usual)
         if self._fault is None and now - self._arrived_at >= longest:
             self._report("no frames", self._arrived_at, now)
         if watch.no_frame_timeout and now - self._good_at >= watch.no_frame_timeout:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import glob
 import io
 import os
+import platform
 import re
 import shutil
 import stat
@@ -79,16 +81,20 @@ def completed(path: Path, *, make_parent: bool = True) -> Iterator[Path]:
     """A temporary path for a file or folder, renamed to `path` on success and removed on error.
 
     It replaces an existing file or folder, but a file never replaces a folder; if nothing was written,
-    nothing is replaced. Its name begins with a dot and has the suffix of `path`. What a killed process
-    left there is removed first.
+    nothing is replaced. Its name begins with a dot, has the suffix of `path`, and holds host and process,
+    since several processes may write the same file; what a killed process of this host left is removed.
 
     make_parent : whether to create missing parent folders.
     Raises OSError.
     """
     if make_parent:
         path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    _remove(partial)
+    front, end = f".{path.stem}.{platform.node()[:16]}-", f".partial{path.suffix}"
+    for left in path.parent.glob(f"{glob.escape(front)}*{glob.escape(end)}"):
+        process = left.name[len(front) : -len(end)]
+        if process.isdecimal() and _has_ended(int(process)):
+            _remove(left)
+    partial = path.with_name(f"{front}{os.getpid()}{end}")
     try:
         yield partial
         if path.is_dir() and partial.is_dir():
@@ -97,6 +103,20 @@ def completed(path: Path, *, make_parent: bool = True) -> Iterator[Path]:
             os.replace(partial, path)
     finally:
         _remove(partial)
+
+
+def _has_ended(process: int) -> bool:
+    if sys.platform == "win32":
+        # Signal 0 would terminate the process.
+        return False
+    else:  # noqa: RET505 (mypy knows branches)
+        try:
+            os.kill(process, 0)
+        except (ProcessLookupError, OverflowError):
+            return True
+        except PermissionError:
+            pass
+        return False
 
 
 def _remove(path: Path) -> None:

@@ -115,7 +115,8 @@ class Questions:
         except Empty:
             if self.url is None and not self._terminal.is_alive():
                 raise ConfigError(
-                    "nobody can answer, as standard input has ended and there is no page; give --yes"
+                    "nobody can answer, as standard input has ended and there is no page; for a recording, "
+                    "--yes accepts every proposal"
                 ) from None
             return None
         if number is not None:
