@@ -17,6 +17,7 @@ from tactflow.cli import start
 from tactflow.cli.main import main, make_parser
 from tactflow.engine.errors import SourceError
 from tactflow.sources import FrameReader
+from tactflow.tune.propose import divide
 from tests.terminal import Terminal
 
 Recorded = Callable[[str], str]
@@ -153,3 +154,14 @@ def test_real_sensors(recording: str, base: str, dots: bool, shared_data: Path, 
     assert terminal(*PROPOSE, str(shared_data / "gels" / recording)) == 0
     assert f"from {base}.yaml" in MADE.read_text().splitlines()[0]
     assert ("tracker" in yaml.safe_load(MADE.read_text())["stages"]) == dots
+
+
+def test_presses_are_found_in_a_film_that_begins_with_another_state_of_the_gel(shared_data: Path) -> None:
+    reader = cv2.VideoCapture(str(shared_data / "gels/franka_mini/ball_white_thread-1-0.avi"))
+    frames = []
+    while (read := reader.read())[0]:
+        frames.append(cv2.resize(read[1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    sample = divide([np.asarray(frame, np.uint8) for frame in frames])
+    assert sample.reference > 0
+    assert len(sample.pressed) > 0.8 * len(frames)
+    assert sample.strongest in sample.pressed

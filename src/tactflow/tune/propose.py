@@ -66,8 +66,8 @@ class Sample:
 
     @property
     def strongest(self) -> int:
-        """Index of the frame that differs most from the reference."""
-        return int(np.argmax(self.changes))
+        """Index of the frame behind the reference that differs most from it."""
+        return self.reference + int(np.argmax(self.changes[self.reference :]))
 
 
 @dataclass
@@ -124,7 +124,8 @@ def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Sample:
     changes = [change_between(frames[reference], image) for image in frames]
     same = takewhile(lambda index: changes[index] < CHANGE, range(reference, len(frames)))
     rest = list(same) if at_rest is None else list(range(reference, at_rest))
-    limit = max(CHANGE, PRESSED * max(changes))
+    # Frames before the reference may show another state of the gel.
+    limit = max(CHANGE, PRESSED * max(changes[reference:]))
     pressed = [index for index in range(rest[-1] + 1, len(frames)) if changes[index] >= limit]
     return Sample(list(frames), reference, rest, pressed, changes)
 

@@ -91,7 +91,7 @@ class Kernel(Generic[P, R]):
 @cache
 def _announce() -> None:
     """Say once why the program seems to wait."""
-    text = f"tactflow: compiling {len(_kernels)} loops for this processor, once; this takes some seconds"
+    text = f"tactflow: compiling {len(_kernels)} loops for this processor, once; this takes up to a minute"
     print(text, file=sys.stderr, flush=True)
 
 
