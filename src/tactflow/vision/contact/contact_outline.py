@@ -88,6 +88,7 @@ def largest_nearby(values: Floats32) -> Floats32:
     largest = cv2.dilate(padded, square)
     around = cv2.blur(largest, square.shape, borderType=cv2.BORDER_CONSTANT)
     around = around[reach : reach + coarse.shape[0], reach : reach + coarse.shape[1]]
+    # The bound only keeps quotients finite: without any, 0 / 0 where nothing has changed.
     nearby = cv2.resize(np.maximum(around, np.float32(1e-3 * peak)), values.shape[::-1])
     return np.asarray(nearby, np.float32)
 
