@@ -37,10 +37,10 @@ test: lint types
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test
 	$(PY) -m pytest -m slow
-	$(PY) benchmarks/load.py --soak 1000000
+	$(PY) lab/load.py --soak 1000000
 
 load: $(VENV)/.installed-test
-	$(PY) benchmarks/load.py
+	$(PY) lab/load.py
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .
@@ -86,21 +86,21 @@ packages: $(TOOLS)/.installed
 ros-env: $(ROS)/.installed
 
 # Beside it there is no tactflow, as on a robot.
-$(ROS)/.installed: ros/requirements.txt
+$(ROS)/.installed: plugins/ros/requirements.txt
 	python3 -m venv $(ROS)
 	$(ROS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--require-hashes --requirement ros/requirements.txt
+		--require-hashes --requirement plugins/ros/requirements.txt
 	@touch $@
 
 lerobot-env: $(LEROBOT)/.installed
 
 # Without what LeRobot's cameras do not import, see left_out.txt; the other packages are those that are listed.
-$(LEROBOT)/.installed: lerobot_plugin/requirements.txt lerobot_plugin/pyproject.toml pyproject.toml
+$(LEROBOT)/.installed: plugins/lerobot/camera/requirements.txt plugins/lerobot/camera/pyproject.toml pyproject.toml
 	python3 -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--no-deps --require-hashes --requirement lerobot_plugin/requirements.txt
+		--no-deps --require-hashes --requirement plugins/lerobot/camera/requirements.txt
 	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--no-deps --no-build-isolation --editable . --editable lerobot_plugin
+		--no-deps --no-build-isolation --editable . --editable plugins/lerobot/camera
 	@touch $@
 
 # Bounds as in LeRobot 0.4.4. On a machine without CUDA, `pip config set global.extra-index-url` with PyTorch's index for CPUs saves 4 GB.
@@ -118,13 +118,13 @@ peers: $(PEERS)/.installed $(OTHER_PEERS)
 
 DATA := ../shared/data
 peers-page: peers
-	$(PEERS)/bin/python -W ignore -m benchmarks.peers --data $(DATA) --page docs/peers.md
+	$(PEERS)/bin/python -W ignore -m lab.peers --data $(DATA) --page docs/peers.md
 
 # For CPUs alone, as for lerobot-datasets. pytouch's requirements have no wheels here; it imports an old torchvision.
-$(PEERS)/.installed: benchmarks/peers/requirements.txt pyproject.toml
+$(PEERS)/.installed: lab/peers/requirements.txt pyproject.toml
 	python3 -m venv $(PEERS)
 	$(PEERS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--requirement benchmarks/peers/requirements.txt
+		--requirement lab/peers/requirements.txt
 	$(PEERS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
 		--no-deps --no-build-isolation pytouch==0.4.2 torchvision==0.15.2 --editable .
 	@touch $@
@@ -148,10 +148,10 @@ lock: $(TOOLS)/.installed
 	echo "setuptools>=77" | $(COMPILE) --extra all --constraint requirements-test.txt \
 		--output-file requirements.txt pyproject.toml -
 	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
-		--custom-compile-command "make lock" $(LOCK) --output-file ros/requirements.txt ros/requirements.in
+		--custom-compile-command "make lock" $(LOCK) --output-file plugins/ros/requirements.txt plugins/ros/requirements.in
 	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
-		--custom-compile-command "make lock" $(LOCK) --override lerobot_plugin/left_out.txt \
-		--output-file lerobot_plugin/requirements.txt lerobot_plugin/requirements.in
+		--custom-compile-command "make lock" $(LOCK) --override plugins/lerobot/camera/left_out.txt \
+		--output-file plugins/lerobot/camera/requirements.txt plugins/lerobot/camera/requirements.in
 	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
 		--custom-compile-command "make lock" $(LOCK) --constraint requirements-test.txt --extra plot \
 		--output-file docs/site/requirements.txt docs/site/requirements.in pyproject.toml

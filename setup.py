@@ -28,6 +28,8 @@ setup(
         "tactflow.stages",
         "tactflow.sinks",
         "tactflow.pipelines",
+        "tactflow.plugins",
+        *(f"tactflow.plugins.{name}" for name in ("arrays", "lerobot", "onnx", "parquet", "rosbags")),
     ],
     long_description=re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", absolute, readme) if REPOSITORY else readme,
     long_description_content_type="text/markdown",

@@ -18,7 +18,7 @@ import pytest
 
 import tactflow
 from tactflow.ports import Image
-from tests.conftest import REPOSITORY
+from tests.paths import REPOSITORY
 
 PIPELINE = """
 stages:

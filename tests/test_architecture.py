@@ -19,11 +19,11 @@ PAGES = ["CONTRIBUTING.md", "docs/architecture.md"]
 
 ROOMS = {
     "src/tactflow/engine": ("cv2", "zmq", "numba", "tactflow.vision", "tactflow.config", "tactflow.stages"),
-    "src/tactflow/config": ("cv2", "zmq", "tactflow.vision", "tactflow.cli", "tactflow.fleet"),
+    "src/tactflow/config": ("cv2", "zmq", "tactflow.vision", "tactflow.cli", "tactflow.tools"),
     "src/tactflow/vision": ("zmq", "tactflow.engine", "tactflow.config", "tactflow.stages"),
     "src/tactflow/calibration": ("zmq", "tactflow.stages", "tactflow.sinks", "tactflow.cli"),
-    "src/tactflow/fleet": ("tactflow.cli", "tactflow.stages", "tactflow.sinks"),
-    "src/tactflow/batch": ("tactflow.cli", "tactflow.bench"),
+    "src/tactflow/tools/fleet": ("tactflow.cli", "tactflow.stages", "tactflow.sinks"),
+    "src/tactflow/tools/batch": ("tactflow.tools.bench",),
     "src/tactflow/classic": ("tactflow.stages", "tactflow.cli"),
     "stages": ("tactflow.stages", "tactflow.config", "tactflow.cli"),
     "sinks": ("tactflow.stages", "tactflow.config", "tactflow.cli"),

@@ -16,10 +16,11 @@ pytest.importorskip("zarr", reason="the extra zarr is not installed")
 pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
 pytest.importorskip("av", reason="the extra lerobot is not installed")
 
+from tests.plugins.test_datasets import KEY, write_hdf5, write_lerobot, write_zarr
+
+from plugins.rosbags.tests.bags import TOPIC, write_bag
+from plugins.rosbags.tests.test_bags import pictures
 from tactflow.cli.main import main
-from tests.adapters.bags import TOPIC, write_bag
-from tests.adapters.test_bags import pictures
-from tests.adapters.test_datasets import KEY, write_hdf5, write_lerobot, write_zarr
 from tests.faults.rig import array, run
 from tests.sources.flaky import Flaky
 

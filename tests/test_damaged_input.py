@@ -32,8 +32,8 @@ from tactflow.recording.repair import repair
 from tactflow.recording.writer import Entry, RecordingWriter
 from tactflow.sources import open_source
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
+from tests.paths import REPOSITORY
 
 IMAGE = np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8)
 BORDERS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 62, (1 << 64) - 1)
@@ -94,7 +94,7 @@ def pictures(_: Path) -> Parser:
 def bags(folder: Path) -> Parser:
     """A recording of ROS."""
     pytest.importorskip("rosbags", reason="the extra bags is not installed")
-    from tests.adapters.bags import TOPIC, write_bag
+    from plugins.rosbags.tests.bags import TOPIC, write_bag
 
     file = write_bag(folder / "sample.bag", [IMAGE, IMAGE], "ros1")
     return [file.read_bytes()], ".bag", lambda path: play(f"{path}?topic={TOPIC}")

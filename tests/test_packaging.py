@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from tactflow.cli.main import main
-from tests.conftest import REPOSITORY
+from tests.paths import REPOSITORY
 
 PACKAGING = REPOSITORY / "packaging"
 SERVICES = yaml.safe_load((PACKAGING / "compose.yaml").read_text())["services"]

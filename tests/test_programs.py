@@ -19,8 +19,8 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Slip
 from tests.clock import LOOK_SECONDS
-from tests.conftest import REPOSITORY
 from tests.messages import Results, result_of
+from tests.paths import REPOSITORY
 
 EXAMPLES = REPOSITORY / "examples"
 CONTACT = Contact(200.0, (30.0, 20.0), 30.0, -0.577, np.array([[25.0, 15], [35, 15], [30, 28]]), None)

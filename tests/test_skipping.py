@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import tactflow
-from benchmarks.skipping import differing
+from lab.skipping import differing
 from tactflow import Result
 
 FRAMES = 60

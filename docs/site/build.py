@@ -25,7 +25,7 @@ NAMES: Final = {
 """Page -> its name on the site; a page `docs/NAME.md` is `NAME.md`."""
 BESIDE_THE_GUIDE: Final = {"guide", "index", "changes", "accuracy", "peers"}
 """Pages that have their own place in the navigation, not within the guide."""
-LINKED: Final = ("examples", "pipelines", "ros")
+LINKED: Final = ("examples", "pipelines", "plugins")
 """Folders with files that pages link to."""
 ROOT: Final = """
 ```{toctree}

@@ -22,7 +22,7 @@ extensions = [
 ]
 myst_heading_anchors = 4
 myst_enable_extensions = ["html_image"]
-exclude_patterns = ["examples", "pipelines", "ros"]
+exclude_patterns = ["examples", "pipelines", "plugins"]
 # `name` in a docstring is code.
 default_role = "code"
 autodoc_default_options = {"members": True, "inherited-members": "BaseModel,Exception,str,tuple,int"}

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from tactflow.cli.main import COMMANDS
+from tactflow.cli.main import all_commands
 from tests.clock import PATIENCE
 from tests.terminal import Terminal
 
@@ -28,10 +28,10 @@ def in_shell(redirection: str, *args: str, **options: object) -> subprocess.Comp
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, **options)  # type: ignore[call-overload, no-any-return]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", all_commands())
 def test_every_listed_command_is_there(name: str, terminal: Terminal) -> None:
     assert terminal("--help") == 0
-    summary = COMMANDS[name][1]
+    summary = all_commands()[name].summary
     assert f" {name} {summary}" in " ".join(terminal.out.split())
     assert terminal(name, "--help") == 0
     words = " ".join(terminal.out.split())

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from tests.clock import PATIENCE, until
-from tests.conftest import REPOSITORY
 from tests.faults.outputs import KINDS, settings_of
 from tests.faults.rig import array, write_pipeline
+from tests.paths import REPOSITORY
 
 WRITES = ("jsonl", "images", "video .avi", "record", "parquet")
 """The sinks that run together. Of the films, only an .avi can be played before it is finished."""

@@ -15,15 +15,15 @@ from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
 from tactflow.engine.contract import Publication
 from tactflow.engine.errors import StageError
-from tactflow.fleet.relay import relay
-from tactflow.fleet.sinks import clash_problems
 from tactflow.network.keys import WrongKeysError, make_keys
 from tactflow.network.publisher import Publisher
 from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import Subscriber
 from tactflow.sinks.zmq import Zmq
+from tactflow.tools.fleet.relay import relay
+from tactflow.tools.fleet.sinks import clash_problems
 from tests.clock import PATIENCE
-from tests.conftest import REPOSITORY
+from tests.paths import REPOSITORY
 
 ANY_PORT = "tcp://127.0.0.1:*"
 MESSAGE = (

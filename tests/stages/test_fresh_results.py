@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactflow.bench.lockstep import LockstepPipeline, TimedResult, on_recording
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.sim import open_scene
+from tactflow.tools.bench.lockstep import LockstepPipeline, TimedResult, on_recording
 
 FRAMES = 20
 

@@ -6,52 +6,73 @@ import argparse
 import os
 import re
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from typing import Final, NoReturn
 
 from tactflow import __version__
+from tactflow.cli.command import Command
 from tactflow.engine.errors import ConfigError, TactflowError
+from tactflow.system.plugins import plugins
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.spelling import closest, did_you_mean
 from tactflow.system.terminal import printable, say
 
-COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "run": ("run", "run a pipeline"),
-    "check": ("pipelines", "validate a pipeline file without running it; prints every mistake at once"),
-    "start": ("start", "set up a sensor, step by step: from the camera to a pipeline file and live results"),
-    "explain": ("explain", "why each stage runs, is skipped or is left out, and what it cost"),
-    "graph": ("explain", "print a pipeline as a Mermaid flowchart"),
-    "pipelines": ("pipelines", "list the pipelines that come with tactflow, one for each kind of sensor"),
-    "stages": ("stages", "list the stages and sinks that can be used, their ports and parameters"),
-    "listen": ("listen", "print what a running tactflow publishes"),
-    "control": ("control", "tell a running tactflow to pause, to take a reference, to record"),
-    "keys": ("control", "make keys that encrypt results sent over a network"),
-    "bench": ("bench", "measure run time against error, per method and for whole pipelines"),
-    "warmup": ("pipelines", "compile what `run` would compile on its first use"),
-    "batch": ("batch", "run a pipeline over many recordings; a second call does what is missing"),
-    "record": ("run", "run a pipeline and record its frames and results"),
-    "export": ("recordings", "make a dataset from recordings: HDF5, Zarr, LeRobot and others"),
-    "repair": ("recordings", "copy what is intact in a damaged or unfinished recording, with an index"),
-    "calibrate": ("calibrate", "make a sensor's calibration file, or check whether it still fits"),
-    "detect": ("detect", "find the dots of a gel, and show what was found and why in one picture"),
-    "doctor": (
-        "doctor",
-        "diagnose a sensor's pictures: what is wrong, its effect on the errors, and what to change",
+COMMANDS: Final[dict[str, Command]] = {
+    "run": Command("run a pipeline", "tactflow.cli.run"),
+    "check": Command(
+        "validate a pipeline file without running it; prints every mistake at once",
+        "tactflow.cli.pipelines",
+        "check",
     ),
-    "tune": (
-        "tune",
-        "find the cheapest pipeline within an error budget, for one sensor, from a recording of it",
+    "explain": Command(
+        "why each stage runs, is skipped or is left out, and what it cost", "tactflow.cli.explain"
     ),
-    "cameras": ("cameras", "list the cameras that are plugged in, with names that stay the same"),
-    "sim": ("sim", "write a simulated recording and its ground truth"),
-    "schema": ("pipelines", "print the JSON Schema of the result message or of a pipeline file"),
+    "graph": Command("print a pipeline as a Mermaid flowchart", "tactflow.cli.explain", "graph"),
+    "pipelines": Command(
+        "list the pipelines that come with tactflow, one for each kind of sensor", "tactflow.cli.pipelines"
+    ),
+    "stages": Command(
+        "list the stages and sinks that can be used, their ports and parameters", "tactflow.cli.stages"
+    ),
+    "listen": Command("print what a running tactflow publishes", "tactflow.cli.listen"),
+    "control": Command(
+        "tell a running tactflow to pause, to take a reference, to record", "tactflow.cli.control"
+    ),
+    "keys": Command("make keys that encrypt results sent over a network", "tactflow.cli.control", "keys"),
+    "warmup": Command(
+        "compile what `run` would compile on its first use", "tactflow.cli.pipelines", "warmup"
+    ),
+    "record": Command("run a pipeline and record its frames and results", "tactflow.cli.run", "record"),
+    "export": Command(
+        "make a dataset from recordings: HDF5, Zarr, LeRobot and others", "tactflow.cli.recordings", "export"
+    ),
+    "repair": Command(
+        "copy what is intact in a damaged or unfinished recording, with an index",
+        "tactflow.cli.recordings",
+        "repair",
+    ),
+    "calibrate": Command(
+        "make a sensor's calibration file, or check whether it still fits", "tactflow.cli.calibrate"
+    ),
+    "detect": Command(
+        "find the dots of a gel, and show what was found and why in one picture", "tactflow.cli.detect"
+    ),
+    "cameras": Command(
+        "list the cameras that are plugged in, with names that stay the same", "tactflow.cli.cameras"
+    ),
+    "sim": Command("write a simulated recording and its ground truth", "tactflow.cli.sim"),
+    "schema": Command(
+        "print the JSON Schema of the result message or of a pipeline file",
+        "tactflow.cli.pipelines",
+        "schema",
+    ),
 }
-"""Command -> module in `tactflow.cli`, and what the command does.
+"""The commands of the core; others are entry points of the group `tactflow.commands`."""
 
-The module has `add_arguments(parser)` and `run(args) -> exit code` for the command of its own name, and
-`add_arguments_NAME`, `run_NAME` for every other. It is imported only when one of its commands is used.
-"""
+
+def all_commands() -> dict[str, Command]:
+    """Name -> command, of the core and of everything that is installed."""
+    return COMMANDS | {point.name: point.load() for point in plugins("tactflow.commands")}
 
 
 def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -> int:
@@ -93,21 +114,22 @@ def make_parser(command: str | None) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"tactflow {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, (module_name, summary) in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+    for name, known in (COMMANDS if command in COMMANDS else all_commands()).items():
+        subparser = subparsers.add_parser(
+            name, help=known.summary, description=known.summary, allow_abbrev=False
+        )
         if name == command:
-            module = import_module(f"tactflow.cli.{module_name}")
-            suffix = "" if name == module_name else f"_{name}"
-            getattr(module, f"add_arguments{suffix}")(subparser)
-            subparser.set_defaults(run=getattr(module, f"run{suffix}"), parser=subparser)
+            module = known.load()
+            getattr(module, f"add_arguments{known.suffix}")(subparser)
+            subparser.set_defaults(run=getattr(module, f"run{known.suffix}"), parser=subparser)
     return parser
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     command = next((word for word in argv if not word.startswith("-")), None)
     parser = make_parser(command)
-    if command is not None and command not in COMMANDS:
-        parser.error(f"there is no command {command}{did_you_mean(command, COMMANDS, 'there are ')}")
+    if command is not None and command not in COMMANDS and command not in (known := all_commands()):
+        parser.error(f"there is no command {command}{did_you_mean(command, known, 'there are ')}")
     args, unknown = parser.parse_known_args(argv)
     if unknown:
         _refuse(args, unknown)

@@ -40,7 +40,7 @@ def add_arguments_check(parser: argparse.ArgumentParser) -> None:
 
 def run_check(args: argparse.Namespace) -> int:
     """Print one line for each sensor; raises ConfigError with every mistake."""
-    from tactflow.fleet.sinks import clash_problems
+    from tactflow.tools.fleet.sinks import clash_problems
 
     names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
     valid: dict[str | None, tuple[Pipeline, Plan]] = {}

@@ -22,13 +22,13 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
-from tactflow.fleet.run import run_fleet
-from tactflow.fleet.sinks import added, with_name
 from tactflow.system.arguments import positive
 from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.terminal import notes, say
+from tactflow.tools.fleet.run import run_fleet
+from tactflow.tools.fleet.sinks import added, with_name
 
 STATISTICS_BEGIN = '{\n "frames":'
 """How a statistics file begins. A file that begins otherwise is not replaced."""

@@ -19,7 +19,7 @@ from tactflow.vision.contact.background import CELL
 from tactflow.vision.types import Contact
 
 WEIGHTS: Final = (0.37, 1.59, 1.67)
-"""Constant and weights of `contact_evidence` in the log odds: `python -m benchmarks.probability contacts`."""
+"""Constant and weights of `contact_evidence` in the log odds: `python -m lab.probability contacts`."""
 DOUBTFUL: Final = 0.25
 """Probability below which a region beside another is rejected: odds of three to one against it."""
 LEAST_SHARE: Final = 1e-3

@@ -23,7 +23,7 @@ from tactflow.vision.arrays import Flags, Floats32, Mask
 OUTER: Final = 0.55
 """Slope at the border of a contact, as a fraction of its local maximum. Lower includes more of the
 surroundings and of wrinkled gel; higher opens the ring where the light is faint. On outlines of fifteen labs,
-values from 0.5 to 0.6 overlap equally well within 0.02 (`tactflow.bench.judge`)."""
+values from 0.5 to 0.6 overlap equally well within 0.02 (`lab.judges.judge`)."""
 SHALLOW: Final = 0.2
 """Depth at the border of a contact, as a fraction of its local maximum. Under a ball it is 0.32 on a
 half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap equally well with

@@ -40,7 +40,7 @@ OUTLINE: Final = 1 / 3
 """Standard error of a contact's outline, over the radius of a disc of the same area. Gel that a wrong outline
 includes or leaves out moves otherwise than the contact. On labelled frames of nine labs, 71 % of the
 components of the mean lie within one standard error of those inside outlines by eye, and 94 % within two
-(`benchmarks/mean_flow.py`)."""
+(`lab/mean_flow.py`)."""
 FEWEST: Final = 3
 """Tracked markers that a field needs. Chosen by hand."""
 OVERSHOOT: Final = 0.5

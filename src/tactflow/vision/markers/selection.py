@@ -74,7 +74,7 @@ LEAST_CLUSTER: Final = 6
 
 PROBABILITY: Final = (-0.37, -4.72, 5.65, 2.42)
 """Log odds of a mark: constant, and weights of its `evidence`. Fitted to 18 sensors by `python -m
-benchmarks.probability dots`, which also reports the calibration of the probability on sensors that were
+lab.probability dots`, which also reports the calibration of the probability on sensors that were
 left out."""
 
 WINDOW: Final = 2.6

@@ -1,0 +1,1 @@
+"""How accuracy and speed are judged: labels, judges, benchmarks, other packages. Never installed."""

@@ -1,0 +1,1 @@
+"""Labels of real recordings, and the judges that compare results with them."""

@@ -1,0 +1,1 @@
+"""HDF5 and Zarr: data sets as sources, and the export to HDF5."""

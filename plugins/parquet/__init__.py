@@ -1,0 +1,1 @@
+"""Parquet: a sink for tables of results."""

@@ -1,0 +1,1 @@
+"""ROS bags and the MCAP files of others as sources."""

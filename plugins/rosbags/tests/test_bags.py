@@ -1,0 +1,104 @@
+"""Recordings of ROS and Foxglove: their pictures and times as they were recorded, and clear errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tactflow.sources import open_source
+
+pytest.importorskip("rosbags", reason="the extra bags is not installed")
+
+from plugins.rosbags.tests.bags import BEGIN, PERIOD, TOPIC, write_bag, write_foxglove
+
+KINDS = {"ros1": "press.bag", "sqlite3": "press", "mcap": "press_mcap"}
+"""Kind of bag -> what it is called."""
+
+
+def pictures(count: int) -> list[NDArray[np.uint8]]:
+    return [np.random.default_rng(seed).integers(0, 256, (12, 16, 3), np.uint8) for seed in range(count)]
+
+
+def played(spec: str) -> list[tuple[NDArray[np.uint8], float]]:
+    reader = open_source(spec)
+    try:
+        return list(iter(reader.read, None))
+    finally:
+        reader.close()
+
+
+def test_every_kind_of_bag_gives_the_pictures_and_the_stamps_in_the_messages(tmp_path: Path) -> None:
+    images = pictures(4)
+    bags = [write_bag(tmp_path / name, images, kind) for kind, name in KINDS.items()]
+    alone = next((tmp_path / "press_mcap").glob("*.mcap"))
+    for bag in [*bags, alone, next((tmp_path / "press").glob("*.db3"))]:
+        reader = open_source(f"{bag}?topic={TOPIC}")
+        assert (reader.total, reader.size, reader.live) == (4, (16, 12), False)
+        found = list(iter(reader.read, None))
+        reader.close()
+        reader.close()
+        assert [t for _, t in found] == [index / 25 for index in range(4)]
+        assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
+
+
+def test_a_folder_of_pictures_may_have_a_metadata_file_too(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), pictures(1)[0])
+    (tmp_path / "metadata.yaml").write_text("sensor: left\n")
+    assert len(played(str(tmp_path))) == 1
+
+
+def in_encoding(image: NDArray[np.uint8], encoding: str) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """An image as a camera with this encoding gives it, and what it must become: (H, W, 3) BGR."""
+    gray = image[:, :, 0]
+    if encoding in ("bgr8", "png"):
+        return image, image
+    if encoding == "jpeg":
+        return image, cv2.imdecode(cv2.imencode(".jpeg", image)[1], cv2.IMREAD_COLOR)
+    if encoding == "rgb8":
+        return image[:, :, ::-1], image
+    if encoding == "mono8":
+        return gray, cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+    if encoding == "mono16":
+        return gray.astype(np.uint16) * 257, cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+    # One colour: what lies between the pixels then does not matter. 16 is black to YUV, 128 has no colour.
+    if encoding == "yuv422":
+        return np.full((12, 16, 2), (128, 16), np.uint8), np.zeros((12, 16, 3), np.uint8)
+    mosaic = np.zeros((12, 16), np.uint8)
+    letters = encoding.removeprefix("bayer_").removesuffix("8")
+    for index, letter in enumerate(letters):
+        mosaic[index // 2 :: 2, index % 2 :: 2] = {"r": 30, "g": 20, "b": 10}[letter]
+    return mosaic, np.full((12, 16, 3), (10, 20, 30), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        *("bgr8", "rgb8", "mono8", "mono16", "yuv422", "jpeg", "png"),
+        *("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"),
+    ],
+)
+def test_every_encoding_becomes_bgr(encoding: str, tmp_path: Path) -> None:
+    sent, expected = in_encoding(pictures(1)[0], encoding)
+    bag = write_bag(tmp_path / "press", [np.ascontiguousarray(sent)], "mcap", encoding)
+    ((image, _),) = played(f"{bag}?topic={TOPIC}")
+    assert np.array_equal(image, expected)
+
+
+def test_pictures_of_foxglove_are_read(tmp_path: Path) -> None:
+    schemas = pytest.importorskip("foxglove_schemas_protobuf.CompressedImage_pb2")
+    images = pictures(3)
+    messages = [
+        schemas.CompressedImage(format="png", data=cv2.imencode(".png", image)[1].tobytes())
+        for image in images
+    ]
+    for index, one in enumerate(messages):
+        one.timestamp.FromNanoseconds(BEGIN + index * PERIOD)
+    # The only topic with pictures need not be named.
+    found = played(str(write_foxglove(tmp_path / "press.mcap", messages)))
+    assert [t for _, t in found] == [0.0, 0.04, 0.08]
+    assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))

@@ -1,1 +1,0 @@
-"""Foreign formats and systems; each can be deleted without a trace elsewhere."""

@@ -1,0 +1,95 @@
+"""Write the table of all runs, for programs, and the report page, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from urllib.parse import quote
+
+import orjson
+
+from tactflow.engine.errors import ConfigError
+from tactflow.system.extras import missing
+from tactflow.system.files import completed
+from tactflow.tools.batch.recordings import Recording
+from tactflow.tools.batch.store import Format, Outcome, Store
+
+NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full", "pictures"}
+"""Internal fields of an outcome."""
+COLUMNS = (
+    *("recording", "status", "frames", "duration, s", "frames/s", "contacts", "touching, %"),
+    *("largest contact, px²", "result", "largest contacts, or what went wrong"),
+)
+"""Headings of the page."""
+_TYPES = {"int": "int64", "float": "float64"}
+"""Python type -> Arrow type; all others are strings."""
+
+Runs = Sequence[tuple[Recording, Outcome]]
+
+
+def require_pyarrow() -> None:
+    """Raise ConfigError with installation instructions if pyarrow is missing."""
+    if problem := missing("Parquet tables", "parquet", ["pyarrow"]):
+        raise ConfigError(f"{problem}; or use --format jsonl, which needs no package")
+
+
+def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
+    """Write the table of runs, overwriting an earlier one; return its path."""
+    path = store.path / f"runs.{format_}"
+    columns = [field for field in fields(Outcome) if field.name not in NOT_IN_TABLE]
+    rows = [{column.name: getattr(outcome, column.name) for column in columns} for _, outcome in runs]
+    with completed(path) as partial:
+        if format_ == "jsonl":
+            partial.write_bytes(b"".join(orjson.dumps(row) + b"\n" for row in rows))
+        else:
+            import pyarrow as pa  # type: ignore[import-untyped]
+            import pyarrow.parquet as pq  # type: ignore[import-untyped]
+
+            types = [(c.name, getattr(pa, _TYPES.get(str(c.type), "string"))()) for c in columns]
+            pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(types)), partial)
+    return path
+
+
+def write_page(store: Store, runs: Runs, title: str) -> Path:
+    """Write `index.html`, overwriting an earlier one; return its path."""
+    path = store.path / "index.html"
+    ordered = sorted(runs, key=lambda run: ("failed", "done", "not done").index(run[1].status))
+    done = [outcome for _, outcome in runs if outcome.status == "done"]
+    failed = sum(outcome.status == "failed" for _, outcome in runs)
+    text = (
+        f"{len(done)} done, {failed} failed, {len(runs) - len(done) - failed} not done; "
+        f"{sum(o.frames for o in done)} frames, {sum(o.contacts for o in done)} contacts; "
+        f"{sum(o.took_s for o in done):.0f} s of work"
+    )
+    rows = (f"<tr>{''.join(f'<td>{cell}' for cell in _cells(store, *run))}" for run in ordered)
+    template = Template(files("tactflow.tools.batch").joinpath("page.html").read_text(encoding="utf-8"))
+    columns = "".join(f"<th>{column}" for column in COLUMNS)
+    page = template.substitute(title=escape(title), text=text, columns=columns, rows="\n".join(rows))
+    with completed(path) as partial:
+        partial.write_text(page, encoding="utf-8")
+    return path
+
+
+def _cells(store: Store, recording: Recording, outcome: Outcome) -> Iterator[str]:
+    """Cells of a row, HTML."""
+    yield escape(recording.name)
+    yield f'<b class="{outcome.status}">{outcome.status}</b>'
+    if outcome.status == "done":
+        yield str(outcome.frames)
+        yield f"{outcome.duration_s:.2f}"
+        yield f"{outcome.frames / outcome.took_s:.0f}" if outcome.took_s else ""
+        yield str(outcome.contacts)
+        yield f"{100.0 * outcome.touching_frames / max(1, outcome.frames):.1f}"
+        yield f"{outcome.largest_area_px2:.0f}"
+        yield f'<a href="{escape(quote(str(outcome.result)))}">open</a>'
+    else:
+        yield from [""] * 7
+    remarks = "\n".join(filter(None, (outcome.error, outcome.warnings)))
+    pictures = zip(store.pictures(recording, len(outcome.pictures)), outcome.pictures, strict=True)
+    addresses = ((escape(quote(file.relative_to(store.path).as_posix())), t) for file, t in pictures)
+    images = (f'<img loading="lazy" src="{address}" title="{t:.2f} s">' for address, t in addresses)
+    yield "".join(images) + escape(remarks).replace("\n", "<br>")

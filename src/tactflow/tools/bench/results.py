@@ -1,0 +1,143 @@
+"""What a run of the bench measured, its JSON, and the comparison with a stored run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import median
+
+from tactflow.engine.errors import ConfigError
+from tactflow.tools.bench.quantities import QUANTITIES
+
+SCHEMA = "tactflow.bench/3"
+
+PIPELINE = "pipeline"
+"""Group of the rows about whole pipelines."""
+CLASSIC = "classic"
+"""Name of the pipeline that is the yardstick: the original script."""
+TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
+"""Kind of frame -> quantity that is its median CPU time, ms."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """The numbers of one method on one scene.
+
+    group : what is compared: "pipeline", or the id of a stage. method : name of the pipeline, or of the way
+    to do the stage's work. scene : simulated scene.
+    values : key of `QUANTITIES`, or one of `TIMES`, or "frames" for the number of frames -> finite value.
+    """
+
+    group: str
+    method: str
+    scene: str
+    values: Mapping[str, float]
+
+    @property
+    def key(self) -> str:
+        """group/method/scene."""
+        return f"{self.group}/{self.method}/{self.scene}"
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """The values that are errors, not times or counts."""
+        return {key: value for key, value in self.values.items() if key in QUANTITIES}
+
+    @property
+    def time_ms(self) -> float | None:
+        """Median CPU time of a frame with contact, ms; of one without where no frame had contact."""
+        return self.values.get(TIMES["contact"], self.values.get(TIMES["idle"]))
+
+
+@dataclass(slots=True)
+class BenchResult:
+    """A whole run of the bench.
+
+    quick : whether it was the short one. machine : what it ran on. wall_s : how long the run took, s.
+    failures : group/method/scene -> why there are no numbers.
+    """
+
+    quick: bool
+    machine: dict[str, str] = field(default_factory=dict[str, str])
+    wall_s: float = 0.0
+    measured: list[Measurement] = field(default_factory=list[Measurement])
+    failures: dict[str, str] = field(default_factory=dict[str, str])
+
+    def add(
+        self,
+        group: str,
+        method: str,
+        scene: str,
+        errors: Mapping[str, float],
+        *,
+        times: Mapping[str, Collection[float]] | None = None,
+        frames: int,
+    ) -> None:
+        """Add the errors of a method on a scene, and the median of CPU times, s, of each kind of frame."""
+        values = dict(errors)
+        for kind, quantity in TIMES.items():
+            if samples := (times or {}).get(kind):
+                values[quantity] = 1e3 * median(samples)
+        values["frames"] = float(frames)
+        self.measured.append(Measurement(group, method, scene, values))
+
+    def measurements(self, group: str) -> list[Measurement]:
+        """The numbers of one group, in the order in which they were measured."""
+        return [measurement for measurement in self.measured if measurement.group == group]
+
+    def save(self, path: Path) -> None:
+        """Write everything as JSON, one measurement a line."""
+        run = {name: value for name, value in asdict(self).items() if name != "measured"}
+        values = [f'"{m.key}": {json.dumps(m.values, allow_nan=False)}' for m in self.measured]
+        head = json.dumps({"schema": SCHEMA, **run}, allow_nan=False)
+        lines = ",\n".join(values)
+        path.write_text(f'{head[:-1]}, "values": {{\n{lines}\n}}}}\n', encoding="utf-8")
+
+
+def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
+    """Errors of a stored run: group/method/scene -> quantity -> error.
+
+    Raises ConfigError if the file is not a result of the bench, or of a quick run while this one is full, or
+    the other way round, because their scenes differ.
+    """
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not JSON: {error}") from error
+    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or "values" not in stored:
+        raise ConfigError(f'{path}: not a result of `tactflow bench` (required "schema": "{SCHEMA}")')
+    if stored["quick"] != quick:
+        kind = "quick" if stored["quick"] else "full"
+        raise ConfigError(f"{path}: is the result of a {kind} run; compare it with a {kind} run")
+    return {
+        key: {name: value for name, value in values.items() if name in QUANTITIES}
+        for key, values in stored["values"].items()
+    }
+
+
+def regressions(
+    result: BenchResult,
+    stored: Mapping[str, Mapping[str, float]],
+    scenes: Collection[str] | None = None,
+) -> list[str]:
+    """In words, every error that is worse than in a stored run by more than its tolerance, or missing.
+
+    stored : of `load_errors`. scenes : the simulated scenes that were chosen, or None for all.
+    """
+    now = {m.key: m.errors for m in result.measured}
+    worse = []
+    for key, errors in stored.items():
+        scene = key.rpartition("/")[2]
+        if scenes is not None and scene not in scenes:
+            continue
+        for name, value in errors.items():
+            quantity, current = QUANTITIES[name], now.get(key, {}).get(name)
+            if current is None or quantity.is_worse(current, value):
+                found = "no longer measured" if current is None else f"now {current:.4g}"
+                allowed = quantity.allowed(value)
+                worse.append(f"{key}: {quantity.title}: was {value:.4g}, allowed {allowed:.4g}, {found}")
+    return worse

@@ -1,0 +1,1 @@
+"""Setting up a sensor: which pipeline fits its pictures."""

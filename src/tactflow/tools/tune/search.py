@@ -1,0 +1,119 @@
+"""Measure all candidates on the fitted simulator and on the recording, and choose one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from tactflow.engine.errors import SourceError
+from tactflow.tools.bench.scenes import Case
+from tactflow.tools.tune.measure import Trial, judge, mark_unsound, measure_on_recording
+from tactflow.tools.tune.recording import Recording
+from tactflow.tools.tune.sensor import Fitted, Look, fit
+from tactflow.tools.tune.space import ORIGINAL
+
+SIMULATED: Final = (Case("press", 140), Case("slide", 80))
+"""Simulated recordings: several depths and positions, and a drag. No cable: whether its ends are detected
+under light pressure is random."""
+ERROR_FACTOR: Final = 1.5
+"""Without a budget, the largest acceptable error relative to the smallest. Chosen by hand."""
+WORTHWHILE: Final = 0.95
+"""Time, relative to the user's own pipeline, above which another one does not replace it: less is within the
+scatter of two measurements. Chosen by hand."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The requested budgets: max_error, px of the camera image, and max_ms, ms per frame; None for none."""
+
+    max_error: float | None = None
+    max_ms: float | None = None
+
+    def order(self, trials: Sequence[Trial]) -> list[Trial]:
+        """Sort by preference: within the budgets first, then by time, or by error if only the time is
+        limited."""
+        allowed = self.allowed(trials)
+        by_error = self.max_ms is not None and self.max_error is None
+
+        def key(trial: Trial) -> tuple[float, ...]:
+            values = (trial.error, trial.ms) if by_error else (trial.ms, trial.error)
+            return (not trial.usable, trial not in allowed, *values)
+
+        return sorted(trials, key=key)
+
+    def allowed(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The usable trials within the budgets."""
+        usable = [trial for trial in trials if trial.usable]
+        max_error, max_ms = self.max_error or math.inf, self.max_ms or math.inf
+        if self.max_error is None and self.max_ms is None:
+            max_error = ERROR_FACTOR * min((trial.error for trial in usable), default=math.inf)
+        return [trial for trial in usable if trial.error <= max_error and trial.ms <= max_ms]
+
+    def choose(self, trials: Sequence[Trial]) -> Trial | None:
+        """The best of the allowed trials; the original, unless another is significantly faster."""
+        allowed = self.order(self.allowed(trials))
+        for trial in allowed:
+            if trial.name == ORIGINAL and WORTHWHILE * trial.ms <= allowed[0].ms:
+                return trial
+        return allowed[0] if allowed else None
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Result of a search.
+
+    trials : all candidates, best first. chosen : None if none is within the budgets.
+    """
+
+    recording: Recording
+    look: Look
+    trials: list[Trial]
+    chosen: Trial | None = None
+
+    def impossible(self) -> str:
+        """Message with the achievable time and error if no candidate is within the budgets."""
+        usable = [trial for trial in self.trials if trial.usable]
+        best = min(usable, key=lambda trial: trial.error), min(usable, key=lambda trial: trial.ms)
+        possible = ", or ".join(f"{trial.error:.3g} px in {trial.ms:.3g} ms ({trial.name})" for trial in best)
+        return f"no pipeline is within the budget. Possible: {possible}"
+
+
+def search(
+    candidates: list[Trial],
+    recording: Recording,
+    folder: Path,
+    goal: Goal,
+    say: Callable[[str], None] = lambda _: None,
+) -> Tuned:
+    """Measure all candidates, and choose the best.
+
+    candidates : most expensive first. folder : for temporary files. say : called with progress messages.
+
+    Raises
+    ------
+    SourceError
+        No candidate detects the contacts of the simulated sensor, or runs on the recording.
+    """
+    look = fit(recording)
+    say(f"fitted simulator: {look}")
+    say(f"{len(candidates)} candidates on {sum(case.frames for case in SIMULATED)} simulated frames")
+    judge(candidates, [Fitted(look, case, folder, case.frames) for case in SIMULATED])
+    mark_unsound(candidates)
+    _require_usable(candidates)
+    say(f"the same on {recording.frames} frames of the recording")
+    measure_on_recording(candidates, recording)
+    _require_usable(candidates)
+    return Tuned(recording, look, goal.order(candidates), goal.choose(candidates))
+
+
+def _require_usable(trials: Sequence[Trial]) -> None:
+    """Raise SourceError if no trial can be chosen."""
+    if not any(trial.usable for trial in trials):
+        faults = [trial.fault for trial in trials if trial.fault]
+        why = faults[0] if faults else "none has an error that could be measured"
+        raise SourceError(
+            f"no pipeline works on this sensor: {why}; see tactflow doctor, and tactflow detect"
+        )
