@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import tactflow
-from tactflow.cli import batch as command
 from tactflow.cli.main import main
+from tactflow.tools.batch import command
 from tactflow.tools.batch.work import Task
 from tests.sources.test_open_source import write_video
 from tests.tools.batch.doubles import PIPELINE, InThisProcess, add_stage, recording

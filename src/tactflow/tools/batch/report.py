@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from urllib.parse import quote
 
 import orjson
@@ -17,6 +15,7 @@ from tactflow.system.extras import missing
 from tactflow.system.files import completed
 from tactflow.tools.batch.recordings import Recording
 from tactflow.tools.batch.store import Format, Outcome, Store
+from tactflow.tools.page import Html, Section, marked, page, table
 
 NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full", "pictures"}
 """Internal fields of an outcome."""
@@ -65,19 +64,17 @@ def write_page(store: Store, runs: Runs, title: str) -> Path:
         f"{sum(o.frames for o in done)} frames, {sum(o.contacts for o in done)} contacts; "
         f"{sum(o.took_s for o in done):.0f} s of work"
     )
-    rows = (f"<tr>{''.join(f'<td>{cell}' for cell in _cells(store, *run))}" for run in ordered)
-    template = Template(files("tactflow.tools.batch").joinpath("page.html").read_text(encoding="utf-8"))
-    columns = "".join(f"<th>{column}" for column in COLUMNS)
-    page = template.substitute(title=escape(title), text=text, columns=columns, rows="\n".join(rows))
+    rows = [list(_cells(store, *run)) for run in ordered]
+    written = page(title, [Section("", body=[table(COLUMNS, rows, sortable=True)])], text)
     with completed(path) as partial:
-        partial.write_text(page, encoding="utf-8")
+        partial.write_text(written, encoding="utf-8")
     return path
 
 
 def _cells(store: Store, recording: Recording, outcome: Outcome) -> Iterator[str]:
-    """Cells of a row, HTML."""
-    yield escape(recording.name)
-    yield f'<b class="{outcome.status}">{outcome.status}</b>'
+    """Cells of a row."""
+    yield recording.name
+    yield marked(outcome.status, {"done": "good", "failed": "bad"}.get(outcome.status, "quiet"))
     if outcome.status == "done":
         yield str(outcome.frames)
         yield f"{outcome.duration_s:.2f}"
@@ -85,11 +82,11 @@ def _cells(store: Store, recording: Recording, outcome: Outcome) -> Iterator[str
         yield str(outcome.contacts)
         yield f"{100.0 * outcome.touching_frames / max(1, outcome.frames):.1f}"
         yield f"{outcome.largest_area_px2:.0f}"
-        yield f'<a href="{escape(quote(str(outcome.result)))}">open</a>'
+        yield Html(f'<a href="{escape(quote(str(outcome.result)))}">open</a>')
     else:
         yield from [""] * 7
     remarks = "\n".join(filter(None, (outcome.error, outcome.warnings)))
     pictures = zip(store.pictures(recording, len(outcome.pictures)), outcome.pictures, strict=True)
     addresses = ((escape(quote(file.relative_to(store.path).as_posix())), t) for file, t in pictures)
     images = (f'<img loading="lazy" src="{address}" title="{t:.2f} s">' for address, t in addresses)
-    yield "".join(images) + escape(remarks).replace("\n", "<br>")
+    yield Html("".join(images) + escape(remarks).replace("\n", "<br>"))
