@@ -88,10 +88,10 @@ def import_graph() -> dict[str, set[str]]:
 
 
 def room_graph(modules: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Room -> the rooms that it imports; a module at the top of the package is a room of its own."""
+    """Room -> the rooms that it imports; a module at the top of the package, and each tool, is a room."""
 
     def room(module: str) -> str:
-        return ".".join(module.split(".")[:2])
+        return ".".join(module.split(".")[: 3 if module.startswith("tactflow.tools.") else 2])
 
     rooms: dict[str, set[str]] = {room(name): set() for name in modules}
     for name, imported in modules.items():
