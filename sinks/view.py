@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 from pydantic import Field, model_validator
 
@@ -24,6 +25,14 @@ if TYPE_CHECKING:
 log = logging.getLogger("tactflow")
 
 
+class GuidedSession(Protocol):
+    """Tells its user what to do next."""
+
+    @property
+    def state(self) -> Mapping[str, Any]:
+        """For the page; replaced as a whole, so that any thread may read it."""
+
+
 class View(Sink):
     """Serves a page that draws the results over the processed frame, and can pause and end the run.
 
@@ -34,9 +43,6 @@ class View(Sink):
     threaded = True
     when_live = "latest"
     observer = True
-    session: ClassVar[Any] = None
-    """A guided session that the page shows, such as the presses of a calibration; a subclass sets it. Its
-    attribute `state`, a mapping, is replaced as a whole and may be read from any thread."""
 
     class Params(StageParams):
         """Address of the page, and amount of data."""
@@ -68,12 +74,20 @@ class View(Sink):
                 )
             return self
 
-    def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
+    def __init__(
+        self,
+        params: Params,
+        sensor: str = "main",
+        control: Control | None = None,
+        session: GuidedSession | None = None,
+    ) -> None:
         """Prepare; nothing is served yet.
 
-        sensor : names the tab. control : handle on the run, for the statistics and the buttons.
+        sensor : names the tab. control : handle on the run, for the statistics and the buttons. session :
+        shown by the page, such as the presses of a calibration.
         """
         super().__init__(params)
+        self._session = session
         self._sensor = sensor
         self._control = control
         self._hub: Hub | None = None
@@ -137,7 +151,7 @@ class View(Sink):
             result,
             valid,
             latency_ms=(now - captured) * 1000 if captured else -1.0,
-            guide=None if self.session is None else self.session.state,
+            guide=None if self._session is None else self._session.state,
             quality=p.quality,
             max_size=p.max_size,
         )

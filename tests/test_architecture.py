@@ -175,6 +175,20 @@ def test_every_number_with_a_name_says_what_it_means() -> None:
     assert not found
 
 
+def test_no_class_is_made_while_the_program_runs() -> None:
+    """A component is constructed with other arguments (`Component.make`), never by a class forged for it."""
+    forged = []
+    for folder in ("src", "stages", "sinks", "plugins"):
+        for file in (REPOSITORY / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+                makes_class = is_call and node.func.id == "type" and len(node.args) == 3  # type: ignore[union-attr]
+                names = {target.id for target in getattr(node, "targets", ()) if isinstance(target, ast.Name)}
+                if makes_class or "__signature__" in names:
+                    forged.append(f"{file.relative_to(REPOSITORY)}:{node.lineno}")  # type: ignore[attr-defined]
+    assert not forged
+
+
 def test_every_function_fits_on_a_screen() -> None:
     long = []
     for folder in ("src", "stages", "sinks"):

@@ -95,22 +95,14 @@ _MEMORY = "frames in memory"
 def _with_frames(pipeline: Pipeline, frames: Frames) -> Pipeline:
     """The pipeline with a source that reads these frames."""
     node = pipeline.source
-    cls: type = node.component.cls
-    takes = inspect.signature(cls)
-    if "opener" not in takes.parameters:
-        raise ConfigError(f"{node.id}: {cls.__name__} cannot take frames from memory; use the stage capture")
+    if "opener" not in inspect.signature(node.component.make).parameters:
+        name = node.component.cls.__name__
+        raise ConfigError(f"{node.id}: {name} cannot take frames from memory; use the stage capture")
 
-    class FromMemory(cls):  # type: ignore[misc]
-        __signature__ = takes
+    def open_frames(_: str, *, fps: float | None = None, **__: Any) -> MemoryFrames:
+        return MemoryFrames(frames, fps)
 
-        def __init__(self, *args: Any, **options: Any) -> None:
-            super().__init__(*args, opener=self._open_frames, **options)
-
-        @staticmethod
-        def _open_frames(_: str, *, fps: float | None = None, **__: Any) -> MemoryFrames:
-            return MemoryFrames(frames, fps)
-
-    component = replace(node.component, cls=FromMemory)
+    component = node.component.with_arguments(opener=open_frames)
     return replace(pipeline, nodes={**pipeline.nodes, node.id: replace(node, component=component)})
 
 
@@ -246,7 +238,7 @@ def stage(use: str | type[Stage], /, **params: Any) -> Any:
         name, found = use.__name__, component(use, use.__name__, use.__module__, ())
     checked = validated(found.params, params, name, origin=f'stage("{name}")')
     offered = {"sensor": "main", "directory": Path(), "skipping": True, "control": None, "calibration": None}
-    instance: Any = build(found.cls, checked, offered)
+    instance: Any = build(found.make, checked, offered)
     instance.open()
     instance.process = _with_frames_made(instance.process, configured(found, checked).ports.inputs)
     return instance

@@ -9,6 +9,7 @@ import pytest
 from tactflow.engine.conformance import build, component
 from tactflow.engine.contract import Sink, Source, Stage, StageParams
 from tactflow.engine.errors import ConfigError
+from tactflow.engine.graph import Delivery
 from tactflow.ports import Image
 
 
@@ -61,3 +62,25 @@ def test_a_constructor_is_given_what_it_asks_for_and_cannot_lose_its_parameters(
     params = StageParams()
     built: Any = build(Named, params, {"sensor": "left", "skipping": True})
     assert (built.sensor, built.params) == ("left", params)
+
+
+def test_a_component_with_further_arguments_passes_them_on_and_still_gets_what_it_asks_for() -> None:
+    class Opened(Good):
+        def __init__(self, _: StageParams, sensor: str, opener: str = "none") -> None:
+            self.sensor, self.opener = sensor, opener
+
+    plain = component(Opened, "opened", "a test", ())
+    built: Any = build(plain.with_arguments(opener="mine").make, StageParams(), {"sensor": "left"})
+    assert (built.sensor, built.opener) == ("left", "mine")
+    assert type(built) is plain.cls
+
+
+def test_how_frames_are_delivered_to_a_sink_is_read_from_its_class() -> None:
+    class Slow(Sink):
+        threaded = True
+        queue_capacity = 9
+
+        def write(self, image: Image) -> None: ...
+
+    assert component(Slow, "slow", "a test", ()).delivery == Delivery(threaded=True, queue_capacity=9)
+    assert component(Good, "good", "a test", ()).delivery == Delivery()

@@ -500,8 +500,7 @@ def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[
     """The live page of the pipeline, or else one with defaults, showing the guided session."""
     own, added = _load(args, pipeline), _load(args, pipeline, {"sinks.view": {}})
     node = next(node for node in (*own.sinks, *added.sinks) if node.component.name == "view")
-    guided = type("View", (node.component.cls,), {"session": guide})
-    return {node.id: replace(node, component=replace(node.component, cls=guided))}
+    return {node.id: replace(node, component=node.component.with_arguments(session=guide))}
 
 
 def _darkness_words(found: DarknessEntry) -> str:

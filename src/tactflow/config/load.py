@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,7 +19,7 @@ from tactflow.config.shipped import is_packaged
 from tactflow.config.validation import validate
 from tactflow.config.wiring import Draft
 from tactflow.engine.conformance import configured, declares
-from tactflow.engine.contract import Sink, StageParams
+from tactflow.engine.contract import Part, StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, OnError, Pipeline
 from tactflow.engine.plan import plan_problem
@@ -234,9 +234,8 @@ def _node(draft: Draft, entry: Entry, document: Document) -> Node:
     """The node of a valid draft."""
     assert draft.component is not None, "a stage without one was reported"
     assert draft.params is not None, "parameters that are wrong were reported"
-    cls = draft.component.cls
     # A viewer must never stop the run.
-    default = OnError(action="disable" if issubclass(cls, Sink) and cls.observer else "stop")
+    default = OnError(action="disable" if draft.component.delivery.observer else "stop")
     mark = draft.mark
     if draft.component.kind == "source" and not (origin := document.mark(*draft.keys, "source")).line:
         # A source of the command line that cannot be opened is not an error in the file.
@@ -268,13 +267,13 @@ def _warnings(document: Document, drafts: Sequence[Draft]) -> list[str]:
     warnings = []
     if not any(draft.section == "sinks" for draft in drafts):
         warnings.append(f"{document.mark('sinks')}  there are no sinks, so nothing will be computed")
-    users = (draft.component.cls for draft in drafts if draft.component)
+    users = (draft.component.make for draft in drafts if draft.component)
     if document.get("calibration") and not any(map(_takes_calibration, users)):
         mark = document.mark("calibration")
         warnings.append(f"{mark}  calibration: no stage uses it; add untouched, scale and depth")
     return warnings
 
 
-def _takes_calibration(cls: type) -> bool:
+def _takes_calibration(make: Callable[..., Part]) -> bool:
     """Whether the constructor of a stage takes the calibration."""
-    return "calibration" in inspect.signature(cls).parameters
+    return "calibration" in inspect.signature(make).parameters

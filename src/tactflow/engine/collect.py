@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.frame import Tick
-from tactflow.engine.graph import Component, Mark, Node, Pipeline, Ref
+from tactflow.engine.graph import Component, Delivery, Mark, Node, Pipeline, Ref
 from tactflow.engine.ports import Port, Ports, ResultParameter, ports_of
 
 T = TypeVar("T", bound=Tick)
@@ -64,11 +64,12 @@ def with_collector(
     passive = {port: ref for port, ref in outputs.items() if port not in inputs}
     # Accept any value: the stage that returns it checks it.
     ports = Ports([Port(port, object, True) for port in inputs], (), ResultParameter(len(inputs), kind))
-    policy = {"threaded": True, "when_live": "latest"} if background else {}
-    cls: type[Collect] = type("Collect", (Collect,), {"takes_references": references, **policy})
-    component = Component(name, "sink", cls, cls.Params, ports, "pure", "tactflow")
+    delivery = Delivery(
+        threaded=background, when_live="latest" if background else "block", takes_references=references
+    )
+    component = Component(name, "sink", Collect, Collect.Params, ports, "pure", "tactflow", Collect, delivery)
     nodes[name] = Node(
-        name, component, cls.Params(take=take), inputs, Mark(name, 0, 0), passive_inputs=passive
+        name, component, Collect.Params(take=take), inputs, Mark(name, 0, 0), passive_inputs=passive
     )
     return replace(pipeline, nodes=nodes)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import fields, replace
 from typing import Any, get_args
 
 from tactflow.engine.contract import Memory, Part, Sink, Source, Stage, StageParams
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Component, Kind
+from tactflow.engine.graph import Component, Delivery, Kind
 from tactflow.engine.ports import Ports, read_ports
 
 BASES: dict[Kind, type[Part]] = {"source": Source, "stage": Stage, "sink": Sink}
@@ -43,7 +43,10 @@ def component(cls: type[Any], name: str, origin: str, reserved: Collection[str])
         raise ConfigError(f"{place}: {cls.__name__}{problem}")
     memory: Memory = getattr(cls, "memory", "pure")
     ports = Ports((), ()) if declares(cls) else read_ports(cls, METHODS[kind])
-    return Component(name, kind, cls, cls.Params, ports, memory, origin)
+    delivery = Delivery()
+    if kind == "sink":
+        delivery = Delivery(**{field.name: getattr(cls, field.name) for field in fields(Delivery)})
+    return Component(name, kind, cls, cls.Params, ports, memory, origin, cls, delivery)
 
 
 def declares(cls: type[Any]) -> bool:
@@ -59,14 +62,13 @@ def configured(component: Component, params: StageParams) -> Component:
     return replace(component, ports=Ports(declared.inputs, declared.outputs), memory=declared.memory)
 
 
-def build(cls: type[Any], params: StageParams, offered: Mapping[str, Any]) -> Part:
+def build(make: Callable[..., Part], params: StageParams, offered: Mapping[str, Any]) -> Part:
     """Construct a part of a pipeline with the arguments that its constructor takes.
 
-    offered : the optional arguments, see `tactflow.engine.contract`.
+    make : as in `Component`. offered : the optional arguments, see `tactflow.engine.contract`.
     """
-    parameters = inspect.signature(cls).parameters
-    part: Part = cls(params, **{name: value for name, value in offered.items() if name in parameters})
-    return part
+    parameters = inspect.signature(make).parameters
+    return make(params, **{name: value for name, value in offered.items() if name in parameters})
 
 
 def _problem(cls: type[Any], kind: Kind | None, reserved: Collection[str]) -> str | None:

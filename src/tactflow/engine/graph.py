@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, Field
 
-from tactflow.engine.contract import Memory, StageParams
+from tactflow.engine.contract import Memory, Part, StageParams, WhenLive
 from tactflow.engine.ports import Ports
 
 Kind = Literal["source", "stage", "sink"]
@@ -30,12 +31,24 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
+class Delivery:
+    """How a sink gets its frames. The attributes are those of `tactflow.engine.contract.Sink`."""
+
+    threaded: bool = False
+    when_live: WhenLive = "block"
+    queue_capacity: int = 4
+    observer: bool = False
+    takes_references: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Component:
-    """A stage or sink class, as named by `use:`.
+    """A stage or sink, as named by `use:`.
 
     name : as in `use:`. cls, params : the class, and the model of its parameters. ports : from its
     annotations. memory : always "pure" for sources and sinks. origin : for messages ("built-in", "plug-in
-    NAME VERSION", a file, a module).
+    NAME VERSION", a file, a module). make : constructs an instance from parameters; the class, or a function
+    that calls it. delivery : of a sink.
     """
 
     name: str
@@ -45,6 +58,12 @@ class Component:
     ports: Ports
     memory: Memory
     origin: str
+    make: Callable[..., Part]
+    delivery: Delivery = Delivery()
+
+    def with_arguments(self, **arguments: Any) -> Self:
+        """The component whose instances are constructed with further arguments."""
+        return replace(self, make=partial(self.make, **arguments))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from tactflow.engine.contract import Sink
 from tactflow.engine.graph import FullPolicy, Mark, Node, Pipeline, Queue
 
 CAPTURE = "capture"
@@ -185,7 +184,7 @@ def _segment_for(node: Node, inputs: set[str], first: str, before: Mapping[str, 
 
     inputs : segments of its inputs. first : segment of the source.
     """
-    if issubclass(node.component.cls, Sink) and node.component.cls.threaded:
+    if node.component.delivery.threaded:
         return node.id
     last = {name for name in inputs if not any(name in _ancestors(input_, before) for input_ in inputs)}
     if last == {first}:
@@ -209,12 +208,12 @@ def _link(
 ) -> LinkPlan:
     nodes = [pipeline.nodes[id_] for id_ in members[consumer]]
     queue = next((node.queue for node in nodes if node.queue != Queue()), Queue())
-    sinks = [node.component.cls for node in nodes if issubclass(node.component.cls, Sink)]
+    sinks = [node.component.delivery for node in nodes if node.component.kind == "sink"]
     if len(sinks) == len(nodes):
-        capacity = max(sink.queue_capacity for sink in sinks)
-        newest = all(sink.when_live == "latest" for sink in sinks)
+        capacity = max(delivery.queue_capacity for delivery in sinks)
+        newest = all(delivery.when_live == "latest" for delivery in sinks)
     else:
-        capacity = max([BLOCK_CAPACITY, *(sink.queue_capacity for sink in sinks)])
+        capacity = max([BLOCK_CAPACITY, *(delivery.queue_capacity for delivery in sinks)])
         newest = pipeline.source.id in members[producer]
     policy: FullPolicy = "latest" if live and newest else "block"
     return LinkPlan(producer, consumer, queue.capacity or capacity, queue.when_full or policy)

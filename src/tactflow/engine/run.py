@@ -218,7 +218,7 @@ class Runner:
             "calibration": pipeline.calibration,
         }
         try:
-            instance = build(node.component.cls, node.params, offered)
+            instance = build(node.component.make, node.params, offered)
             self._opened.append((node.id, instance))
             instance.open()
         except kind as error:
@@ -260,7 +260,7 @@ class Runner:
             if len(with_stages) != 1:
                 return
             first = with_stages[0]
-        takers = [id_ for id_, node in self.nodes.items() if node.sink and node.sink.takes_references]
+        takers = [id_ for id_, n in self.nodes.items() if n.node.component.delivery.takes_references]
         first.references = NewReferences(self._source_slot, takers)
 
     @property
@@ -411,6 +411,6 @@ def _wants(node: RunningNode, frame: Frame) -> bool:
     sink = node.sink
     if sink is None or node.disabled:
         return False
-    if frame.reference and sink.takes_references:
+    if frame.reference and node.node.component.delivery.takes_references:
         return True
     return frame.seq >= 0 and node.rate_limit.due(frame.t) and sink.wants()

@@ -98,7 +98,7 @@ class Segment:
             if node.stage is not None
             for maker, slot in _last_with(node.stage.watches, run.nodes.values())
         ]
-        self._data_sinks = [n for n in self.nodes if n.sink is not None and not n.sink.observer]
+        self._data_sinks = [n for n in self.nodes if n.sink and not n.node.component.delivery.observer]
         self.inputs: list[Link[TickState]] = []
         self.outputs: list[tuple[Link[TickState], frozenset[str] | None]] = []
         self.epoch = 0

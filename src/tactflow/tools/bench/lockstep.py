@@ -16,14 +16,14 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from inspect import signature
+from functools import wraps
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from tactflow.api import make_runner
 from tactflow.engine.collect import with_collector
-from tactflow.engine.contract import StageParams
+from tactflow.engine.contract import Part, StageParams
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline, Queue
@@ -105,15 +105,14 @@ class LockstepPipeline:
 
     def _in_one_thread(self, pipeline: Pipeline) -> Pipeline:
         """The same graph in one segment, with frames in turns and a sink that keeps the results."""
-        source_class: Any = pipeline.source.component.cls
-        in_turns = self._frames
+        component = pipeline.source.component
 
-        class Source(source_class):  # type: ignore[misc]
-            # The engine offers what the constructor asks for.
-            __signature__ = signature(source_class)
-
-            def frames(self) -> Iterator[Frame]:
-                return in_turns(super().frames())
+        @wraps(component.make)
+        def make(*args: Any, **offered: Any) -> Part:
+            source: Any = component.make(*args, **offered)
+            frames = source.frames
+            source.frames = lambda: self._frames(frames())
+            return source  # type: ignore[no-any-return]
 
         collecting = with_collector(pipeline, TimedResult, self._take, name="tactflow.bench")
         segment = pipeline.source.segment or "capture"
@@ -121,7 +120,7 @@ class LockstepPipeline:
             name: replace(node, segment=segment, queue=Queue()) for name, node in collecting.nodes.items()
         }
         source = nodes[pipeline.source.id]
-        nodes[source.id] = replace(source, component=replace(source.component, cls=Source))
+        nodes[source.id] = replace(source, component=replace(component, make=make))
         return replace(collecting, nodes=nodes, opencv_threads=1)
 
 
