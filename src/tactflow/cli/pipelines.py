@@ -8,6 +8,7 @@ import time
 from importlib.resources import files
 
 from tactflow.cli.options import add_pipeline, add_quiet, load_plan
+from tactflow.cli.sensors import fleet
 from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.shipped import described_pipelines, find_pipeline
 from tactflow.engine.errors import ConfigError
@@ -40,8 +41,6 @@ def add_arguments_check(parser: argparse.ArgumentParser) -> None:
 
 def run_check(args: argparse.Namespace) -> int:
     """Print one line for each sensor; raises ConfigError with every mistake."""
-    from tactflow.tools.fleet.sinks import clash_problems
-
     names: list[str] = sensor_names(find_pipeline(args.pipeline), args.overrides)
     valid: dict[str | None, tuple[Pipeline, Plan]] = {}
     mistakes: list[str] = []
@@ -50,7 +49,8 @@ def run_check(args: argparse.Namespace) -> int:
             valid[name] = load_plan(args, name)
         except ConfigError as error:
             mistakes += error.mistakes
-    mistakes += clash_problems({name: pipeline for name, (pipeline, _) in valid.items() if name is not None})
+    if len(names) > 1:
+        mistakes += fleet().problems({name: pipeline for name, (pipeline, _) in valid.items() if name})
     if mistakes:
         # A mistake that several sensors share is reported once.
         raise ConfigError(*dict.fromkeys(mistakes))

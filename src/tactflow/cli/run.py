@@ -16,8 +16,10 @@ from typing import Any
 from tactflow.api import ended_by_signals, make_runner
 from tactflow.cli.options import add_overwrite, add_pipeline, add_quiet, refuse_output
 from tactflow.cli.progress import run_progress, summary
+from tactflow.cli.sensors import fleet
 from tactflow.config.load import load_pipeline, sensor_names
-from tactflow.config.overrides import Override
+from tactflow.config.overrides import Override, added
+from tactflow.config.sensors import with_name
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
@@ -27,8 +29,6 @@ from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED
 from tactflow.system.terminal import notes, say
-from tactflow.tools.fleet.run import run_fleet
-from tactflow.tools.fleet.sinks import added, with_name
 
 STATISTICS_BEGIN = '{\n "frames":'
 """How a statistics file begins. A file that begins otherwise is not replaced."""
@@ -94,7 +94,7 @@ def _run_all(args: argparse.Namespace, file: Path, sensors: Sequence[str]) -> in
     arguments = {
         sensor: _arguments(args, file, pipeline, sinks[sensor]) for sensor, pipeline in pipelines.items()
     }
-    return run_fleet(pipelines, arguments)
+    return fleet().run(pipelines, arguments)
 
 
 def _arguments(args: argparse.Namespace, file: Path, pipeline: Pipeline, sinks: Sinks) -> list[str]:

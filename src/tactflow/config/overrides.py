@@ -11,7 +11,7 @@ from pydantic_core import to_jsonable_python
 
 from tactflow.config.document import Document, Keys, parse_value
 from tactflow.engine.errors import ConfigError
-from tactflow.engine.graph import Mark
+from tactflow.engine.graph import Mark, Node
 from tactflow.system.redaction import public_setting
 from tactflow.system.spelling import did_you_mean
 
@@ -55,6 +55,12 @@ def _part(settings: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 def as_yaml(value: Any) -> str:
     """A value for `--set`, as JSON, which is also YAML."""
     return json.dumps(plain(value), ensure_ascii=False)
+
+
+def added(node: Node) -> str:
+    """The argument of `--set` that adds the same sink as an option of the command line did."""
+    settings = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
+    return f"sinks.{node.id}={as_yaml({'use': node.component.name} | settings)}"
 
 
 def plain(value: Any) -> Any:

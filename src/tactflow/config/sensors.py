@@ -10,10 +10,12 @@ The changes of a sensor are merged into the rest of the file; null removes a sta
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 from tactflow.config.document import Document, Keys
 from tactflow.config.models import Changes, is_word
+from tactflow.system.files import STREAMS, is_device
 from tactflow.system.spelling import did_you_mean
 
 PLACEHOLDER = "{sensor}"
@@ -49,6 +51,20 @@ def select(document: Document, chosen: str | None) -> str:
     if document.mapping("sinks"):
         document.root["sinks"] = _filled_in(document.root["sinks"], name)
     return name
+
+
+def with_name(path: str, sensor: str) -> str:
+    """The file that one of several sensors writes, given the `path` on the command line.
+
+    Standard output and devices are shared by all.
+
+    >>> with_name("out.jsonl", "left"), with_name("{sensor}/out.jsonl", "left")
+    ('out-left.jsonl', 'left/out.jsonl')
+    """
+    if path in STREAMS or is_device(path):
+        return path
+    name, suffix = os.path.splitext(path)
+    return path.replace(PLACEHOLDER, sensor) if PLACEHOLDER in path else f"{name}-{sensor}{suffix}"
 
 
 def _merge(document: Document, change: Keys, target: Keys) -> None:

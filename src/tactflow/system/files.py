@@ -38,6 +38,10 @@ def status(text: str) -> os.stat_result | None:
         return None
 
 
+STREAMS = ("-", "/dev/stdout", "/dev/stderr")
+"""Names of this process's streams, even if they are redirected to a regular file."""
+
+
 def is_device(text: str) -> bool:
     """Whether it exists and is neither a regular file nor a folder: a terminal, a pipe, /dev/null."""
     file = status(text)

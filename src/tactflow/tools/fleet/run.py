@@ -12,11 +12,12 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.system.signals import ending_handled
 from tactflow.tools.fleet.relay import relay
-from tactflow.tools.fleet.sinks import Shared, WatchedSink, changes, clash_problems, shared_addresses
+from tactflow.tools.fleet.sinks import Shared, WatchedSink, changes, shared_addresses
+from tactflow.tools.fleet.sinks import problems as problems
 from tactflow.tools.fleet.supervisor import Member, Supervisor
 
 
-def run_fleet(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequence[str]]) -> int:
+def run(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequence[str]]) -> int:
     """Run every sensor's pipeline in a process of its own until all have ended.
 
     pipelines : sensor -> its pipeline, checked. arguments : sensor -> command line of its process.
@@ -27,9 +28,9 @@ def run_fleet(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequenc
     ConfigError : several sensors would write one file.
     StageError : the address for subscribers is taken.
     """
-    problems = clash_problems(pipelines)
-    if problems:
-        raise ConfigError("\n".join(problems))
+    mistakes = problems(pipelines)
+    if mistakes:
+        raise ConfigError("\n".join(mistakes))
     shared = shared_addresses(pipelines)
     supervisor = Supervisor()
     with ending_handled(supervisor.count_signal), ExitStack() as stack:

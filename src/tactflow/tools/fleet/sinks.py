@@ -12,24 +12,7 @@ from tactflow.config.overrides import as_yaml
 from tactflow.config.sensors import PLACEHOLDER
 from tactflow.engine.contract import Output, Publication, StageParams
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.system.files import is_device, status
-
-STREAMS = ("-", "/dev/stdout", "/dev/stderr")
-"""Streams that lead to the supervisor, even if they are redirected to a regular file."""
-
-
-def with_name(path: str, sensor: str) -> str:
-    """The file that one sensor's process writes, given the `path` on the command line.
-
-    Standard output and devices are shared by all.
-
-    >>> with_name("out.jsonl", "left"), with_name("{sensor}/out.jsonl", "left")
-    ('out-left.jsonl', 'left/out.jsonl')
-    """
-    if path in STREAMS or is_device(path):
-        return path
-    name, suffix = os.path.splitext(path)
-    return path.replace(PLACEHOLDER, sensor) if PLACEHOLDER in path else f"{name}-{sensor}{suffix}"
+from tactflow.system.files import STREAMS, is_device, status
 
 
 class WatchedSink:
@@ -76,18 +59,12 @@ def changes(node: Node, params: StageParams) -> list[str]:
     return [f"sinks.{node.id}.{key}={as_yaml(value)}" for key, value in new.items() if value != old.get(key)]
 
 
-def added(node: Node) -> str:
-    """The override that adds the same sink as an option of the command line did."""
-    settings = node.params.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    return f"sinks.{node.id}={as_yaml({'use': node.component.name} | settings)}"
-
-
-def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
+def problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
     """Error messages for sinks that would write or listen where another sensor's sink does.
 
     pipelines : sensor -> its pipeline. Results may be published at one address with the same keys.
     """
-    problems = [
+    found = [
         f"{node.mark}  sinks.{node.id}.keys: required the same for all that publish at {together.address}"
         for sinks, together in shared_addresses(pipelines)
         for _, node in sinks
@@ -101,8 +78,8 @@ def clash_problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
                 if owner != sensor:
                     place = f"{node.mark}  " if node.mark.line else f"{node.mark}: "
                     where = f"{place}sinks.{node.id}.{parameter}"
-                    problems.append(f"{where}: {owner} and {sensor} would both {use}; {advice}")
-    return problems
+                    found.append(f"{where}: {owner} and {sensor} would both {use}; {advice}")
+    return found
 
 
 def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
