@@ -21,7 +21,7 @@ from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.tools.fleet.relay import relay
-from tactflow.tools.fleet.sinks import clash_problems
+from tactflow.tools.fleet.sinks import problems
 from tests.clock import PATIENCE
 from tests.paths import REPOSITORY
 
@@ -123,7 +123,7 @@ def test_several_sensors_with_different_keys_at_one_address_are_refused(tmp_path
     text = (REPOSITORY / "pipeline.yaml").read_text(encoding="utf-8").replace("sensor: main", "")
     file.write_text(text + "\nsensors:\n  left: {}\n  right: {sinks: {zmq: {keys: other}}}\n")
     both = {name: load_pipeline(file, sensor=name) for name in ("left", "right")}
-    assert any("sinks.zmq.keys: required the same for all" in problem for problem in clash_problems(both))
+    assert any("sinks.zmq.keys: required the same for all" in problem for problem in problems(both))
 
 
 def test_an_address_that_other_machines_reach_needs_keys_or_an_explicit_word() -> None:
