@@ -91,7 +91,7 @@ def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
         sizes = f"radii {marks.radii.min():.1f} to {marks.radii.max():.1f} px, most {marks.dot_radius:.1f} px"
     yield f"yellow circles: {len(marks.centers)} {marks.polarity} dots, {sizes}, {marks.pitch:.1f} px apart"
     if marks.chosen is not None:
-        closed = f"{100 * marks.chosen.lattice:.0f} % of the parallelograms of neighbours close"
+        closed = f"{100 * marks.chosen.lattice.closed_share:.0f} % of the parallelograms of neighbours close"
         grids = "grids: 80 % and more, random: 30 % and less"
         yield f"green: {len(marks.edges)} links; {closed} ({grids}); score {marks.chosen.score:.1f}"
     yield from _best(rival, "next best")
@@ -102,5 +102,5 @@ def _found(marks: Detection, rival: Candidate | None) -> Iterator[str]:
 def _best(spots: Candidate | None, what: str = "best") -> Iterator[str]:
     """A line about the best spots that are not marks, if there are any."""
     if spots is not None:
-        closed = f"{100 * spots.lattice:.0f} % of their parallelograms close"
+        closed = f"{100 * spots.lattice.closed_share:.0f} % of their parallelograms close"
         yield f"magenta: {what}, {spots}; {closed}; score {spots.score:.1f}"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.markers.lattice import closed_share, corners, neighbour_graph, own_shares, support
+from tactflow.vision.markers.lattice import Lattice, support
 from tests.vision.dots import grid
 
 FloatArray = NDArray[np.float64]
@@ -30,7 +30,7 @@ def bent(kind: str) -> FloatArray:
 @pytest.mark.parametrize("kind", ["square", "hexagonal", "perspective", "fisheye", "rings"])
 def test_a_grid_closes_nearly_all_parallelograms_however_it_is_bent(kind: str) -> None:
     points = bent(kind)
-    assert closed_share(points, neighbour_graph(points, 60.0)) > 0.85
+    assert Lattice(points).closed_share > 0.85
 
 
 def test_marks_at_random_close_few_even_if_they_keep_their_distance() -> None:
@@ -40,25 +40,25 @@ def test_marks_at_random_close_few_even_if_they_keep_their_distance() -> None:
             points = np.vstack([points, point])
     assert len(points) > 180
     # Measured: 0.24 to 0.32, over seeds and distances.
-    assert closed_share(points, neighbour_graph(points, 60.0)) < 0.35
+    assert Lattice(points).closed_share < 0.35
 
 
 def test_a_mark_beside_the_lattice_closes_nothing_and_hangs_together_with_nobody() -> None:
     points = np.vstack([GRID, [[165.0, 135.0]]])
-    share, cluster = own_shares(points, neighbour_graph(points, 60.0))
-    assert share[-1] == 0
-    assert cluster[-1] == 1
-    assert np.median(cluster[:-1]) == len(GRID)
+    lattice = Lattice(points)
+    assert lattice.own_shares[-1] == 0
+    assert lattice.cluster_sizes[-1] == 1
+    assert np.median(lattice.cluster_sizes[:-1]) == len(GRID)
 
 
 def test_a_missing_mark_is_wanted_where_it_was() -> None:
     missing = 5 * 12 + 6
     points = np.delete(GRID, missing, axis=0)
-    wanted = corners(points, neighbour_graph(points, 40.0))
+    wanted = Lattice(points).corners
     assert support(np.array([GRID[missing], GRID[missing] + 15.0]), wanted).tolist() == [4, 0]
 
 
 def test_no_marks_and_one_mark_form_no_lattice() -> None:
     for count in (0, 1, 2):
         points = GRID[:count]
-        assert closed_share(points, neighbour_graph(points, 60.0)) == 0
+        assert Lattice(points).closed_share == 0

@@ -195,7 +195,7 @@ def lattice(detection: Detection, gray: Gray) -> Lattice:
     x, y = np.clip(np.rint(detection.centers).astype(int), 0, (width - 1, height - 1)).T
     around = cv2.blur(gray, (round(detection.pitch) | 1,) * 2)
     contrast = float(np.median(np.abs(around[y, x] - gray[y, x])))
-    closed = 0.0 if detection.chosen is None else detection.chosen.lattice
+    closed = 0.0 if detection.chosen is None else detection.chosen.lattice.closed_share
     # An irregular grid has no predictable positions.
     empty = len(_empty_positions(detection)) if closed >= REGULAR else 0
     return Lattice(len(detection.centers), closed, empty / (len(detection.centers) + empty), contrast)

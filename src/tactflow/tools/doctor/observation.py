@@ -86,7 +86,7 @@ class Observation:
             found = _dots_of(pair.image)
             if found is None:
                 continue
-            if found.chosen is not None and found.chosen.lattice >= REGULAR:
+            if found.chosen is not None and found.chosen.lattice.closed_share >= REGULAR:
                 return found
             again = None if pair.after is None else _dots_of(pair.after)
             if len(found.centers) >= MIN_DOTS and (pair.after is None or _recur(found, again)):

@@ -13,16 +13,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
-from tactflow.vision.markers.lattice import LONGEST_LINK, corners, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.selection import (
-    Candidate,
-    Sign,
-    candidates,
-    evidence,
-    links,
-    marks_of,
-    probability,
-)
+from tactflow.vision.markers.lattice import LONGEST_LINK, Lattice, nearest, neighbour_graph, pitch_of
+from tactflow.vision.markers.selection import Candidate, Sign, candidates, evidence, marks_of, probability
 from tactflow.vision.markers.spots import ONE_SIZE, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
@@ -198,9 +190,9 @@ def _in_lattice(
     """
     best = found[0]
     _require_lattice(found)
-    _require_gel_between(gray, best, best.spots)
+    _require_gel_between(gray, best, best.lattice)
     marks = marks_of(gray, best, by_scale)
-    _require_gel_between(gray, best, marks)
+    _require_gel_between(gray, best, Lattice(marks.points))
     # A single mark has no probability.
     marks = marks.at(~(probability(evidence(gray, marks)) < least))
     if not len(marks.points):
@@ -228,17 +220,16 @@ def _require_lattice(found: list[Candidate]) -> None:
     best = max(found, key=lambda other: float(other.spots.strength.sum()))
     raise NoMarkersError(
         f"{_NO_MARKERS} ({len(best.spots.points)} {best.polarity} spots of radius "
-        f"{best.radius:.1f} px form no lattice: {100 * best.lattice:.0f} % of their "
+        f"{best.radius:.1f} px form no lattice: {100 * best.lattice.closed_share:.0f} % of their "
         "parallelograms close, of a grid's 80 %; if they are marks, and no dust or random texture, give "
         "their radius in pixels)",
         best,
     )
 
 
-def _require_gel_between(gray: NDArray[np.float32], best: Candidate, spots: Spots) -> None:
+def _require_gel_between(gray: NDArray[np.float32], best: Candidate, lattice: Lattice) -> None:
     """Raise NoMarkersError if the marks run into each other, without even gel between them, as in a weave."""
-    points, radius = spots.points, best.radius
-    around = corners(points, links(points))
+    points, radius, around = lattice.points, best.radius, lattice.corners
     if not len(around.points):
         return
     smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.2 * radius), np.float32)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.ndimage import median
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -19,6 +21,10 @@ by hand."""
 LONGEST_LINK: Final = 2.3
 """Maximum distance of neighbours, pitches: that of the two marks on either side of a missing one. Without
 this bound on the second nearest, two more of twelve simulated cloths show marks (measured)."""
+
+LONG_LINK: Final = 2.0
+"""Maximum length of a link, relative to the median one at either end: it may span one missing mark. Without
+this bound, the bright rims of a TacTip's pins are taken for marks."""
 
 CLOSED: Final = 0.25
 """Maximum distance of a mark from the fourth corner of a parallelogram, in mean sides. Chosen by hand."""
@@ -47,6 +53,96 @@ class Corners(NamedTuple):
     first: Indices
     middle: Indices
     last: Indices
+
+
+class Lattice:
+    """The lattice of a set of marks: their links, and the parallelograms of these. Computed lazily.
+
+    points : (N, 2) float64, px.
+
+    >>> x, y = np.meshgrid(np.arange(0, 100, 10.0), np.arange(0, 100, 10.0))
+    >>> lattice = Lattice(np.column_stack([x.ravel(), y.ravel()]))
+    >>> len(lattice.links), round(lattice.closed_share, 2)
+    (180, 0.99)
+    """
+
+    def __init__(self, points: Floats) -> None:
+        self.points = points
+
+    @cached_property
+    def links(self) -> Indices:
+        """(E, 2) int64, neighbours without links that are much longer than the others at either end."""
+        if len(self.points) < 2:
+            return np.zeros((0, 2), np.int64)
+        edges = neighbour_graph(self.points, LONGEST_LINK * pitch_of(self.points))
+        if not len(edges):
+            return edges
+        length = np.hypot(*(self.points[edges[:, 0]] - self.points[edges[:, 1]]).T)
+        usual = np.asarray(median(np.tile(length, 2), edges.T.ravel(), np.arange(len(self.points))))
+        return np.asarray(edges[length < LONG_LINK * usual[edges].min(axis=1)], np.int64)
+
+    @cached_property
+    def corners(self) -> Corners:
+        """Fourth corners of the parallelograms of linked marks."""
+        return corners(self.points, self.links)
+
+    @property
+    def closed_share(self) -> float:
+        """Regularity: the share of parallelograms that a mark closes.
+
+        Real grids, including hand-painted, curved and tilted ones, have 0.8 and more; marks scattered at
+        random have 0.1, or 0.3 if they keep a distance from each other (measured).
+        """
+        return float(np.count_nonzero(self._closing >= 0) / (len(self.corners.points) + PRIOR_TESTS))
+
+    @property
+    def own_shares(self) -> Floats:
+        """(N,) float64, for each mark, the share of closed ones among its parallelograms; 0 without any."""
+        count, closing = len(self.points), self._closing
+        tests, own = np.zeros(count), np.zeros(count)
+        for part in self.corners[2:]:
+            tests += np.bincount(part, minlength=count)
+        for part in self._cells.T:
+            own += np.bincount(part, minlength=count)
+        tests += np.bincount(closing[closing >= 0], minlength=count)
+        return np.asarray(own / np.maximum(tests, 1), np.float64)
+
+    @property
+    def cluster_sizes(self) -> Indices:
+        """(N,) int64, the number of marks that closed parallelograms connect to each mark, itself included."""
+        count = len(self.points)
+        cluster = components(self._cells, count)
+        return np.bincount(cluster, minlength=count)[cluster]
+
+    @property
+    def predicted(self) -> Corners:
+        """Where marks are predicted: at corners of parallelograms, and one step further along each line."""
+        found, (first, last) = self.corners, np.concatenate([self.links, self.links[:, ::-1]]).T
+        step = self.points[last] - self.points[first]
+        return Corners(
+            np.concatenate([found.points, self.points[last] + step]),
+            np.concatenate([found.reach, CLOSED * np.hypot(*step.T)]),
+            np.concatenate([found.first, first]),
+            np.concatenate([found.middle, last]),
+            np.concatenate([found.last, last]),
+        )
+
+    @cached_property
+    def _closing(self) -> Indices:
+        """Index (M,) of the mark that closes each parallelogram, or -1."""
+        expected = self.corners
+        if len(expected.points) == 0:
+            return np.zeros(0, np.int64)
+        away, near = map(np.asarray, KDTree(self.points).query(expected.points, 2))
+        # The middle mark is opposite to the corner and cannot close it.
+        second = (near[:, 0] == expected.middle).astype(np.int64)
+        which = np.arange(len(near))
+        return np.where(away[which, second] < expected.reach, near[which, second], -1)
+
+    @property
+    def _cells(self) -> Indices:
+        """(C, 4) int64, the marks of each closed parallelogram."""
+        return np.column_stack([*self.corners[2:], self._closing])[self._closing >= 0]
 
 
 def neighbour_graph(centers: Floats, longest: float) -> Indices:
@@ -126,41 +222,6 @@ def corners(centers: Floats, edges: Indices) -> Corners:
     return Corners((centers[c] + one + other)[open_], reach, a[open_], c[open_], b[open_])
 
 
-def closed_share(centers: Floats, edges: Indices) -> float:
-    """Regularity of a lattice: the share of parallelograms of neighbours that a mark closes.
-
-    Real grids, including hand-painted, curved and tilted ones, have 0.8 and more; marks scattered at random
-    have 0.1, or 0.3 if they keep a distance from each other (measured).
-
-    centers : (N, 2) float64, px. edges : (E, 2) int64, neighbours.
-
-    >>> x, y = np.meshgrid(np.arange(0, 100, 10.0), np.arange(0, 100, 10.0))
-    >>> centers = np.column_stack([x.ravel(), y.ravel()])
-    >>> round(closed_share(centers, neighbour_graph(centers, 15.0)), 2)
-    0.99
-    """
-    expected = corners(centers, edges)
-    closed = np.count_nonzero(_closing(centers, expected) >= 0)
-    return float(closed / (len(expected.points) + PRIOR_TESTS))
-
-
-def own_shares(centers: Floats, edges: Indices) -> tuple[Floats, Indices]:
-    """For each mark, the share of closed ones among its parallelograms, and the number of marks connected to
-    it by closed parallelograms: two (N,) arrays; 0 and 1 for a mark without any."""
-    count, expected = len(centers), corners(centers, edges)
-    closing = _closing(centers, expected)
-    closed = closing >= 0
-    tests, own = np.zeros(count), np.zeros(count)
-    cells = np.column_stack([expected.first, expected.middle, expected.last, closing])[closed]
-    for part in (expected.first, expected.middle, expected.last):
-        tests += np.bincount(part, minlength=count)
-    for part in cells.T:
-        own += np.bincount(part, minlength=count)
-    tests += np.bincount(closing[closed], minlength=count)
-    cluster = components(cells, count)
-    return own / np.maximum(tests, 1), np.bincount(cluster, minlength=count)[cluster]
-
-
 def components(groups: Indices, count: int) -> Indices:
     """Label (count,) of the connected component of each mark; groups : (C, k), connected marks."""
     first, others = np.repeat(groups[:, 0], groups.shape[1] - 1), groups[:, 1:].ravel()
@@ -174,14 +235,3 @@ def support(points: Floats, expected: Corners) -> Indices:
         return np.zeros(len(points), np.int64)
     closing = KDTree(points).query_ball_point(expected.points, expected.reach)
     return np.bincount(np.concatenate(closing).astype(np.int64), minlength=len(points))
-
-
-def _closing(centers: Floats, expected: Corners) -> Indices:
-    """Index (M,) of the mark that closes each parallelogram, or -1."""
-    if len(expected.points) == 0:
-        return np.zeros(0, np.int64)
-    away, near = map(np.asarray, KDTree(centers).query(expected.points, 2))
-    # The middle mark is opposite to the corner and cannot close it.
-    second = (near[:, 0] == expected.middle).astype(np.int64)
-    which = np.arange(len(near))
-    return np.where(away[which, second] < expected.reach, near[which, second], -1)

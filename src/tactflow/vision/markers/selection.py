@@ -12,12 +12,10 @@ from typing import Final, Literal, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median
 from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
-from tactflow.vision.markers import lattice
-from tactflow.vision.markers.lattice import BESIDE, LONGEST_LINK, Corners, nearest, neighbour_graph, pitch_of
+from tactflow.vision.markers.lattice import BESIDE, LONGEST_LINK, Lattice, nearest, support
 from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, Spots, joined
 
 Sign = Literal["dark", "bright"]
@@ -32,10 +30,6 @@ BETWEEN: Final = 0.55
 RANDOM_SHARE: Final = 0.3
 """Share of closed parallelograms without a lattice: 0.1 to 0.25 on rendered textures, 0.31 for spots that
 keep nearly the distance of a lattice from each other (measured)."""
-
-LONG_LINK: Final = 2.0
-"""Maximum length of a link, relative to the median one at either end: it may span one missing mark. Without
-this bound, the bright rims of a TacTip's pins are taken for marks."""
 
 APART: Final = 0.9
 """Minimum distance of two marks, in sums of their radii: with 1, crowded marks are lost (sts_torque160)."""
@@ -86,14 +80,14 @@ class Candidate(NamedTuple):
     """Spots of one scale and polarity that may be the marks of a gel.
 
     spots : of similar strength, apart from each other. radius : of a disc with the same response, px. score :
-    rank among the candidates of a picture. lattice : share of closed parallelograms, 0 to 1.
+    rank among the candidates of a picture. lattice : of their centres.
     """
 
     spots: Spots
     radius: float
     polarity: Sign
     score: float
-    lattice: float
+    lattice: Lattice
 
     @property
     def centers(self) -> Floats:
@@ -114,11 +108,11 @@ def candidates(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Candidate]:
         for sigma, spots in by_scale.items():
             members = _alike(spots.at(spots.clear > RING_CONTRAST))
             if len(members.points):
-                share = lattice.closed_share(members.points, links(members.points))
+                lattice = Lattice(members.points)
                 # More contrast is more evidence, but six lamps must not beat a hundred faint dots.
                 total = float(np.median(members.strength)) * len(members.points)
-                score = max(share - RANDOM_SHARE, 0.0) * total**0.5
-                found.append(Candidate(members, sigma * RADIUS_PER_SIGMA, polarity, score, share))
+                score = max(lattice.closed_share - RANDOM_SHARE, 0.0) * total**0.5
+                found.append(Candidate(members, sigma * RADIUS_PER_SIGMA, polarity, score, lattice))
     return sorted(found, key=lambda one: (one.score, float(one.spots.strength.sum())), reverse=True)
 
 
@@ -147,8 +141,7 @@ def evidence(gray: NDArray[np.float32], marks: Spots) -> Floats:
         return np.full((len(marks.points), 3), np.nan)
     strength = np.log(marks.strength / np.median(marks.strength[around], axis=1))
     alike = likeness(gray, marks.points, marks.points[around], np.median(marks.radius[around], axis=1))
-    share, _ = lattice.own_shares(marks.points, links(marks.points))
-    return np.column_stack([np.abs(strength), alike, share])
+    return np.column_stack([np.abs(strength), alike, Lattice(marks.points).own_shares])
 
 
 def probability(evidence: Floats) -> Floats:
@@ -164,18 +157,6 @@ def probability(evidence: Floats) -> Floats:
     array([ True, False])
     """
     return np.asarray(1 / (1 + np.exp(-PROBABILITY[0] - evidence @ PROBABILITY[1:])), np.float64)
-
-
-def links(points: Floats) -> NDArray[np.int64]:
-    """The neighbours (E, 2) among marks (N, 2)."""
-    if len(points) < 2:
-        return np.zeros((0, 2), np.int64)
-    edges = neighbour_graph(points, LONGEST_LINK * pitch_of(points))
-    if not len(edges):
-        return edges
-    length = np.hypot(*(points[edges[:, 0]] - points[edges[:, 1]]).T)
-    usual = np.asarray(median(np.tile(length, 2), edges.T.ravel(), np.arange(len(points))))
-    return np.asarray(edges[length < LONG_LINK * usual[edges].min(axis=1)], np.int64)
 
 
 def _alike(spots: Spots) -> Spots:
@@ -207,8 +188,9 @@ def _in_lattice(marks: Spots) -> Spots:
     """The marks that belong to a lattice, or stand isolated on an even background."""
     if len(marks.points) < BESIDE:
         return marks
-    share, cluster = lattice.own_shares(marks.points, links(marks.points))
-    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (share >= RANDOM_SHARE)
+    lattice = Lattice(marks.points)
+    cluster = lattice.cluster_sizes
+    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (lattice.own_shares >= RANDOM_SHARE)
     alike = _ratio(marks.strength, np.median(marks.strength)) < ALIKE
     return marks.at(member | (alike & (marks.clear > CLEAR)))
 
@@ -227,8 +209,8 @@ def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
 
 def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     """The spots, none of which touches a mark, that extend the lattice and resemble the marks around."""
-    support = lattice.support(spots.points, expected_marks(marks.points))
-    wanted, support = spots.at(support > 0), support[support > 0]
+    count = support(spots.points, Lattice(marks.points).predicted)
+    wanted, count = spots.at(count > 0), count[count > 0]
     away = cdist(wanted.points, marks.points)
     around = np.argsort(away, axis=1, kind="stable")[:, :BESIDE]
     usual = np.median(marks.radius[around], axis=1)
@@ -236,7 +218,7 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     strength = _ratio(wanted.strength, np.median(marks.strength[around], axis=1))
     fits = (radius < ALIKE) & (strength < NEAR)
     sure = (wanted.clear > CLEAR) & (strength < ALIKE)
-    chosen = (wanted.clear > RING_CONTRAST) & ((support >= LEAST_SUPPORT) | sure)
+    chosen = (wanted.clear > RING_CONTRAST) & ((count >= LEAST_SUPPORT) | sure)
     left = np.flatnonzero(fits & ~chosen)
     chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > LIKENESS
     rank = wanted.strength / radius
@@ -246,23 +228,6 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
 def _ratio(one: Floats, other: Floats | np.float64) -> Floats:
     """Ratio (n,) of the larger to the smaller of two values."""
     return np.asarray(np.maximum(one / other, other / one), np.float64)
-
-
-def expected_marks(points: Floats) -> Corners:
-    """Where the lattice predicts marks: at corners of parallelograms, and one step further along each
-    line."""
-    edges = links(points)
-    found = lattice.corners(points, edges)
-    first, last = np.concatenate([edges, edges[:, ::-1]]).T
-    step = points[last] - points[first]
-    reach = lattice.CLOSED * np.hypot(*step.T)
-    return Corners(
-        np.concatenate([found.points, points[last] + step]),
-        np.concatenate([found.reach, reach]),
-        np.concatenate([found.first, first]),
-        np.concatenate([found.middle, last]),
-        np.concatenate([found.last, last]),
-    )
 
 
 def _apart(spots: Spots, rank: Floats) -> Spots:
