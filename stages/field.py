@@ -7,7 +7,7 @@ from typing import NamedTuple
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Image
-from tactflow.vision.flow.displacement_field import FEWEST, DisplacementField, FieldModel
+from tactflow.vision.flow.displacement_field import MIN_MARKERS, DisplacementField, FieldModel
 from tactflow.vision.types import Markers
 
 
@@ -29,7 +29,7 @@ class Field(Stage):
 
     def process(self, markers: Markers, image: Image) -> FieldPorts | Absent:
         """The field of this frame; absent where fewer than three markers are seen."""
-        if len(markers.origin) < FEWEST:
+        if len(markers.origin) < MIN_MARKERS:
             return Absent("no_markers")
         # What the reference alone tells is kept; it is known again by its markers.
         reference = markers.origin.tobytes(), (image.shape[1], image.shape[0])

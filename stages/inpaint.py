@@ -8,7 +8,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask, Unmarked
-from tactflow.vision.markers.inpaint import RADIUS, remove_markers
+from tactflow.vision.markers.inpaint import RADIUS_PX, remove_markers
 
 
 class Inpaint(Stage):
@@ -22,7 +22,7 @@ class Inpaint(Stage):
         method: Literal["normalized", "telea", "ns", "none"] = Field(
             "normalized", description="normalized averages the gel around; telea and ns are OpenCV's, slow"
         )
-        radius: float = Field(RADIUS, gt=0, le=100, description="neighbourhood, processed px")
+        radius: float = Field(RADIUS_PX, gt=0, le=100, description="neighbourhood, processed px")
 
     params: Params
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.background_kernels import BESIDE, MIDDLE
+from tactflow.vision.contact.background_kernels import CENTER_WEIGHT, NEIGHBOUR_WEIGHT
 
 Float = NDArray[np.float32]
 
@@ -73,6 +73,6 @@ def plain_scaled_change(
         array.reshape(len(array), -1, 3)[rows, columns].transpose(2, 0, 1) for array in (picture, mean, scale)
     )
     scaled = _change(planes, usual, coefficients, across[columns], down[rows]) * unit
-    weights: Any = np.array([BESIDE, MIDDLE, BESIDE], np.float64)
+    weights: Any = np.array([NEIGHBOUR_WEIGHT, CENTER_WEIGHT, NEIGHBOUR_WEIGHT], np.float64)
     smooth = cv2.sepFilter2D(np.stack(list(scaled), axis=2), cv2.CV_32F, weights, np.ones(1))
     change[:] = smooth.reshape(change.shape)

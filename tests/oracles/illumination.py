@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.contact.illumination import (
-    CONVERGED,
     MAX_STEPS,
-    NEVER,
-    REJECT,
+    MIN_STEP_GREY,
+    NO_REJECTION_RATIO,
+    REJECT_CLIP_RATIO,
     SATURATED,
 )
 
@@ -42,13 +42,13 @@ def plain_fit_robustly(
     excess: Float, basis: Float, step: Float, shrink: Float, limit: Float, center: Float, coefficients: Float
 ) -> None:
     """Least-squares steps with clipped residuals, twice."""
-    for reject in (NEVER, REJECT):
+    for reject in (NO_REJECTION_RATIO, REJECT_CLIP_RATIO):
         for _ in range(MAX_STEPS):
             model = np.einsum("ck,ckn->cn", coefficients, basis)
             residual = np.clip(excess - model, -limit, limit)
             residual[np.abs(excess - model) >= reject * limit] = 0
             change = np.einsum("cn,ckn->ck", residual, step) - np.einsum("cj,cjk->ck", coefficients, shrink)
             coefficients += change
-            if np.abs(change).max() < CONVERGED:
+            if np.abs(change).max() < MIN_STEP_GREY:
                 break
     coefficients[:, :3] /= center[:, None]

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import check_color_image
-from tactflow.vision.contact.cells import HALF, to_cells, to_planes
+from tactflow.vision.contact.cells import MASKED_MEAN_GREY, to_cells, to_planes
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
@@ -84,7 +84,7 @@ class LightChange:
         side = max(1, round(max(height, width) / CELLS))
         self._size = max(1, height // side), max(1, width // side)
         self._light = to_planes(untouched, self._size)
-        self._gel = to_cells(valid_area(untouched), self._size) > HALF
+        self._gel = to_cells(valid_area(untouched), self._size) > MASKED_MEAN_GREY
         self._illumination = IlluminationModel(self._light, np.ones_like(self._light), self._gel)
 
     def __call__(self, image: NDArray[np.uint8]) -> float:
@@ -104,7 +104,7 @@ class LightChange:
 
 
 def seen(contact: Contact, scale: Scale, depth: Depth | None, change: float, flow: Flow | None) -> Seen:
-    """What is seen of a contact.
+    """Features of a contact.
 
     contact : with its hull's area. change : of the light less that of a gel which nothing touches, mm^2.
 

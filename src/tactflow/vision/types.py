@@ -146,7 +146,7 @@ class Flow:
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """How what touches the gel moves against the gel under it.
+    """Motion of the object relative to the gel.
 
     slipping : whether it slides over the gel: whether `probability` is above a half.
     stick_ratio : share of the contact on which the gel still moves with it, 0 to 1; 0 while it slides.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.fusion import UNMOVED, changed_mask, fuse_contact
+from tactflow.vision.contact.fusion import MIN_RESTING_MARKERS, changed_mask, fuse_contact
 from tactflow.vision.flow.motion import MotionTest
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -65,7 +65,7 @@ def test_a_change_of_the_light_over_many_resting_markers_is_no_contact() -> None
 
 
 def test_fewer_resting_markers_leave_the_light_its_say() -> None:
-    one_row = light(10, 10, 15 + 25 * (UNMOVED - 1), 30)
+    one_row = light(10, 10, 15 + 25 * (MIN_RESTING_MARKERS - 1), 30)
     assert fuse_contact(one_row, markers(), MotionTest(ORIGIN)).evidence == "light"
 
 

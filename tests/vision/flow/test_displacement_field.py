@@ -11,7 +11,7 @@ import pytest
 
 from tactflow.sim import open_scene
 from tactflow.vision.flow import FieldModel, flow_in_mask, flow_of_field
-from tactflow.vision.flow.displacement_field import NUGGET, matern
+from tactflow.vision.flow.displacement_field import NUGGET_VARIANCE, matern
 from tactflow.vision.types import Markers, MarkerStatus
 
 X, Y = np.meshgrid(np.arange(20.0, 300, 40), np.arange(20.0, 400, 40))
@@ -53,7 +53,9 @@ def krige(origin: np.ndarray, moved: np.ndarray, extra: np.ndarray, places: np.n
     def kernel(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return matern(np.linalg.norm(one[:, None] - other, axis=2) / length)
 
-    return kernel(places, origin) @ np.linalg.solve(kernel(origin, origin) + np.diag(extra + NUGGET), moved)
+    return kernel(places, origin) @ np.linalg.solve(
+        kernel(origin, origin) + np.diag(extra + NUGGET_VARIANCE), moved
+    )
 
 
 def test_it_is_kriging_with_a_matern_kernel() -> None:

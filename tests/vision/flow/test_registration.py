@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tactflow.vision.arrays import Floats, Floats32, Mask
-from tactflow.vision.flow.registration import CELL, Registration, register, template_of
+from tactflow.vision.flow.registration import CELL_PX, Registration, register, template_of
 
 REST, SPREAD = np.zeros(5), np.array([5.0, 5.0, 5.0, 1.0, 0.3])
 SIZE = 60
@@ -30,7 +30,9 @@ def change(
 
 def mask_of(picture: Floats32) -> Mask:
     cells = np.where(picture > 5, 255, 0).astype(np.uint8)
-    return np.asarray(cv2.resize(cells, None, fx=CELL, fy=CELL, interpolation=cv2.INTER_NEAREST), np.uint8)
+    return np.asarray(
+        cv2.resize(cells, None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_NEAREST), np.uint8
+    )
 
 
 def moved(

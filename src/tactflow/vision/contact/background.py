@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED, Floats32
 from tactflow.vision.contact.background_kernels import (
-    BESIDE,
-    MIDDLE,
+    CENTER_WEIGHT,
+    NEIGHBOUR_WEIGHT,
     scaled_change,
     smooth_cells,
     weigh_change,
@@ -26,18 +26,18 @@ from tactflow.vision.contact.illumination import IlluminationModel, positions, u
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
-CELL: Final = 4
+CELL_PX: Final = 4
 """Side of a cell, px: averages 16 pixels, so that noise of 2 grey levels is half a level."""
-PRIOR_FRAMES: Final = 8
+PRIOR_WEIGHT_FRAMES: Final = 8
 """Weight, in frames, of the noise that is estimated from the grain of the first frame. Chosen by hand."""
-QUANTISATION: Final = 12**-0.5
+QUANTISATION_STDDEV_GREY: Final = 12**-0.5
 """Standard deviation of rounding to whole grey levels, grey levels: that of a uniform variable of width 1."""
-BRIGHTNESS_BINS: Final = 6
+BRIGHTNESS_BIN_COUNT: Final = 6
 """Brightness ranges whose noise is estimated separately: shot noise grows with the light. Chosen by hand."""
-NOISE_CORRELATION: Final = 2.0
+CORRELATED_NOISE_RATIO: Final = 2.0
 """Ratio of the noise left by smoothing to that of white noise: demosaicing and video compression correlate
 neighbouring pixels. Chosen by hand."""
-CELL_VALID: Final = 128
+MIN_CELL_VALID_MEAN: Final = 128
 """Minimum mean of the valid area, 0 to 255, over a cell that counts: half of the cell."""
 
 _NO_CELLS: Final = np.zeros((0, 0), np.bool_)
@@ -257,7 +257,10 @@ class BackgroundModel:
             scaled,
         )
         smooth = cv2.sepFilter2D(
-            scaled, cv2.CV_32F, np.ones(1, np.float32), np.array([BESIDE, MIDDLE, BESIDE])
+            scaled,
+            cv2.CV_32F,
+            np.ones(1, np.float32),
+            np.array([NEIGHBOUR_WEIGHT, CENTER_WEIGHT, NEIGHBOUR_WEIGHT]),
         )
         smooth *= inside.repeat(2, axis=0).repeat(6, axis=1)
         return np.asarray(smooth.reshape(high, wide, 3), np.float32)
@@ -266,8 +269,8 @@ class BackgroundModel:
         if self._known is not None:
             return self._known
         mean, count = self._mean, self._frames
-        noise = (PRIOR_FRAMES * self._noise**2 + self._squares) / (PRIOR_FRAMES + count - 1)
-        steady = noise * (1 + 1 / count) + (self._shift / CELL * _steepness(mean)) ** 2
+        noise = (PRIOR_WEIGHT_FRAMES * self._noise**2 + self._squares) / (PRIOR_WEIGHT_FRAMES + count - 1)
+        steady = noise * (1 + 1 / count) + (self._shift / CELL_PX * _steepness(mean)) ** 2
         self._known = Derived.of(mean, steady, self._repeatability, self._tint, self._gel)
         return self._known
 
@@ -305,7 +308,7 @@ def _smoothed(half: NDArray[np.uint8]) -> Floats32:
 
 def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Means over 2 x 2 px; the border is replicated to make whole cells."""
-    bottom, right = -image.shape[0] % CELL, -image.shape[1] % CELL
+    bottom, right = -image.shape[0] % CELL_PX, -image.shape[1] % CELL_PX
     whole = np.ascontiguousarray(image)
     if bottom or right:
         whole = np.asarray(cv2.copyMakeBorder(whole, 0, bottom, 0, right, cv2.BORDER_REPLICATE), np.uint8)
@@ -319,7 +322,7 @@ def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDAr
     gel = lit_area(half)[::2, ::2]
     if not valid.all():
         cells = halved(_halved(np.repeat(valid[:, :, None], 3, axis=2)))
-        gel = gel & (cells[:, :, 0] >= CELL_VALID)
+        gel = gel & (cells[:, :, 0] >= MIN_CELL_VALID_MEAN)
     return None if gel.all() else np.asarray(gel)
 
 
@@ -340,7 +343,7 @@ def _spatial_noise(picture: NDArray[np.uint8]) -> Floats32:
     against markers. The grain of the gel counts as noise here, which makes false contacts rarer.
     """
     cells = _planes(picture)
-    noise = np.full_like(cells, QUANTISATION)
+    noise = np.full_like(cells, QUANTISATION_STDDEV_GREY)
     if cells.shape[2] < 3:
         return noise
     # The difference of white noise has six times its variance.
@@ -349,12 +352,12 @@ def _spatial_noise(picture: NDArray[np.uint8]) -> Floats32:
     for channel in range(3):
         level = cells[channel, :, 1:-1].ravel()
         order = np.argsort(level)
-        bins = [part for part in np.array_split(order, BRIGHTNESS_BINS) if part.size]
+        bins = [part for part in np.array_split(order, BRIGHTNESS_BIN_COUNT) if part.size]
         center = [float(level[part].mean()) for part in bins]
         spread = [float(np.median(second[channel].ravel()[part])) for part in bins]
         noise[channel] = np.interp(cells[channel], center, spread)
     # Smoothing 3 x 3 independent cells divides the noise by three, but these are correlated.
-    return np.asarray(np.hypot(noise, QUANTISATION) * (NOISE_CORRELATION / 3), np.float32)
+    return np.asarray(np.hypot(noise, QUANTISATION_STDDEV_GREY) * (CORRELATED_NOISE_RATIO / 3), np.float32)
 
 
 def _fine_noise(planes: Floats32) -> Floats32:
@@ -368,4 +371,6 @@ def _fine_noise(planes: Floats32) -> Floats32:
     diagonal = np.abs(above[:, :, ::2] - above[:, :, 1::2] - below[:, :, ::2] + below[:, :, 1::2])
     # The mean of four independent pixels is as noisy as a smoothed one.
     noise = np.median(diagonal, axis=(1, 2), keepdims=True) * (MAD_TO_SIGMA / 4)
-    return np.asarray((noise**2 + QUANTISATION**2) * (NOISE_CORRELATION / 3) ** 2, np.float32)
+    return np.asarray(
+        (noise**2 + QUANTISATION_STDDEV_GREY**2) * (CORRELATED_NOISE_RATIO / 3) ** 2, np.float32
+    )

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32
 from tactflow.vision.compiled import helper, kernel
-from tactflow.vision.contact.illumination import WHITE
+from tactflow.vision.contact.illumination import SATURATION_GREY
 
 Byte = NDArray[np.uint8]
 
-BLUR_SIGMA: Final = 0.8
+BLUR_SIGMA_PX: Final = 0.8
 """Standard deviation of the smoothing of changes, pixels of the window. Chosen by hand."""
-_AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA**2))
-MIDDLE: Final = np.float32(1 / (1 + 2 * _AT_ONE))
-BESIDE: Final = np.float32(_AT_ONE / (1 + 2 * _AT_ONE))
+_AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA_PX**2))
+CENTER_WEIGHT: Final = np.float32(1 / (1 + 2 * _AT_ONE))
+NEIGHBOUR_WEIGHT: Final = np.float32(_AT_ONE / (1 + 2 * _AT_ONE))
 """Weights of a pixel and of each of its two neighbours: a Gaussian with that standard deviation."""
-NINTH: Final = np.float32(1 / 9)
+BOX_WEIGHT: Final = np.float32(1 / 9)
 """Weight of one of 3 x 3 cells."""
 
 
@@ -60,7 +60,7 @@ def smooth_cells(half: Byte, smooth: Floats32) -> None:
             squares[x] = sums[x] + sums[x + 3] + sums[x + 6]
         for c in range(3):
             for x in range(wide):
-                smooth[c, y, x] = np.float32(squares[3 * x + c]) * NINTH
+                smooth[c, y, x] = np.float32(squares[3 * x + c]) * BOX_WEIGHT
 
 
 @kernel(
@@ -109,7 +109,7 @@ def weigh_change(
             scale = weight[c, y]
             for x in range(wide):
                 light = usual[x] * (gain + slope * across[x]) + offset
-                change, least = line[x] - usual[x] - light, line[x] - WHITE
+                change, least = line[x] - usual[x] - light, line[x] - SATURATION_GREY
                 change = change if change > least else least
                 deviation = change * scale[x]
                 total[x] = deviation * deviation + total[x]
@@ -164,7 +164,7 @@ def scaled_change(
             line[c], line[wide + 3 + c] = line[3 * min(2, wide // 3) + c], line[max(wide - 3, 3) + c]
         smooth = change[y]
         for i in range(wide):
-            smooth[i] = (line[i] + line[i + 6]) * BESIDE + line[i + 3] * MIDDLE
+            smooth[i] = (line[i] + line[i + 6]) * NEIGHBOUR_WEIGHT + line[i + 3] * CENTER_WEIGHT
 
 
 @helper
@@ -192,5 +192,5 @@ def _scale_line(
     for i in range(values.size):
         value, usual = np.float32(values[i]), mean[i]
         change = value - usual - (usual * (gain[i] + slope[i] * place) + offset[i])
-        least = value - WHITE
+        least = value - SATURATION_GREY
         changes[i] = (change if change > least else least) * scale[i]

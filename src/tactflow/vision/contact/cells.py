@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32
 
-CELLS: Final = 128
+LONG_SIDE_CELLS: Final = 128
 """Cells along the longer side of a picture."""
-HALF: Final = 127
+MASKED_MEAN_GREY: Final = 127
 """Mean of a mask, 0 to 255, above which a cell counts as masked."""
 
 
@@ -22,7 +22,7 @@ def grid_size(shape: tuple[int, ...]) -> tuple[int, int]:
     >>> grid_size((240, 320, 3))
     (96, 128)
     """
-    scale = CELLS / max(shape[:2])
+    scale = LONG_SIDE_CELLS / max(shape[:2])
     return max(1, round(shape[0] * scale)), max(1, round(shape[1] * scale))
 
 

@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Floats, Floats32, Mask
-from tactflow.vision.contact.background import CELL
+from tactflow.vision.contact.background import CELL_PX
 from tactflow.vision.types import Contact
 
-WEIGHTS: Final = (0.37, 1.59, 1.67)
+EVIDENCE_WEIGHTS: Final = (0.37, 1.59, 1.67)
 """Constant and weights of `contact_evidence` in the log odds: `python -m lab.probability contacts`."""
-DOUBTFUL: Final = 0.25
+MIN_REGION_PROBABILITY: Final = 0.25
 """Probability below which a region beside another is rejected: odds of three to one against it."""
-LEAST_SHARE: Final = 1e-3
+MIN_COLOUR_SHARE: Final = 1e-3
 """Lower bound of the share of colour in a change, so that its logarithm is finite."""
 
 
@@ -44,9 +44,9 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
     evidence = np.empty((len(parts), 2))
     for row, part in zip(evidence, parts, strict=True):
         cells = np.zeros((high, wide), np.uint8)
-        cv2.fillConvexPoly(cells, (part.hull / CELL).astype(np.int32), (1.0,))
+        cv2.fillConvexPoly(cells, (part.hull / CELL_PX).astype(np.int32), (1.0,))
         light, colour = (cv2.minMaxLoc(values, cells & inside)[1] for values in deviations)
-        row[:] = math.log(max(colour / max(light, 1e-9), LEAST_SHARE)), part.evidence == "both"
+        row[:] = math.log(max(colour / max(light, 1e-9), MIN_COLOUR_SHARE)), part.evidence == "both"
     return evidence
 
 
@@ -55,7 +55,7 @@ def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
 
     Regions that only the markers show have none, because there is no change of light to judge.
     """
-    odds = WEIGHTS[0] + contact_evidence(parts, mask, deviations) @ WEIGHTS[1:]
+    odds = EVIDENCE_WEIGHTS[0] + contact_evidence(parts, mask, deviations) @ EVIDENCE_WEIGHTS[1:]
     return [
         part if part.evidence == "dots" else replace(part, probability=1 / (1 + math.exp(-value)))
         for part, value in zip(parts, odds.tolist(), strict=True)
@@ -68,7 +68,7 @@ def without_doubtful(parts: Sequence[Contact], mask: Mask) -> tuple[list[Contact
     parts : all regions of the mask, (H, W) uint8, 0 or 255. The mask itself is returned if all are kept.
     """
     best = max(parts, key=_probability)
-    probable = [part for part in parts if part is best or _probability(part) >= DOUBTFUL]
+    probable = [part for part in parts if part is best or _probability(part) >= MIN_REGION_PROBABILITY]
     if len(probable) == len(parts):
         return probable, mask
     kept = mask.copy()

@@ -20,11 +20,11 @@ import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats32, Mask
 
-OUTER: Final = 0.55
+BORDER_SLOPE_FRACTION: Final = 0.55
 """Slope at the border of a contact, as a fraction of its local maximum. Lower includes more of the
 surroundings and of wrinkled gel; higher opens the ring where the light is faint. On outlines of fifteen labs,
 values from 0.5 to 0.6 overlap equally well within 0.02 (`lab.judges.judge`)."""
-SHALLOW: Final = 0.2
+BORDER_DEPTH_FRACTION: Final = 0.2
 """Depth at the border of a contact, as a fraction of its local maximum. Under a ball it is 0.32 on a
 half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap equally well with
 real outlines within 0.02."""
@@ -67,9 +67,11 @@ def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
     shown = np.asarray(cv2.transform(change, mixtures), np.float32)
     if len(mixtures) > 1:
         # OpenCV's lengths take a tenth of the time of NumPy's.
-        return np.asarray(reduce(cv2.magnitude, cv2.split(shown)), np.float32), OUTER
+        return np.asarray(reduce(cv2.magnitude, cv2.split(shown)), np.float32), BORDER_SLOPE_FRACTION
     more, less = np.maximum(shown, np.float32(0)), np.maximum(-shown, np.float32(0))
-    return (less if cv2.norm(less, cv2.NORM_L2SQR) > cv2.norm(more, cv2.NORM_L2SQR) else more), SHALLOW
+    return (
+        less if cv2.norm(less, cv2.NORM_L2SQR) > cv2.norm(more, cv2.NORM_L2SQR) else more
+    ), BORDER_DEPTH_FRACTION
 
 
 def largest_nearby(values: Floats32) -> Floats32:
@@ -80,7 +82,7 @@ def largest_nearby(values: Floats32) -> Floats32:
     """
     smooth = np.asarray(cv2.blur(values, (3, 3)), np.float32)
     peak = max(float(smooth.max()), 1e-9)
-    reach = round(math.sqrt(np.count_nonzero(values > OUTER * peak) / math.pi) / 2)
+    reach = round(math.sqrt(np.count_nonzero(values > BORDER_SLOPE_FRACTION * peak) / math.pi) / 2)
     half = -(-values.shape[1] // 2), -(-values.shape[0] // 2)
     coarse = cv2.resize(smooth, half, interpolation=cv2.INTER_AREA)
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)

@@ -33,27 +33,27 @@ from numpy.typing import NDArray
 from scipy import special
 
 from tactflow.vision.arrays import Flags, Floats32, check_color_image
-from tactflow.vision.contact.background import CELL, BackgroundModel, Change
+from tactflow.vision.contact.background import CELL_PX, BackgroundModel, Change
 from tactflow.vision.contact.components import contact_cells, wide_change
 from tactflow.vision.contact.contact_outline import contact_level, draw_level
 from tactflow.vision.contact.heights import HeightModel
 from tactflow.vision.contact.level_lines import ContactFinder
 
-CONNECTED: Final = 0.25
+LOW_THRESHOLD_FRACTION: Final = 0.25
 """Low hysteresis threshold, as a fraction of the detection threshold on squared deviations: half of it in
 standard deviations. Chosen by hand."""
-STAY: Final = 0.7
+HELD_THRESHOLD_FRACTION: Final = 0.7
 """Threshold for an existing contact, as a fraction of the detection threshold in standard deviations. Chosen
 by hand."""
-FORGET: Final = 0.98
+DECAY_PER_FRAME: Final = 0.98
 """Decay of the strongest recent change per frame: it halves in 34 frames. Chosen by hand."""
-WIDE: Final = 0.01
+MIN_WIDE_AREA_SHARE: Final = 0.01
 """Minimum area of a wide change, as a fraction of the picture: more than compression noise, which comes in
 blocks of 16 px of the camera (4 cells without contact where 48 would be contact)."""
-CLUSTER: Final = 0.7
+CELLS_PER_LOG_RATE: Final = 0.7
 """Increase of that minimum, in cells, for each factor of e in the rate of false alarms: measured on white
 noise, smoothed as the cells are."""
-GONE: Final = 0.5
+ENDED_FRACTION: Final = 0.5
 """A faint change that falls below this fraction of itself within one frame has ended. Chosen by hand."""
 
 
@@ -209,8 +209,8 @@ class ContactDetector:
         else:
             self._suspected = None
         largest, widest = (0.0, 0.0) if found is None else (change.largest, change.largest_colour)
-        self._strongest = max(self._strongest * FORGET, largest)
-        self._strongest_wide = max(self._strongest_wide * FORGET, widest)
+        self._strongest = max(self._strongest * DECAY_PER_FRAME, largest)
+        self._strongest_wide = max(self._strongest_wide * DECAY_PER_FRAME, widest)
         if found is None:
             self._mask = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
@@ -241,9 +241,9 @@ class ContactDetector:
             window = self._background.window_change(change, rows, columns, inside)
             surely = core.repeat(2, axis=0).repeat(2, axis=1)
             level = contact_level(window, surely, heights.mixtures)
-            draw_level(level, CELL * rows.start, CELL * columns.start, mask)
+            draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, mask)
         if not regions:
-            draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL)
+            draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL_PX)
         # Cells reach beyond the gel.
         return mask if self._gel is None else mask & self._gel
 
@@ -253,12 +253,12 @@ class ContactDetector:
         before : cells in contact in the previous frame.
         """
         limit, remembered = self._limit(change.squared.size), self._relaxation**2 * self._strongest
-        start, stay = max(limit, remembered), limit * STAY**2
+        start, stay = max(limit, remembered), limit * HELD_THRESHOLD_FRACTION**2
         if not self._relaxation < change.remaining < 1 - self._creep:
             stay = max(stay, remembered)
         if change.largest < (start if before is None else stay):
             return None
-        return contact_cells(change.squared, CONNECTED * limit, start, stay, before)
+        return contact_cells(change.squared, LOW_THRESHOLD_FRACTION * limit, start, stay, before)
 
     def _faint(self, change: Change, before: Flags | None) -> Flags | None:
         """Cells (h, w) in contact by the extent of a change of colour in two frames, or that fade while being
@@ -267,7 +267,7 @@ class ContactDetector:
         before : as for `_clear`.
         """
         suspected, self._suspected = self._suspected, None
-        if change.remaining <= GONE:
+        if change.remaining <= ENDED_FRACTION:
             return None
         fading = change.remaining < 1 - self._creep
         limit = self._limit(change.colour.size)
@@ -281,15 +281,15 @@ class ContactDetector:
             # One frame may be a flash, a cable's shadow, a damaged picture.
             if belongs is None or suspected is None or not (belongs & suspected).any():
                 return None
-        elif fading and change.evidence[before].max() >= limit * STAY**2:
+        elif fading and change.evidence[before].max() >= limit * HELD_THRESHOLD_FRACTION**2:
             belongs = before if belongs is None else before | belongs
         if belongs is None:
             return None
-        return contact_cells(change.evidence, CONNECTED * limit, math.inf, 0.0, belongs)
+        return contact_cells(change.evidence, LOW_THRESHOLD_FRACTION * limit, math.inf, 0.0, belongs)
 
     def _extent(self, cells: int) -> float:
         """Number of cells from which a faint change of colour is a contact."""
-        return max(WIDE * cells, CLUSTER * math.log(cells / self._false_alarms))
+        return max(MIN_WIDE_AREA_SHARE * cells, CELLS_PER_LOG_RATE * math.log(cells / self._false_alarms))
 
     def _limit(self, cells: int) -> float:
         """Detection threshold on squared deviations, corrected for the number of cells."""

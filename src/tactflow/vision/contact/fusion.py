@@ -15,19 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32, Mask
-from tactflow.vision.contact.background import CELL
+from tactflow.vision.contact.background import CELL_PX
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
 from tactflow.vision.geometry.region import Region, measure_region
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
-UNMOVED: Final = 6
+MIN_RESTING_MARKERS: Final = 6
 """Minimum number of resting markers below a change of the light that make it a change of illumination.
 Measured: frames in contact in which no marker moved had at most 5 (simulator, mini_ball, gelslim_ball,
 handmade_dots, sts_640 and franka_mini)."""
-MARGIN: Final = 0.125
+HULL_MARGIN_PITCHES: Final = 0.125
 """Margin of a region around the hull of its markers, pitches. Chosen by hand."""
-SPREAD: Final = 5.0
+MAX_RESIDUE_DISTANCE_PX: Final = 5.0
 """Maximum distance of inpainting residue from a marker's border, px: a cell of `background`, and a pixel for
 smoothing. Chosen by hand. On sts_640 and tactip_video the centres of residues lie up to 4.4 px away."""
 _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
@@ -86,7 +86,7 @@ def fuse_contact(
     changed = light if deviations is None else changed_mask(deviations, light.shape)
     if _rests(changed, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
-    if deviations is not None and not _without_rims(changed, measure_region(changed), markers, CELL).any():
+    if deviations is not None and not _without_rims(changed, measure_region(changed), markers, CELL_PX).any():
         return FusedContact(np.zeros_like(light), None)
     mask = _without_rims(light, region, markers)
     return FusedContact(mask, "light" if cv2.countNonZero(mask) else None)
@@ -95,7 +95,7 @@ def fuse_contact(
 def changed_mask(deviations: Floats32, shape: tuple[int, ...]) -> Mask:
     """(H, W) uint8, 255 in changed cells; deviations : (2, h, w), 0 in all other cells."""
     cells = (deviations.max(axis=0) > 0).view(np.uint8) * np.uint8(255)
-    return np.ascontiguousarray(cells.repeat(CELL, axis=0).repeat(CELL, axis=1)[: shape[0], : shape[1]])
+    return np.ascontiguousarray(cells.repeat(CELL_PX, axis=0).repeat(CELL_PX, axis=1)[: shape[0], : shape[1]])
 
 
 def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
@@ -103,7 +103,7 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     seen = markers.status == _TRACKED
     below = inside_mask(markers.position[seen], light)
     resting = motion.still()[seen][below]
-    return len(resting) >= UNMOVED and bool(resting.all())
+    return len(resting) >= MIN_RESTING_MARKERS and bool(resting.all())
 
 
 def _without_rims(light: Mask, region: Region, markers: Markers, coarse: int = 0) -> Mask:
@@ -119,10 +119,12 @@ def _without_rims(light: Mask, region: Region, markers: Markers, coarse: int = 0
     left, top, width, height = region[:4]
     window = light[top : top + height, left : left + width]
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(window)
-    small = np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + SPREAD + coarse) ** 2)
+    small = np.flatnonzero(
+        boxes[:, cv2.CC_STAT_AREA] <= np.pi * (radius + MAX_RESIDUE_DISTANCE_PX + coarse) ** 2
+    )
     places = centers[small] + (left, top)
     away = np.hypot(*(places[:, None] - markers.position).transpose(2, 0, 1)).min(axis=1)
-    rims = small[(away <= radius + SPREAD) & (small > 0)]
+    rims = small[(away <= radius + MAX_RESIDUE_DISTANCE_PX) & (small > 0)]
     if not len(rims):
         return light
     kept = np.ones(count, np.bool_)
@@ -137,5 +139,5 @@ def _hull_of(points: NDArray[np.float64], pitch: float, like: Mask) -> Mask:
     region = np.zeros_like(like)
     hull = cv2.convexHull(np.rint(points).astype(np.int32))
     cv2.fillConvexPoly(region, hull, 255)
-    cv2.polylines(region, [hull], True, 255, max(1, round(2 * MARGIN * pitch)))
+    cv2.polylines(region, [hull], True, 255, max(1, round(2 * HULL_MARGIN_PITCHES * pitch)))
     return region

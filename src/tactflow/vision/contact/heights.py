@@ -24,25 +24,25 @@ from scipy import linalg
 
 from tactflow.vision.arrays import Floats32
 
-MARGIN: Final = 0.15
+PADDING_SHARE: Final = 0.15
 """Padding with gel at rest at both ends of a side, as a fraction of it: the integrated surface is
 periodic."""
-SHORTEST: Final = 4
+MIN_WAVELENGTH_CELLS: Final = 4
 """Shortest wavelength, cells: cells are means over three by three."""
-INTEGRABLE: Final = 0.2
+MAX_CURL_SHARE: Final = 0.2
 """Largest fraction of the slopes' power that an integrable pair may lack. A single slope of a round contact,
 as seen in light from one side, lacks 0.25; sensors with lamps on several sides lack 0.00 to 0.15."""
-ONE_SLOPE: Final = 3 / 8
+MAX_CURL_SHARE_GREY: Final = 3 / 8
 """The same if all channels change alike: one slope of a round contact lacks a quarter, depth a half."""
-WEAKEST: Final = 0.01
+MIN_MIXTURE_POWER: Final = 0.01
 """Minimum power of a mixture of channels, relative to the strongest one, to count as a slope: a tenth in
 amplitude. Weaker ones are noise, in a faint contact that brightens as a whole."""
-CLEAR: Final = 2.0
+MIN_CHANGE_STDDEVS: Final = 2.0
 """Minimum size of a change that is more than noise, standard deviations."""
-ONE_WAY: Final = 1 / 3
+MIN_DARKNESS_COHERENCE: Final = 1 / 3
 """Length of the sum of clear changes over the sum of their lengths from which they are depth: slopes go up
 as well as down. In gray pictures of fifteen labs it is 0.0 to 0.3, or 0.4 to 0.9."""
-MORE: Final = 0.1
+MIN_FRAME_POWER_SHARE: Final = 0.1
 """Minimum power of a frame to learn from, relative to the total so far: a sensor is known after ten such
 frames. With 0.02 to 0.3, outlines overlap equally well with real ones within 0.01."""
 
@@ -104,7 +104,7 @@ class HeightModel:
     def _learn(self, change: Floats32) -> None:
         """Add a change to the statistics of power and integrability, unless it is too weak to matter."""
         flat = change.reshape(3, -1)
-        if not cv2.norm(flat, cv2.NORM_L2SQR) > MORE * self._power.trace():
+        if not cv2.norm(flat, cv2.NORM_L2SQR) > MIN_FRAME_POWER_SHARE * self._power.trace():
             return
         high, wide = change.shape[1:]
         down, across = _waves(high), _waves(wide)
@@ -116,7 +116,7 @@ class HeightModel:
         self._power += power
         self._missing += np.kron(np.eye(2), power) - both @ both.T
         sizes = np.linalg.norm(flat, axis=0)
-        clear = sizes > CLEAR
+        clear = sizes > MIN_CHANGE_STDDEVS
         self._one_way += float(np.linalg.norm(flat[:, clear].sum(axis=1)))
         self._size += float(sizes[clear].sum())
         self._mixtures = self._showing()
@@ -128,12 +128,12 @@ class HeightModel:
     def _showing(self) -> Floats32:
         """Mixtures (k, 3) of the channels that show the shape, as in `Heights`."""
         powers, directions = np.linalg.eigh(self._power)
-        basis = np.kron(np.eye(2), directions[:, powers >= WEAKEST * powers[-1]])
+        basis = np.kron(np.eye(2), directions[:, powers >= MIN_MIXTURE_POWER * powers[-1]])
         self.alike = basis.shape[1] == 2
         power = basis.T @ np.kron(np.eye(2), self._power) @ basis
         missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
-        one_way = self.alike and self._one_way >= ONE_WAY * self._size
-        if missing[0] <= (ONE_SLOPE if self.alike else INTEGRABLE) and not one_way:
+        one_way = self.alike and self._one_way >= MIN_DARKNESS_COHERENCE * self._size
+        if missing[0] <= (MAX_CURL_SHARE_GREY if self.alike else MAX_CURL_SHARE) and not one_way:
             slopes = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
             return slopes / np.linalg.norm(slopes)
         return np.asarray(directions[:, -1:].T if self.alike else np.eye(3), np.float32)
@@ -154,9 +154,9 @@ class _Waves(NamedTuple):
 @lru_cache(maxsize=4)
 def _waves(side: int) -> _Waves:
     """The basis for a side of this many cells."""
-    margin = max(round(MARGIN * side), 1)
+    margin = max(round(PADDING_SHARE * side), 1)
     length = side + 2 * margin
-    frequencies = 2 * np.pi / length * np.arange(length // SHORTEST + 1)[:, None]
+    frequencies = 2 * np.pi / length * np.arange(length // MIN_WAVELENGTH_CELLS + 1)[:, None]
     phases = frequencies * (margin + np.arange(side))
     cosines, sines = np.cos(phases), np.sin(phases)
     cosines[0] /= np.sqrt(2)

@@ -11,26 +11,26 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import SATURATED, Floats32
 from tactflow.vision.compiled import kernel
 
-BLOCK: Final = 8
+BLOCK_CELLS: Final = 8
 """Side of the blocks whose means are fitted, cells. Chosen by hand."""
-CLIP: Final = 2.0
+CLIP_STDDEVS: Final = 2.0
 """Residuals are clipped at this number of standard deviations of a cell. Chosen by hand."""
-REJECT: Final = 6.0
+REJECT_CLIP_RATIO: Final = 6.0
 """Residuals above this multiple of the clipping limit are rejected in the second fit. Chosen on the simulated
 bright_cable, whose centre moves by 0.1 px more the lower it is, down to 2."""
-NEVER: Final = 1e6
+NO_REJECTION_RATIO: Final = 1e6
 """The same for the first fit, which rejects no residuals."""
 MAX_STEPS: Final = 12
 """Maximum number of least-squares steps. Chosen by hand; the fit usually converges earlier."""
-CONVERGED: Final = 0.05
+MIN_STEP_GREY: Final = 0.05
 """The fit has converged when no coefficient moves by more than this, grey levels. Chosen by hand."""
-RIDGE: Final = (0.0, 0.05, 0.05, 0.1)
+RIDGE_PENALTIES: Final = (0.0, 0.05, 0.05, 0.1)
 """Ridge penalties of gain, slopes and offset, relative to the data: on a gel of uniform brightness an offset
 is nearly the same as a gain, and slopes follow wide, faint contacts. Chosen on wedge_grasp, where 0.01 for
 the slopes misses 8 of 324 frames more than 0.1, and seu_a, whose light smaller values follow better."""
-WHITE: Final = np.float32(255)
+SATURATION_GREY: Final = np.float32(255)
 """Grey level at which a camera saturates."""
-DARK: Final = 0.25
+MIN_BLOCK_BRIGHTNESS: Final = 0.25
 """Minimum brightness of a block, relative to the mean of its channel, to take part in the initial estimate.
 Chosen by hand."""
 
@@ -68,8 +68,8 @@ class IlluminationModel:
 
     def __init__(self, reference: Floats32, variance: Floats32, gel: NDArray[np.bool_] | None = None) -> None:
         height, width = reference.shape[1:]
-        self._row_weights = _block_weights(max(1, height // BLOCK), height)
-        self._column_weights = _block_weights(max(1, width // BLOCK), width)
+        self._row_weights = _block_weights(max(1, height // BLOCK_CELLS), height)
+        self._column_weights = _block_weights(max(1, width // BLOCK_CELLS), width)
         self._center: Floats32 = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))
         relative = reference / self._center[:, None, None]
         slopes = np.stack([relative * positions(width), relative * positions(height)[:, None]], axis=1)
@@ -80,16 +80,22 @@ class IlluminationModel:
         if self._fitted is not None:
             weight = weight * self._fitted
         fitted = basis * weight
-        penalty = weight.sum(axis=2)[:, :, None] * np.diag(RIDGE)
+        penalty = weight.sum(axis=2)[:, :, None] * np.diag(RIDGE_PENALTIES)
         inverse = np.linalg.inv(fitted @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
         self._basis: Floats32 = np.ascontiguousarray(basis, np.float32)
         brightness = self._basis[:, 0]
-        lit = brightness > DARK if self._fitted is None else (brightness > DARK) & self._fitted
-        self._per_brightness: Floats32 = np.where(lit, 1 / np.maximum(brightness, DARK), np.float32(0))
+        lit = (
+            brightness > MIN_BLOCK_BRIGHTNESS
+            if self._fitted is None
+            else (brightness > MIN_BLOCK_BRIGHTNESS) & self._fitted
+        )
+        self._per_brightness: Floats32 = np.where(
+            lit, 1 / np.maximum(brightness, MIN_BLOCK_BRIGHTNESS), np.float32(0)
+        )
         self._step: Floats32 = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Floats32 = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
         self._reference = self._block_means(reference)
-        self._limit: Floats32 = np.float32(CLIP) * np.sqrt(self._block_means(variance))
+        self._limit: Floats32 = np.float32(CLIP_STDDEVS) * np.sqrt(self._block_means(variance))
 
     def fit(self, cells: Floats32) -> Floats32:
         """Coefficients of the change of illumination between the reference and a frame.
@@ -136,7 +142,7 @@ def under_illumination(untouched: Floats32, coefficients: Floats32) -> Floats32:
     height, width = untouched.shape[1:]
     gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
     gains = 1 + gain + slope_y * positions(height)[:, None] + slope_x * positions(width)
-    return np.asarray(np.minimum(untouched * gains + offset, WHITE), np.float32)
+    return np.asarray(np.minimum(untouched * gains + offset, SATURATION_GREY), np.float32)
 
 
 @lru_cache(maxsize=16)
@@ -230,12 +236,12 @@ def fit_robustly(
     """Least-squares steps with clipped residuals; `coefficients`, (3, 4), holds the start and the result.
 
     excess, limit : (3, n), the data and the limits of their residuals; the second fit rejects residuals above
-    `REJECT` times the limit. basis, step : (3, 4, n), the model and its pseudo-inverse. shrink : (3, 4, 4),
-    effect of the ridge on the coefficients in a step. center : (3,), divides the first three coefficients at
-    the end.
+    `REJECT_CLIP_RATIO` times the limit. basis, step : (3, 4, n), the model and its pseudo-inverse. shrink :
+    (3, 4, 4), effect of the ridge on the coefficients in a step. center : (3,), divides the first three
+    coefficients at the end.
     """
     change = np.empty(4, np.float32)
-    for reject in (np.float32(NEVER), np.float32(REJECT)):
+    for reject in (np.float32(NO_REJECTION_RATIO), np.float32(REJECT_CLIP_RATIO)):
         for _ in range(MAX_STEPS):
             longest = np.float32(0)
             for c in range(3):
@@ -259,7 +265,7 @@ def fit_robustly(
                 for k in range(4):
                     coefficients[c, k] += change[k]
                     longest = max(longest, abs(change[k]))
-            if longest < np.float32(CONVERGED):
+            if longest < np.float32(MIN_STEP_GREY):
                 break
     for c in range(3):
         for k in range(3):

@@ -19,25 +19,25 @@ from tactflow.vision.arrays import Flags, Floats32, Mask
 from tactflow.vision.contact.heights import Heights
 from tactflow.vision.contact.level_tree import grow_level_lines
 
-LEVELS: Final = 12
+LEVEL_COUNT: Final = 12
 """Levels between the gel at rest and its highest point: their distance is a 13th of that height."""
-FLATTER: Final = 0.5
+MIN_CLIMB_SLOPE_RATIO: Final = 0.5
 """Minimum mean slope of outer lines that still belong to the climb to the object, relative to the
 steepest."""
-BESIDE: Final = 3
+SEARCH_MARGIN_CELLS: Final = 3
 """Margin around the outermost of these lines in which the outline is searched, cells: cells are means over
 three by three, and the shortest waves of the surface are four. With 2 to 6, outlines overlap equally well
 with real ones within 0.01."""
-SMALLEST: Final = 9
+MIN_LINE_CELLS: Final = 9
 """Minimum number of cells inside a line: three by three."""
-WIDEST: Final = 0.6
+MAX_AREA_SHARE: Final = 0.6
 """Maximum area of a contact, as a fraction of the picture: the rest must show gel at rest."""
-OPEN: Final = 0.5
+MAX_BORDER_SHARE: Final = 0.5
 """Maximum fraction of a line along the border of the picture."""
-DECIDED: Final = 5.0
+SIGN_EVIDENCE_SLOPES: Final = 5.0
 """Accumulated evidence, in slopes of a frame's contact, that settles whether contacts are bumps or dents. The
 wrong one is flatter by at least a tenth in all outlined frames, by three quarters in the median."""
-LESSER: Final = 0.5
+MIN_SALIENCE_RATIO: Final = 0.5
 """Minimum salience of further contacts, relative to the first: less is gel that wrinkles, or light that has
 changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap equally well within 0.01)."""
 
@@ -64,7 +64,7 @@ class LevelLines(NamedTuple):
 
 def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
     """Level lines at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
-    levels = np.linspace(0, heights.max(), LEVELS + 2, dtype=np.float32)[1:-1]
+    levels = np.linspace(0, heights.max(), LEVEL_COUNT + 2, dtype=np.float32)[1:-1]
     high, wide = heights.shape
     # All lines lie in a window, and touch its border only where it is the picture's.
     left, top, across, down = cv2.boundingRect((heights > levels[0]).view(np.uint8))
@@ -73,16 +73,16 @@ def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
     marked = np.ascontiguousarray(changed[window]).view(np.uint8)
     above = np.zeros((high, wide), np.int32)
     over = np.empty(surface.shape, np.int32)
-    lines = np.empty((LEVELS * surface.size // SMALLEST, 7), np.int32)
+    lines = np.empty((LEVEL_COUNT * surface.size // MIN_LINE_CELLS, 7), np.int32)
     drops = np.empty(len(lines), np.float32)
-    count = grow_level_lines(surface, marked, levels, SMALLEST, over, drops, lines)
+    count = grow_level_lines(surface, marked, levels, MIN_LINE_CELLS, over, drops, lines)
     above[window] = over
     level, inside, cells, enclosed, sides, border, outer = lines[:count].T
     y, x = np.divmod(inside, surface.shape[1])
     inside = (y + window[0].start) * wide + x + window[1].start
     # Averaged over directions, a line is pi / 4 as long as the sides of the cells along it.
     length = np.float32(math.pi / 4) * sides
-    possible = (sides >= (1 - OPEN) * (sides + border)) & (cells <= WIDEST * heights.size)
+    possible = (sides >= (1 - MAX_BORDER_SHARE) * (sides + border)) & (cells <= MAX_AREA_SHARE * heights.size)
     slope = np.asarray(drops[:count] * possible / np.maximum(length, np.float32(1)), np.float32)
     salience = slope * np.sqrt(length)
     return LevelLines(above, level, inside, enclosed > 0, slope, np.asarray(salience, np.float32), outer)
@@ -118,7 +118,7 @@ class ContactFinder:
         """
         values = heights.values if self._bumps >= 0 or not heights.sloping else -heights.values
         found = _contacts(values, changed)
-        if heights.sloping and abs(self._bumps) <= DECIDED * found.slope:
+        if heights.sloping and abs(self._bumps) <= SIGN_EVIDENCE_SLOPES * found.slope:
             others = _contacts(-values, changed)
             more = found.slope - others.slope
             if abs(self._bumps) + more < 0:
@@ -140,7 +140,7 @@ def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
     regions: list[ContactRegion] = []
     left, first, slope = lines.salience.copy(), 0.0, 0.0
     free = np.ones(left.size, np.bool_)
-    while (salience := float(left.max(initial=0))) > 0 and salience >= LESSER * first:
+    while (salience := float(left.max(initial=0))) > 0 and salience >= MIN_SALIENCE_RATIO * first:
         steepest = int(left.argmax())
         outwards = _outwards(lines, steepest, free)
         wide = outwards[-1]
@@ -164,7 +164,7 @@ def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
 def _outwards(lines: LevelLines, steepest: int, free: Flags) -> list[int]:
     """The lines from the steepest one outwards, up to one that is much flatter or belongs to another
     contact."""
-    found, least = [steepest], FLATTER * lines.slope[steepest]
+    found, least = [steepest], MIN_CLIMB_SLOPE_RATIO * lines.slope[steepest]
     while (outer := int(lines.outer[found[-1]])) >= 0 and free[outer] and lines.slope[outer] >= least:
         found.append(outer)
     return found
@@ -182,7 +182,10 @@ def _region(core: Mask, near: Mask) -> ContactRegion:
     """The region of a contact; core : cells that certainly belong to it. near : cells inside the outer
     line."""
     high, wide = core.shape
-    near = np.asarray(cv2.dilate(near, np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8)), np.uint8)
+    near = np.asarray(
+        cv2.dilate(near, np.ones((2 * SEARCH_MARGIN_CELLS + 1, 2 * SEARCH_MARGIN_CELLS + 1), np.uint8)),
+        np.uint8,
+    )
     left, top, across, down = cv2.boundingRect(near)
     rows, columns = slice(max(top - 1, 0), top + down + 1), slice(max(left - 1, 0), left + across + 1)
     return ContactRegion(

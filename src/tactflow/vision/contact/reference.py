@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32, Mask
-from tactflow.vision.contact.cells import HALF, grid_size, to_cells, to_planes
+from tactflow.vision.contact.cells import MASKED_MEAN_GREY, grid_size, to_cells, to_planes
 
-SMOOTHER: Final = 0.5
+TOUCHED_ROUGHNESS_RATIO: Final = 0.5
 """Ratio of a region's roughness to that in the reference below which the reference was touched there. With
 reference and contact exchanged, 83 % of 166 outlined contacts of fifteen labs are noticed; not exchanged, one
 is a false alarm."""
-ROUGHER: Final = 1.25
+UNTOUCHED_ROUGHNESS_RATIO: Final = 1.25
 """Ratio above which the reference is known to be untouched from then on."""
-ENOUGH: Final = 10
+UNTOUCHED_FRAMES: Final = 10
 """Number of frames with a contact that is not smoother, after which the same holds: a touch in the reference
 is released before another contact begins. Chosen by hand."""
 
@@ -50,15 +50,15 @@ class ReferenceCheck:
         """
         if self.confirmed:
             return False
-        region = to_cells(changed, self._size) > HALF
+        region = to_cells(changed, self._size) > MASKED_MEAN_GREY
         if not region.any():
             return False
         now = float(_squared_slopes(image, self._size)[:, region].sum())
         before = float(self._slopes[:, region].sum())
         ratio = now / before if before > 0 else math.inf
-        self._passed += ratio >= SMOOTHER
-        self.confirmed = ratio > ROUGHER or self._passed == ENOUGH
-        return ratio < SMOOTHER
+        self._passed += ratio >= TOUCHED_ROUGHNESS_RATIO
+        self.confirmed = ratio > UNTOUCHED_ROUGHNESS_RATIO or self._passed == UNTOUCHED_FRAMES
+        return ratio < TOUCHED_ROUGHNESS_RATIO
 
 
 def _squared_slopes(image: NDArray[np.uint8], size: tuple[int, int]) -> Floats32:

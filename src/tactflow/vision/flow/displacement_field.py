@@ -21,38 +21,38 @@ from tactflow.vision.compiled import helper, kernel
 from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
-LENGTH: Final = 1.5
+CORRELATION_LENGTH_PITCHES: Final = 1.5
 """Correlation length of the field, pitches. Kernel and length are those that predict the markers of nine real
 recordings best, each marker from all others (leave-one-out likelihood); on four other recordings the best
 length is 1.4."""
-NUGGET: Final = 1e-5
+NUGGET_VARIANCE: Final = 1e-5
 """Variance added to each marker's, relative to the field's: it keeps the matrix well conditioned. Markers
 known to 0.015 px in a field of 5 px have as much. Chosen by hand."""
-CELL: Final = 0.25
+CELL_PITCHES: Final = 0.25
 """Spacing of the grid, pitches. Chosen by hand."""
-MOST_CELLS: Final = 2500
+MAX_CELLS: Final = 2500
 """Cells of a grid at most; where a quarter of the pitch would make more, the spacing is larger. Chosen by
 hand."""
-MANY: Final = 400
+COARSE_GRID_CELLS: Final = 400
 """A region whose bounding box has this many cells or more is summed over a grid with twice the spacing: it is
 at least five pitches wide, and the field varies over one and a half. Chosen by hand."""
-OUTLINE: Final = 1 / 3
+OUTLINE_STDERR_RADII: Final = 1 / 3
 """Standard error of a contact's outline, over the radius of a disc of the same area. Gel that a wrong outline
 includes or leaves out moves otherwise than the contact. On labelled frames of nine labs, 71 % of the
 components of the mean lie within one standard error of those inside outlines by eye, and 94 % within two
 (`lab/mean_flow.py`)."""
-FEWEST: Final = 3
+MIN_MARKERS: Final = 3
 """Tracked markers that a field needs. Chosen by hand."""
-OVERSHOOT: Final = 0.5
+MAX_OVERSHOOT_PITCHES: Final = 0.5
 """How much farther the gel may have moved than any tracked marker, pitches. Chosen by hand."""
-POOR: Final = 3.0
+POOR_STDERR_RATIO: Final = 3.0
 """A marker whose standard error exceeds the median by this factor has less weight. Chosen by hand."""
-WHOLE: Final = 1e-9
+PARTIAL_SHARE_TOLERANCE: Final = 1e-9
 """Sum of share (1 - share) over the cells of a region, up to which all of them are whole: rounding errors."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
-_LEAST_PRECISION: Final = 1e-5
+_MIN_PRECISION: Final = 1e-5
 """Smallest precision of a marker given all others that is divided by: that of an isolated marker, 1."""
-_NOWHERE: Final = 1e-12
+_MIN_KERNEL_SUM: Final = 1e-12
 """Smallest sum of the kernel to all markers that is divided by."""
 
 
@@ -89,7 +89,7 @@ class Samples(NamedTuple):
 class Gradient(NamedTuple):
     """How a part of the gel is turned, pressed apart and sheared: its displacement gradient.
 
-    dx, dy : (du/dx, dv/dx) and (du/dy, dv/dy), 1: what x and y at rest change the displacement (u, v) by.
+    dx, dy : (du/dx, dv/dx) and (du/dy, dv/dy), 1: gradient of the displacement (u, v).
     dx_stderr, dy_stderr : of each of their components, 1.
     """
 
@@ -172,22 +172,26 @@ class FieldModel:
     """
 
     def __init__(self, origin: Points, size: tuple[int, int]) -> None:
-        if origin.ndim != 2 or origin.shape[1] != 2 or len(origin) < FEWEST:
-            raise ValueError(f"required an origin of shape (N, 2) with N >= {FEWEST}, got {origin.shape}")
+        if origin.ndim != 2 or origin.shape[1] != 2 or len(origin) < MIN_MARKERS:
+            raise ValueError(
+                f"required an origin of shape (N, 2) with N >= {MIN_MARKERS}, got {origin.shape}"
+            )
         if min(size) < 1:
             raise ValueError(f"required a size of at least 1 x 1 px, got {size}")
         self.origin: Points = np.array(origin, np.float64)
         self.pitch = max(pitch_of(self.origin), 1.0)
-        self._length = LENGTH * self.pitch
+        self._length = CORRELATION_LENGTH_PITCHES * self.pitch
         kernel = self._kernel(self.origin)
-        self.inverse: Floats = np.asarray(np.linalg.inv(kernel + NUGGET * np.eye(len(origin))), np.float64)
+        self.inverse: Floats = np.asarray(
+            np.linalg.inv(kernel + NUGGET_VARIANCE * np.eye(len(origin))), np.float64
+        )
         self.precision: Floats = np.diagonal(self.inverse).copy()
         """(N,), of each marker given all others, relative to the field's."""
         width, height = size
-        spacing = max(CELL * self.pitch, math.sqrt(width * height / MOST_CELLS))
+        spacing = max(CELL_PITCHES * self.pitch, math.sqrt(width * height / MAX_CELLS))
         columns, rows = math.ceil(width / spacing), math.ceil(height / spacing)
         first = (width - 1 - spacing * (columns - 1)) / 2, (height - 1 - spacing * (rows - 1)) / 2
-        self.margin = OVERSHOOT * self.pitch + spacing
+        self.margin = MAX_OVERSHOOT_PITCHES * self.pitch + spacing
         """How much farther a cell may have moved than any tracked marker, px."""
         self.fine = self._samples(Grid((rows, columns), first, spacing))
         self.coarse = self._samples(Grid(((rows + 1) // 2, (columns + 1) // 2), first, 2 * spacing))
@@ -214,11 +218,11 @@ class FieldModel:
         if markers.position.shape != self.origin.shape:
             raise ValueError(f"required {len(self.origin)} markers, got {len(markers.position)}")
         seen = markers.status == _TRACKED
-        return DisplacementField(self, markers, seen) if np.count_nonzero(seen) >= FEWEST else None
+        return DisplacementField(self, markers, seen) if np.count_nonzero(seen) >= MIN_MARKERS else None
 
 
 class DisplacementField:
-    """The displacement of the gel everywhere, in one frame. What is not asked for is not computed.
+    """The displacement of the gel everywhere, in one frame. Computed lazily.
 
     Coordinates are those of the gel at rest: `displacement[row, column]` is how far the bit of gel has moved
     that was at `grid.points[row, column]` in the reference frame.
@@ -238,7 +242,7 @@ class DisplacementField:
         self.noise = float(errors[len(errors) // 2]) if len(errors) else 0.0
         self._variance = np.square(np.where(known, markers.stderr, self.noise))
         self._moved = np.where(seen[:, None], markers.position - model.origin, 0.0)
-        doubtful = ~seen | (self._variance > (POOR * self.noise) ** 2)
+        doubtful = ~seen | (self._variance > (POOR_STDERR_RATIO * self.noise) ** 2)
         chosen = np.flatnonzero(doubtful)
         self._left_out: Floats = model.inverse[chosen]
         """(S, N): rows of the inverse of markers that are not seen, or seen poorly."""
@@ -253,7 +257,7 @@ class DisplacementField:
                 self._removed = self._without(chosen, scale)
             information = information - (self._left_out * self._removed).sum(axis=0)
         self._coefficients = self._weights(self._moved.T).T
-        self._precision = np.where(seen, 0.5 / np.maximum(information, _LEAST_PRECISION), 0.0)
+        self._precision = np.where(seen, 0.5 / np.maximum(information, _MIN_PRECISION), 0.0)
 
     def _without(self, chosen: Indices, scale: float) -> Floats:
         """(S, N): the inverse of this frame is that of the model less left_out.T @ these rows.
@@ -288,7 +292,7 @@ class DisplacementField:
     def _scale(self, kernel: Floats) -> Floats:
         """(...,): variance of the field, px^2, near places whose kernel to the markers is (..., N)."""
         variances = np.square(self._coefficients).sum(axis=1) * self._precision
-        return np.asarray(kernel @ variances / np.maximum(kernel @ self._seen, _NOWHERE))
+        return np.asarray(kernel @ variances / np.maximum(kernel @ self._seen, _MIN_KERNEL_SUM))
 
     def at(self, rest: Points) -> Floats:
         """(M, 2) float64, px: displacement of the gel that rests at points (M, 2), px; beyond the grid, that
@@ -322,7 +326,7 @@ class DisplacementField:
 
     def _motion(self, mask: Mask) -> GelMotion | None:
         box = cv2.boundingRect(mask)
-        large = box[2] * box[3] >= MANY * self.grid.spacing**2
+        large = box[2] * box[3] >= COARSE_GRID_CELLS * self.grid.spacing**2
         samples = self._model.coarse if large else self._model.fine
         rows, columns = self._near(box, samples.grid)
         moved = samples.to_markers[rows, columns] @ self._coefficients
@@ -347,7 +351,9 @@ class DisplacementField:
         unknown_share = max(float(unknown[0, 0] / prior[0, 0]), 0.0)
         unknown *= self._scale(to_region[0])
         # Where all cells are whole, the picture shows none of the region's outline.
-        outline = OUTLINE if total - float(np.vdot(share, share)) > WHOLE else 0.0
+        outline = (
+            OUTLINE_STDERR_RADII if total - float(np.vdot(share, share)) > PARTIAL_SHARE_TOLERANCE else 0.0
+        )
         return _fit(products, unknown, noise, unknown_share, outline, samples.grid.spacing)
 
     def _near(self, box: Sequence[int], grid: Grid) -> tuple[slice, slice]:

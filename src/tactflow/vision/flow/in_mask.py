@@ -13,10 +13,10 @@ from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.geometry.similarity import as_complex, fit_similarity
 from tactflow.vision.types import Flow, Markers, MarkerStatus
 
-UNKNOWN: Final = 0.1
+MAX_UNKNOWN_SHARE: Final = 0.1
 """Largest unknown share of the variance of a mean flow. Simulated contacts within the grid of markers have
 less than 0.04; for those beyond the last markers, which have more, the mean is wrong by pixels."""
-_FLAT: Final = 1e-3
+_MIN_SPREAD_RATIO: Final = 1e-3
 """Spread of markers across a line over that along it, 1, up to which they do not span a plane. Chosen by
 hand."""
 _TRACKED: Final = int(MarkerStatus.TRACKED)
@@ -66,7 +66,7 @@ def flow_in_mask(markers: Markers, mask: Mask) -> Flow:
     parameters = 1
     # Product over squared sum of the principal scatters; about their ratio where one is small.
     squares = abs(complex((fit.away * fit.away).mean()))
-    if len(chosen) >= 3 and (fit.spread**2 - squares**2) / 4 > (_FLAT * fit.spread) ** 2:
+    if len(chosen) >= 3 and (fit.spread**2 - squares**2) / 4 > (_MIN_SPREAD_RATIO * fit.spread) ** 2:
         parameters = 2
         rest = rest - fit.slope * fit.away
         rotation = _rotation(fit.slope.real, fit.slope.imag)
@@ -117,7 +117,7 @@ def flow_of_field(field: DisplacementField, markers: Markers, mask: Mask, *, coa
     """
     count = int(np.count_nonzero(_inside(markers, mask)))
     motion = field.motion(mask) if count else None
-    if motion is None or motion.unknown > UNKNOWN:
+    if motion is None or motion.unknown > MAX_UNKNOWN_SHARE:
         return Flow(None, count)
     outline = (motion.spread, motion.spread) if coarse else motion.outline_stderr
     stderr = math.hypot(motion.stderr, outline[0]), math.hypot(motion.stderr, outline[1])

@@ -9,29 +9,29 @@ import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Indices, Points
 from tactflow.vision.compiled import helper, kernel
-from tactflow.vision.markers.lattice import LONGEST_LINK, neighbour_graph, pitch_of
+from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, neighbour_graph, pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
-TOGETHER: Final = 3
+MIN_MOVING_NEIGHBOURS: Final = 3
 """Neighbouring markers that must have moved: a single one may have been confused with another."""
-TRIPLES: Final = 15
+MAX_NEIGHBOUR_PAIRS: Final = 15
 """Largest number of pairs among the neighbours of a marker, of which there are up to six."""
-STAY: Final = 0.6
+LOW_THRESHOLD_FRACTION: Final = 0.6
 """Low hysteresis threshold, as a fraction of the threshold for motion. Chosen by hand."""
-ALONE: Final = 3.0
+UNLIT_THRESHOLD_RATIO: Final = 3.0
 """Threshold for a contact that the light does not show, over that for motion: its region is coarse, and where
 the light responds at all it shows most contacts earlier. Chosen on the simulator's press, whose first frames
 had a region of ten times the area, and on sts_640 and tactip_video, of which no contact is lost."""
-LASTING: Final = 4
+MAX_AVERAGED_FRAMES: Final = 4
 """Largest number of consecutive frames of motion that are averaged: the error of a mean of n is smaller by
 the root of n, so that less motion is enough. Chosen on every second recording of franka_mini."""
-FADES: Final = 0.7
+FADING_RATIO: Final = 0.7
 """Motion relative to the frame before below which a contact is ending and is not averaged. Chosen by hand."""
-STILL: Final = 0.5
+REST_FRACTION: Final = 0.5
 """Fraction of the threshold up to which a marker is at rest. Chosen by hand."""
-FORGET: Final = 0.96
+DECAY_PER_FRAME: Final = 0.96
 """Decay of the strongest recent motion per frame: half in 17 frames, as for the light."""
-STRETCHED: Final = 0.7
+CONTACT_STRAIN_FRACTION: Final = 0.7
 """Fraction of the largest strain above which a marker is in contact: a contact drags all gel around it along,
 but strains it most at its border. Chosen on the simulator, mini_ball and gelslim_ball, where the region then
 overlaps the true one by 0.3 to 0.7 (IoU, medians), and less where a contact slides."""
@@ -59,7 +59,7 @@ class Motion(NamedTuple):
 
         A marker with an unknown standard error, such as one that is not tracked, is not at rest.
         """
-        return np.asarray(self.left <= STILL * self.bound)
+        return np.asarray(self.left <= REST_FRACTION * self.bound)
 
 
 class MotionTest:
@@ -124,9 +124,9 @@ class MotionTest:
         self._relaxation = relaxation
         self.pitch = pitch_of(self._origin) if count > 1 else 0.0
         """Median distance of a marker to its nearest neighbour, px; 0 for fewer than two."""
-        self._links = neighbour_graph(self._origin, LONGEST_LINK * self.pitch)
+        self._links = neighbour_graph(self._origin, MAX_LINK_PITCHES * self.pitch)
         # A motion in a plane exceeds k standard deviations with exp(-k^2 / 2); three must at once.
-        alone = (false_alarms / (TRIPLES * max(1, count))) ** (1 / TOGETHER)
+        alone = (false_alarms / (MAX_NEIGHBOUR_PAIRS * max(1, count))) ** (1 / MIN_MOVING_NEIGHBOURS)
         self._limit = math.sqrt(-2 * math.log(alone))
         self._strongest = 0.0
         self._moving = self._clearly = False
@@ -150,13 +150,17 @@ class MotionTest:
             left,
             bound,
         )
-        self._lasted = min(self._lasted + 1, LASTING) if self._moving else 1
-        alone = ALONE if largest < FADES * self._largest else ALONE / math.sqrt(self._lasted)
+        self._lasted = min(self._lasted + 1, MAX_AVERAGED_FRAMES) if self._moving else 1
+        alone = (
+            UNLIT_THRESHOLD_RATIO
+            if largest < FADING_RATIO * self._largest
+            else UNLIT_THRESHOLD_RATIO / math.sqrt(self._lasted)
+        )
         self._largest = largest
         # Motion beyond the far threshold is beyond the near one as well.
-        self._clearly = chain > alone * (STAY if self._clearly else 1.0)
-        self._moving = self._clearly or chain > (STAY if self._moving else 1.0)
-        self._strongest = max(self._strongest * FORGET, largest if self._moving else 0.0)
+        self._clearly = chain > alone * (LOW_THRESHOLD_FRACTION if self._clearly else 1.0)
+        self._moving = self._clearly or chain > (LOW_THRESHOLD_FRACTION if self._moving else 1.0)
+        self._strongest = max(self._strongest * DECAY_PER_FRAME, largest if self._moving else 0.0)
         return Motion(self._moving, self._clearly, largest, left, bound)
 
     def stretched(self, markers: Markers) -> Points:
@@ -170,7 +174,7 @@ class MotionTest:
         moved = markers.position - self._origin
         length = np.hypot(*(self._origin[first] - self._origin[second]).T)
         strain = np.hypot(*(moved[first] - moved[second]).T) * seen / length
-        most = self._links[seen & (strain >= STRETCHED * strain.max(initial=0.0))]
+        most = self._links[seen & (strain >= CONTACT_STRAIN_FRACTION * strain.max(initial=0.0))]
         return np.asarray(markers.position[np.unique(most)], np.float64)
 
 
@@ -213,7 +217,7 @@ def rate_motion(
     # The two largest ratios among the neighbours of each marker.
     ratio, largest, second_largest = np.zeros((3, left.size))
     for i in range(left.size):
-        if tracked[i] and count >= TOGETHER:
+        if tracked[i] and count >= MIN_MOVING_NEIGHBOURS:
             x = position[i, 0] - rest[0, i] - shift_x + middle * rest[3, i]
             y = position[i, 1] - rest[1, i] - shift_y - middle * rest[2, i]
             left[i] = math.sqrt(x * x + y * y)

@@ -29,32 +29,32 @@ from tactflow.vision.arrays import MAD_TO_SIGMA, ColorImage, Floats, Floats32, I
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import cell_means
 
-CELL: Final = 4
+CELL_PX: Final = 4
 """Side of the cells over which the light is averaged, processed px."""
-MARGIN: Final = 2
+MARGIN_CELLS: Final = 2
 """Cells around a contact that belong to its picture, so that the outline stands out from the gel at rest."""
-MOST: Final = 500
+MAX_CELLS: Final = 500
 """Largest number of cells of a template: neighbours share their errors, so that more only cost time."""
-FEWEST: Final = 30
+MIN_CELLS: Final = 30
 """Smallest number of cells of a template."""
-PATCHES: Final = 25
+PATCH_COUNT: Final = 25
 """Approximate number of patches of a template, whose errors are independent; those of cells are not."""
-ROUNDING: Final = 1 / 6
+ROUNDING_VARIANCE: Final = 1 / 6
 """Variance of the difference of two rounded grey levels."""
-SOBEL: Final = 3 / 16
+GRADIENT_VARIANCE_RATIO: Final = 3 / 16
 """Variance of a gradient over that of the light."""
-LAMPS: Final = 0.05
+LIGHT_STDDEV: Final = 0.05
 """Relative standard deviation of the effect of place and turn on the light of a contact: by how much it is
 brighter at the RMS radius, and how much of one channel shows in another."""
-LEAST: Final = 1e-6
+MIN_INFORMATION: Final = 1e-6
 """Smallest information on a motion, so that it has an inverse."""
-STEPS: Final = 12
+MAX_STEPS: Final = 12
 """Largest number of steps of Gauss-Newton."""
-CONVERGED: Final = 0.05
+MIN_STEP_CELLS: Final = 0.05
 """Step at which the iteration ends, cells: the next one would be several times smaller."""
-SEEN: Final = 0.4
+MIN_VISIBLE_SHARE: Final = 0.4
 """Smallest share of a template's cells that the picture must show."""
-UNLIKE: Final = 0.6
+MAX_RESIDUAL: Final = 0.6
 """Residual, relative to the contrast of the picture, above which it shows something else."""
 
 
@@ -71,7 +71,7 @@ def light_change(unmarked: ColorImage, untouched: ColorImage, markers: Mask | No
 
 def cells(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(h, w, ...): means over cells of a picture (H, W, ...)."""
-    return cell_means(picture, CELL)
+    return cell_means(picture, CELL_PX)
 
 
 class Template(NamedTuple):
@@ -100,7 +100,7 @@ class Template(NamedTuple):
     @property
     def place(self) -> complex:
         """Its centre, x + iy, px."""
-        return complex(*(self.center * CELL + (CELL - 1) / 2).tolist())
+        return complex(*(self.center * CELL_PX + (CELL_PX - 1) / 2).tolist())
 
 
 class Registration(NamedTuple):
@@ -124,14 +124,14 @@ def template_of(change: Floats32, mask: Mask) -> Template | None:
 
     change : of `light_change`. mask : (H, W), 255 in contact.
     """
-    inside = cv2.dilate(cells(mask), np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8))
+    inside = cv2.dilate(cells(mask), np.ones((2 * MARGIN_CELLS + 1, 2 * MARGIN_CELLS + 1), np.uint8))
     inside[change[..., 3] == 0] = 0
     inside[[0, -1]] = inside[:, [0, -1]] = 0
     rows, columns = np.nonzero(inside > 127)
-    if len(rows) < FEWEST:
+    if len(rows) < MIN_CELLS:
         return None
-    side = max(round(math.sqrt(len(rows) / PATCHES)), 1)
-    every = -(-len(rows) // MOST)
+    side = max(round(math.sqrt(len(rows) / PATCH_COUNT)), 1)
+    every = -(-len(rows) // MAX_CELLS)
     rows, columns = rows[::every], columns[::every]
     patches = np.unique(rows // side * len(change[0]) + columns // side, return_inverse=True)[1]
     order = np.argsort(patches)
@@ -152,7 +152,7 @@ def template_of(change: Floats32, mask: Mask) -> Template | None:
     # Of each channel, a slope over x and over y, and a part of every channel.
     slopes = [by[:, channel].T @ (place * values)[:, [channel]] for place in (x, y) for channel in range(3)]
     mixtures = [by[:, channel].T @ values for channel in range(3)]
-    lamps = LAMPS * np.hstack([*slopes, *mixtures]).astype(np.float64)
+    lamps = LIGHT_STDDEV * np.hstack([*slopes, *mixtures]).astype(np.float64)
     return Template(
         center,
         radius,
@@ -174,7 +174,7 @@ def _noise(light: Floats32) -> float:
     line = np.array([1.0, -2.0, 1.0])
     # Neighbours are alike: every other one is enough.
     differences = np.abs(cv2.sepFilter2D(light, cv2.CV_32F, line, line)[1:-1:2, 1:-1:2])
-    return max(2 * (MAD_TO_SIGMA * float(np.median(differences))) ** 2 / 36, ROUNDING)
+    return max(2 * (MAD_TO_SIGMA * float(np.median(differences))) ** 2 / 36, ROUNDING_VARIANCE)
 
 
 def register(
@@ -188,7 +188,7 @@ def register(
     motion, prior = start, np.diag(spread**-2.0)
     error, sums, turned = np.empty_like(template.light), np.empty(10), np.eye(5)
     independent = 3 * (int(template.patches[-1]) + 1)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         turn, growth = (motion[2:4] / template.radius).tolist()
         cos, sin = math.cos(turn), math.sin(turn)
         warp = np.array([*(math.exp(growth) * np.array([cos, sin])), *(template.center + motion[:2])])
@@ -203,7 +203,7 @@ def register(
             error,
             sums,
         )
-        if count < max(SEEN * len(error), FEWEST):
+        if count < max(MIN_VISIBLE_SHARE * len(error), MIN_CELLS):
             return None
         power, alike = (sums[5:7] / (3 * count)).tolist()
         variance = max(power, alike * independent / max(independent - 5, 1), template.noise)
@@ -213,17 +213,17 @@ def register(
         gradient = sums[:5] / variance + turned.T @ prior @ (motion - expected)
         step = -turned @ np.linalg.solve(information + prior, gradient)
         motion = motion + step
-        if np.abs(step[:4]).max() < CONVERGED:
+        if np.abs(step[:4]).max() < MIN_STEP_CELLS:
             break
     # A flicker of the lamps changes all cells alike: it does not count.
     unlike = math.sqrt(max(power - float(np.square(sums[7:] / count).mean()), 0.0))
     residual = unlike / max(template.contrast * (1 + float(motion[4])), 1e-3)
-    if residual > UNLIKE:
+    if residual > MAX_RESIDUAL:
         return None
     # Gradients of noise carry no information, and those of what differs are wrong.
-    gradients = 3 * count * SOBEL / variance * np.diag([1.0, 1.0, 1.0, 1.0, 0.0])
+    gradients = 3 * count * GRADIENT_VARIANCE_RATIO / variance * np.diag([1.0, 1.0, 1.0, 1.0, 0.0])
     values, axes = np.linalg.eigh(information - template.noise * gradients)
-    known = (axes * np.maximum(values, LEAST)) @ axes.T
+    known = (axes * np.maximum(values, MIN_INFORMATION)) @ axes.T
     known = known @ np.linalg.solve(known + power * gradients + template.lamps / variance**2, known)
     covariance = np.linalg.inv(known + prior)
     covariance, known = (turned @ part @ turned.T for part in (covariance, known))

@@ -12,46 +12,51 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Mask
-from tactflow.vision.flow.displacement_field import CELL, OUTLINE, DisplacementField, Grid
-from tactflow.vision.flow.in_mask import UNKNOWN
-from tactflow.vision.flow.registration import CELL as PX
-from tactflow.vision.flow.registration import UNLIKE, Registration, Template, register, template_of
+from tactflow.vision.flow.displacement_field import (
+    CELL_PITCHES,
+    OUTLINE_STDERR_RADII,
+    DisplacementField,
+    Grid,
+)
+from tactflow.vision.flow.in_mask import MAX_UNKNOWN_SHARE
+from tactflow.vision.flow.registration import CELL_PX as PX
+from tactflow.vision.flow.registration import MAX_RESIDUAL, Registration, Template, register, template_of
 from tactflow.vision.geometry.similarity import Complexes, as_complex, fit_similarity
 from tactflow.vision.types import Slip
 
-WINDOW: Final = 0.1
+SPEED_WINDOW_S: Final = 0.1
 """Time over which the speed is measured, s, at least one frame: the largest acceptable delay."""
-SLID: Final = 0.04
+SLIP_THRESHOLD_RADII: Final = 0.04
 """Threshold for the motion against the gel within the window, and for the drag of the gel in its direction by
 friction, relative to the RMS radius of the contact: gel under a contact that sticks strains by as much."""
-SPREAD: Final = np.array([5.0, 5.0, 5.0, 1.0, 0.3])
+MOTION_PRIOR_STDDEV: Final = np.array([5.0, 5.0, 5.0, 1.0, 0.3])
 """Prior standard deviation of the motion of an object against the gel since a keyframe: shift, turn and
 growth, cells, see `Registration`; relative change of contrast."""
-OVERLAP: Final = 0.7
+MIN_OVERLAP: Final = 0.7
 """A keyframe of which a smaller share is visible is replaced."""
-AGED: Final = 0.35
+MAX_KEYFRAME_RESIDUAL: Final = 0.35
 """A keyframe with a larger residual is replaced: the object shows another side."""
-PRESSED: Final = 0.3
+MAX_GROWTH: Final = 0.3
 """Relative growth of a contact above which its keyframe is replaced: a larger picture shows a turn better."""
-ROUNDS: Final = 3
+INVERSION_STEPS: Final = 3
 """Iterations of the search for the gel under a point: the field is smooth, so that each gains a digit."""
-LEAST_MOVED: Final = 1e-6
+MIN_MOTION_PX: Final = 1e-6
 """Smallest motion that is divided by, px."""
-EXCHANGED: Final = 0.15
+MAX_EXCHANGED_SHARE: Final = 0.15
 """The stick ratio is measured anew once a larger share of the gel in contact has come or left: an object that
 is pressed harder, or released, moves the gel without slipping."""
-CORE: Final = 0.5
+CORE_SHARE: Final = 0.5
 """Part of the contact, around its middle, whose motion counts as that of the gel: slip begins at the edge.
 Chosen by hand."""
-LAG: Final = 0.06
+MIN_LAG_RATIO: Final = 0.06
 """How far gel that sticks may stay behind the rigid motion, relative to its RMS. Chosen on the simulator."""
-UNSURE: Final = 6.0
+MIN_LAG_STDERRS: Final = 6.0
 """Smallest such distance, in standard errors of the markers."""
-ASIDE: Final = 2.0
+MIN_LAG_TO_SIDEWAYS_RATIO: Final = 2.0
 """The same, relative to the RMS of how far the gel departs sideways: a press that spreads the gel does both
 alike, slip only the first. Chosen on the simulator."""
 _normal: Final = NormalDist().cdf
-_ROUNDS: Final = 2
+_STICK_FITS: Final = 2
 """Fits of a rigid motion, each to the gel that sticks by the one before. Chosen by hand."""
 
 
@@ -145,7 +150,7 @@ class SlipTracker:
         255 in contact.
         """
         gel = field.motion(mask)
-        if gel is None or gel.unknown > UNKNOWN:
+        if gel is None or gel.unknown > MAX_UNKNOWN_SHARE:
             self.reset()
             return None
         if self._key is not None and self._key.grid != field.grid:
@@ -164,15 +169,15 @@ class SlipTracker:
             found = Registration(at_rest, np.zeros((5, 5)), 0 * template.light, 0.0, 1.0)
         now = _slid(key, found, field, time)
         self._recent.append(now)
-        while len(self._recent) > 2 and time - self._recent[1].time > WINDOW - 1e-6:
+        while len(self._recent) > 2 and time - self._recent[1].time > SPEED_WINDOW_S - 1e-6:
             self._recent.popleft()
         slip = self._slip(gel.stderr, math.hypot(*gel.outline_stderr), torn)
         if slip.slipping:
             self._grip = None
         else:
             slip = replace(slip, stick_ratio=self._sticking(field, share))
-        pressed = abs(now.grown - key.grown) > PRESSED
-        aged = found.seen < OVERLAP or found.residual > AGED or pressed
+        pressed = abs(now.grown - key.grown) > MAX_GROWTH
+        aged = found.seen < MIN_OVERLAP or found.residual > MAX_KEYFRAME_RESIDUAL or pressed
         if aged and (template := template_of(change, mask)) is not None:
             covariance = now.covariance + _of_growth(key, now.grown - key.grown)
             key = _keyframe(template, field, share, now.slid, covariance, now.grown)
@@ -187,26 +192,26 @@ class SlipTracker:
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
         best: Registration | None = None
         for start in (self._last, expected):
-            found = register(key.template, change, start, expected, SPREAD)
+            found = register(key.template, change, start, expected, MOTION_PRIOR_STDDEV)
             if found is not None and (best is None or found.residual < best.residual):
                 best = found
-            if best is not None and best.residual < AGED:
+            if best is not None and best.residual < MAX_KEYFRAME_RESIDUAL:
                 break
         if best is not None:
             self._last = best.motion
         return best
 
     def _torn(self, key: _Key | None, template: Template, time: float) -> bool:
-        """Whether the picture, after at least `WINDOW`, changed abruptly although the object presses on."""
-        if key is None or time - self._began < WINDOW:
+        """Whether the picture changed abruptly, after `SPEED_WINDOW_S`, while the object presses on."""
+        if key is None or time - self._began < SPEED_WINDOW_S:
             return False
-        return template.contrast > UNLIKE * key.template.contrast
+        return template.contrast > MAX_RESIDUAL * key.template.contrast
 
     def _sticking(self, field: DisplacementField, share: Floats) -> float:
         """The stick ratio of the gel that was touched first, or that the contact has moved on to."""
         before, displacement = self._grip or (0 * share, field.displacement)
         came, left = (float(np.maximum(part, 0).sum()) for part in (share - before, before - share))
-        if max(came, left) > EXCHANGED * float(share.sum()):
+        if max(came, left) > MAX_EXCHANGED_SHARE * float(share.sum()):
             self._grip = share, field.displacement
             return 1.0
         return stick_ratio(before, share, field.grid.points, field.displacement - displacement, field.noise)
@@ -220,9 +225,9 @@ class SlipTracker:
         covariance = now.covariance + _of_growth(key, now.grown - key.grown) + np.diag(gel_variance)
         slid, stderr = now.slid.tolist(), np.sqrt(np.diag(covariance)).tolist()
         probability, speed, speed_stderr = 0.0, None, None
-        drag_stderr = math.hypot(gel_stderr, outline_stderr) + LEAST_MOVED
+        drag_stderr = math.hypot(gel_stderr, outline_stderr) + MIN_MOTION_PX
         if torn:
-            probability = _normal((math.hypot(*now.gel[:2]) - SLID * radius) / drag_stderr)
+            probability = _normal((math.hypot(*now.gel[:2]) - SLIP_THRESHOLD_RADII * radius) / drag_stderr)
         if now.time > then.time:
             # At the RMS radius, where a turn moves the object as much as a shift.
             lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
@@ -232,15 +237,15 @@ class SlipTracker:
             covariance += _of_growth(key, now.grown - then.grown) + np.diag(gel_variance)
             covariance *= np.outer(lever, lever)
             # Uncertain components count less: a smooth ball does not show how it turns.
-            shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLID * radius) ** 2)
+            shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLIP_THRESHOLD_RADII * radius) ** 2)
             moved = shrink @ ((now.slid - then.slid) * lever)
             length = float(np.linalg.norm(moved))
-            way = moved / max(length, LEAST_MOVED)
-            error = math.sqrt(float(way @ shrink @ covariance @ way)) + LEAST_MOVED
+            way = moved / max(length, MIN_MOTION_PX)
+            error = math.sqrt(float(way @ shrink @ covariance @ way)) + MIN_MOTION_PX
             # Gel outside the contact that counts as inside stays behind gel that sticks.
-            strained = OUTLINE * float(np.linalg.norm((now.gel - then.gel) * lever))
-            slides = _normal((length - strained - SLID * radius) / error)
-            dragged = float(way @ (now.gel * lever)) - SLID * radius
+            strained = OUTLINE_STDERR_RADII * float(np.linalg.norm((now.gel - then.gel) * lever))
+            slides = _normal((length - strained - SLIP_THRESHOLD_RADII * radius) / error)
+            dragged = float(way @ (now.gel * lever)) - SLIP_THRESHOLD_RADII * radius
             probability = slides * _normal(dragged / drag_stderr)
             speed, speed_stderr = length / time, error / time
         return Slip(
@@ -281,13 +286,13 @@ def _slid(key: _Key, found: Registration, field: DisplacementField, time: float)
     x, y, turn = found.motion[:3].tolist()
     now = (key.rest + key.before - place) * cmath.exp(1j * turn / radius) + complex(x, y) * PX
     under = key.rest - place
-    for _ in range(ROUNDS):
+    for _ in range(INVERSION_STEPS):
         moved = as_complex(field.at((under + place).view(np.float64).reshape(-1, 2)))
         under = now - moved
     slid, left = _rigid(key.rest - place, under + place - key.rest, key.share)
     to_px = np.array([PX, PX, 1 / radius])
     # Displacements of the gel a pitch apart are independent.
-    variance = left / max(key.number * CELL**2, 1.0)
+    variance = left / max(key.number * CELL_PITCHES**2, 1.0)
     covariance = key.covariance + found.covariance[:3, :3] * np.outer(to_px, to_px)
     covariance += variance * np.diag([1.0, 1.0, 2 / (radius * PX) ** 2])
     gel = _rigid(now - key.share @ now, moved, key.share)[0]
@@ -317,7 +322,7 @@ def _core(places: Floats, share: Floats) -> Flags:
     distance = np.hypot(*(places - share @ places / share.sum()).T)
     order = np.argsort(distance)
     filled = np.cumsum(share[order])
-    return np.asarray(distance <= distance[order[np.searchsorted(filled, CORE * filled[-1])]])
+    return np.asarray(distance <= distance[order[np.searchsorted(filled, CORE_SHARE * filled[-1])]])
 
 
 def _correlation(first: Floats32, second: Floats32) -> float:
@@ -344,7 +349,7 @@ def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, nois
         return 0.0
     share, places, way = cells[inside] / cells.sum(), as_complex(points[inside]), as_complex(moved[inside])
     sticks = _core(points[inside], share)
-    for _ in range(_ROUNDS):
+    for _ in range(_STICK_FITS):
         weight = share * sticks
         if not sticks.any():
             return 0.0
@@ -354,5 +359,7 @@ def stick_ratio(before: Floats, now: Floats, points: Floats, moved: Floats, nois
         # Along the motion, and aside of it.
         behind = (fit.mean + fit.slope * fit.away - way) * rigid.conj() / np.maximum(length, 1e-9)
         motion, spread = (math.sqrt(share @ (part * part)) for part in (length, behind.imag))
-        sticks = np.abs(behind.real) <= max(UNSURE * noise, LAG * motion, ASIDE * spread)
+        sticks = np.abs(behind.real) <= max(
+            MIN_LAG_STDERRS * noise, MIN_LAG_RATIO * motion, MIN_LAG_TO_SIDEWAYS_RATIO * spread
+        )
     return float(share[sticks].sum() / share.sum())

@@ -13,43 +13,43 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
-from tactflow.vision.markers.lattice import LONGEST_LINK, Lattice, nearest, neighbour_graph, pitch_of
+from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, Lattice, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.selection import Candidate, Sign, candidates, evidence, marks_of, probability
-from tactflow.vision.markers.spots import ONE_SIZE, Spots, find_spots, sigmas
+from tactflow.vision.markers.spots import SAME_SIZE_RATIO, Spots, find_spots, sigmas
 
 Polarity = Literal["auto", "dark", "bright"]
 
-LEAST_SCORE: Final = 2.5
+MIN_SCORE: Final = 2.5
 """Minimum score of a candidate to be accepted as marks (see `selection.candidates`). Real gels with marks
 score 4 and more; dust, reflections and noise on gels without marks at most 0.4, compression artefacts along
 edges up to 3, in 36 of 38 such pictures of wedge_grasp up to 2.4 (measured). Marks 3.5 px apart score as
 little."""
 
-MOST_BETWEEN: Final = 0.01
+MAX_LEVEL_BETWEEN: Final = 0.01
 """Maximum level half-way between two neighbouring marks, on a scale from the gel's level (0) to that of the
 marks (1), in the better of two directions: dashes may touch in the other one. The gel is sampled on the
 diagonal, 0.7 of the way to the middle of a cell, where another lattice may have its marks. Two crossing
 waves, as in a weave, have 0.37 if they are alike, 0.16 if one is twice as strong. Marks of 18 sensors, and of
 164 simulated ones, have at most 0.00 (measured)."""
 
-CLOSE: Final = 0.8
+MAX_POLARITY_SCORE_RATIO: Final = 0.8
 """Ratio of the scores of the best candidates of the two polarities above which there are no marks: a texture
 looks the same with dark and bright swapped, marks on a gel do not. Marks of 18 sensors have at most 0.67,
 dashes that touch 0.78; three of twelve simulated cloths that no other test rejects have 0.86 and more
 (measured), as have marks that cover 0.4 of the gel."""
 
-CROWDED: Final = 0.32
+MAX_RADIUS_PER_SPACING: Final = 0.32
 """Maximum radius of a mark over the distance of its nearest neighbour, so that its surroundings hold no other
 mark. With 0.37, 0.2 % of the marks of seven recordings are lost (measured)."""
 
-CENTROID_WINDOW: Final = 1.6
+CENTROID_WINDOW_RADII: Final = 1.6
 """Radius of the window of a centroid, in radii of the mark. Chosen by hand: it includes the mark's border."""
 
-SURROUNDINGS: Final = (1.4, 1.9)
+BACKGROUND_RING_RADII: Final = (1.4, 1.9)
 """Inner and outer radius of the ring for the background of a mark, in radii of the mark; the outer one is 1.5
 px wider. Chosen by hand."""
 
-LONE_PITCH: Final = 8.0
+LONE_PITCH_RADII: Final = 8.0
 """Pitch assumed for a single mark, in radii. Chosen by hand."""
 
 _NO_MARKERS: Final = (
@@ -199,7 +199,11 @@ def _in_lattice(
         raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, best)
     detection = _detection(gray, best, marks, found[1:])
     rival = detection.rival
-    if rival is not None and rival.polarity != best.polarity and rival.score > CLOSE * best.score:
+    if (
+        rival is not None
+        and rival.polarity != best.polarity
+        and rival.score > MAX_POLARITY_SCORE_RATIO * best.score
+    ):
         raise NoMarkersError(
             f"{_NO_MARKERS} ({best} are as regular as {rival}, as in a texture; if either are "
             "marks, give their polarity)",
@@ -215,7 +219,7 @@ def _levels(gray: NDArray[np.float32], points: Floats) -> NDArray[np.float32]:
 
 def _require_lattice(found: list[Candidate]) -> None:
     """Raise NoMarkersError if the best candidate has too few or too faint spots, or forms no lattice."""
-    if found[0].score >= LEAST_SCORE:
+    if found[0].score >= MIN_SCORE:
         return
     best = max(found, key=lambda other: float(other.spots.strength.sum()))
     raise NoMarkersError(
@@ -238,7 +242,7 @@ def _require_gel_between(gray: NDArray[np.float32], best: Candidate, lattice: La
         _levels(smooth if best.polarity == "dark" else -smooth, places)
         for places in (mark, 0.3 * mark + 0.35 * (first + last), (mark + first) / 2, (mark + last) / 2)
     )
-    if np.median(gel - np.maximum(one, other)) > MOST_BETWEEN * np.median(gel - marks):
+    if np.median(gel - np.maximum(one, other)) > MAX_LEVEL_BETWEEN * np.median(gel - marks):
         raise NoMarkersError(
             f"{_NO_MARKERS} ({len(points)} {best.polarity} spots of radius {radius:.1f} px run into each "
             "other, like the threads of a cloth; if they are marks, give their radius in pixels)",
@@ -252,14 +256,14 @@ def _detection(
     """The marks in reading order, with the best rival candidate."""
     radius = best.radius
     ratio = np.maximum(marks.radius / radius, radius / marks.radius)
-    radii = np.where(ratio < ONE_SIZE, radius, marks.radius)
+    radii = np.where(ratio < SAME_SIZE_RATIO, radius, marks.radius)
     if len(radii) > 1:
-        radii = np.minimum(radii, CROWDED * nearest(marks.points, 1)[0][:, 0])
+        radii = np.minimum(radii, MAX_RADIUS_PER_SPACING * nearest(marks.points, 1)[0][:, 0])
     centers = _centroids(gray if best.polarity == "dark" else 255 - gray, marks.points, radii)
     order = _reading_order(centers, radius)
     centers, radii, marks = centers[order], radii[order], marks.at(order)
-    pitch = pitch_of(centers) if len(centers) > 1 else LONE_PITCH * radius
-    edges = neighbour_graph(centers, LONGEST_LINK * pitch)
+    pitch = pitch_of(centers) if len(centers) > 1 else LONE_PITCH_RADII * radius
+    edges = neighbour_graph(centers, MAX_LINK_PITCHES * pitch)
     rival = next((other for other in others if not _same(other, centers, radii)), None)
     sizes = radii if (radii != radius).any() else None
     return Detection(centers, radius, best.polarity, pitch, edges, sizes, best, rival, evidence(gray, marks))
@@ -275,7 +279,7 @@ def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Flo
     px.
     """
     radius = radii[:, None]
-    inner, outer = SURROUNDINGS[0] * radius, SURROUNDINGS[1] * radius + 1.5
+    inner, outer = BACKGROUND_RING_RADII[0] * radius, BACKGROUND_RING_RADII[1] * radius + 1.5
     reach = int(np.ceil(outer.max(initial=0)))
     axis = np.arange(-reach, reach + 1)
     grid_x, grid_y = (part.ravel() for part in np.meshgrid(axis, axis))
@@ -296,7 +300,7 @@ def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Flo
         normal = weighted @ basis.transpose(0, 2, 1)
         plane = np.linalg.solve(normal, weighted @ patches[:, :, None])
         darkness = np.maximum((basis.transpose(0, 2, 1) @ plane)[:, :, 0] - patches, 0)
-        darkness *= np.clip(CENTROID_WINDOW * radius + 0.5 - distance, 0, 1)
+        darkness *= np.clip(CENTROID_WINDOW_RADII * radius + 0.5 - distance, 0, 1)
         total = darkness.sum(axis=1)
         good = total > 1e-3
         move = np.zeros_like(result)

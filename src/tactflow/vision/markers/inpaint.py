@@ -19,10 +19,10 @@ Sums = NDArray[np.uint16]
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 _METHODS: Final = get_args(InpaintMethod)
 
-RADIUS: Final = 7.0
+RADIUS_PX: Final = 7.0
 """Default neighbourhood from which a marker is filled, px: that of the original script."""
 
-CELL: Final = 4
+CELL_PX: Final = 4
 """Side of the cells over which means are formed, px; hard-coded in the kernels."""
 
 FAR_WEIGHT: Final = 0.01
@@ -32,10 +32,10 @@ Chosen by hand."""
 FRAME_WEIGHT: Final = np.float32(1e-6)
 """Weight of the mean of the whole frame, which decides where a window has no valid pixel. Chosen by hand."""
 
-LEAST_WEIGHT: Final = 1e-3
+MIN_WEIGHT: Final = 1e-3
 """Weight, of at most 255, below which a window has no valid pixel: one px in 10 000 gives more (derived)."""
 
-MOST_REACH: Final = 31
+MAX_REACH_CELLS: Final = 31
 """Maximum half-width of the wide window, cells, so that sums of its columns fit in 16 bits. Derived: 63 cells
 of at most 4 * 255 are below 2**16."""
 
@@ -49,7 +49,7 @@ def remove_markers(
     mask: Bytes,
     *,
     method: InpaintMethod = "normalized",
-    radius: float = RADIUS,
+    radius: float = RADIUS_PX,
 ) -> Bytes:
     """Replace masked pixels by what surrounds them.
 
@@ -118,7 +118,7 @@ def _normalized(image: Bytes, mask: Bytes, radius: float) -> Bytes:
     Computed in float32, within 1 grey level of the result in float64.
     """
     height, width = mask.shape
-    bottom, right = -height % CELL, -width % CELL
+    bottom, right = -height % CELL_PX, -width % CELL_PX
     hidden = np.ascontiguousarray(mask)
     if not (bottom or right):
         return _fill_cells(image.copy(), hidden, radius)
@@ -133,15 +133,15 @@ def _fill_cells(whole: Bytes, mask: Bytes, radius: float) -> Bytes:
 
     The kernels use sums instead of means, so weights are up to 64 * 255.
     """
-    reach = min(math.ceil(radius / CELL + 1), MOST_REACH)
-    height, width = mask.shape[0] // CELL, mask.shape[1] // CELL
+    reach = min(math.ceil(radius / CELL_PX + 1), MAX_REACH_CELLS)
+    height, width = mask.shape[0] // CELL_PX, mask.shape[1] // CELL_PX
     rows, columns = _reflected(height, reach + 1), _reflected(width, reach) + reach
     long = 4 * (-(-(width + 2 * reach) // LANES) * LANES)
     cells, masked = np.zeros((height, long), np.uint16), np.empty(height, np.bool_)
     sum_valid(mask, halved(whole).reshape(2 * height, -1), columns, cells, masked)
     far = FAR_WEIGHT * 16 / (2 * reach + 1) ** 2
     windows = np.zeros((height, long), np.float32)
-    if sum_windows(cells, masked, rows, reach, width, far, 64 * LEAST_WEIGHT, windows):
+    if sum_windows(cells, masked, rows, reach, width, far, 64 * MIN_WEIGHT, windows):
         inner = cells.reshape(height, 4, -1)[:, :, reach : reach + width]
         everywhere = inner.mean(axis=(0, 2), dtype=np.float64).astype(np.float32)
         if everywhere[3] == 0:

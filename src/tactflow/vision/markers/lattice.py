@@ -13,30 +13,30 @@ from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Floats, Indices
 
-BLOCKING: Final = 1.1
+BLOCKING_RATIO: Final = 1.1
 """Sum of the squared distances of a third mark to two others, over the squared distance of these, below which
 it blocks their link. At a right angle it is 1; a tenth more keeps a skewed square free of diagonals. Chosen
 by hand."""
 
-LONGEST_LINK: Final = 2.3
+MAX_LINK_PITCHES: Final = 2.3
 """Maximum distance of neighbours, pitches: that of the two marks on either side of a missing one. Without
 this bound on the second nearest, two more of twelve simulated cloths show marks (measured)."""
 
-LONG_LINK: Final = 2.0
+MAX_LINK_RATIO: Final = 2.0
 """Maximum length of a link, relative to the median one at either end: it may span one missing mark. Without
 this bound, the bright rims of a TacTip's pins are taken for marks."""
 
-CLOSED: Final = 0.25
+CLOSING_DISTANCE_SIDES: Final = 0.25
 """Maximum distance of a mark from the fourth corner of a parallelogram, in mean sides. Chosen by hand."""
 
-FLAT: Final = 0.8
+MAX_CORNER_COSINE: Final = 0.8
 """Cosine of the angle between two sides above which they span no parallelogram. With 0.71, marks of a grid in
 perspective are lost (sts_torque160)."""
 
-BESIDE: Final = 4
+NEIGHBOUR_COUNT: Final = 4
 """Number of neighbours that a mark is compared with: those of a square grid."""
 
-PRIOR_TESTS: Final = 4.0
+PRIOR_OPEN_COUNT: Final = 4.0
 """Pseudo-count of open parallelograms, so that a lattice of few marks needs more evidence. Without it, three
 more of 121 pictures without dots show a lattice."""
 
@@ -74,12 +74,12 @@ class Lattice:
         """(E, 2) int64, neighbours without links that are much longer than the others at either end."""
         if len(self.points) < 2:
             return np.zeros((0, 2), np.int64)
-        edges = neighbour_graph(self.points, LONGEST_LINK * pitch_of(self.points))
+        edges = neighbour_graph(self.points, MAX_LINK_PITCHES * pitch_of(self.points))
         if not len(edges):
             return edges
         length = np.hypot(*(self.points[edges[:, 0]] - self.points[edges[:, 1]]).T)
         usual = np.asarray(median(np.tile(length, 2), edges.T.ravel(), np.arange(len(self.points))))
-        return np.asarray(edges[length < LONG_LINK * usual[edges].min(axis=1)], np.int64)
+        return np.asarray(edges[length < MAX_LINK_RATIO * usual[edges].min(axis=1)], np.int64)
 
     @cached_property
     def corners(self) -> Corners:
@@ -93,7 +93,7 @@ class Lattice:
         Real grids, including hand-painted, curved and tilted ones, have 0.8 and more; marks scattered at
         random have 0.1, or 0.3 if they keep a distance from each other (measured).
         """
-        return float(np.count_nonzero(self._closing >= 0) / (len(self.corners.points) + PRIOR_TESTS))
+        return float(np.count_nonzero(self._closing >= 0) / (len(self.corners.points) + PRIOR_OPEN_COUNT))
 
     @property
     def own_shares(self) -> Floats:
@@ -109,7 +109,7 @@ class Lattice:
 
     @property
     def cluster_sizes(self) -> Indices:
-        """(N,) int64, the number of marks that closed parallelograms connect to each mark, itself included."""
+        """(N,) int64, how many marks closed parallelograms connect to each mark, itself included."""
         count = len(self.points)
         cluster = components(self._cells, count)
         return np.bincount(cluster, minlength=count)[cluster]
@@ -121,7 +121,7 @@ class Lattice:
         step = self.points[last] - self.points[first]
         return Corners(
             np.concatenate([found.points, self.points[last] + step]),
-            np.concatenate([found.reach, CLOSED * np.hypot(*step.T)]),
+            np.concatenate([found.reach, CLOSING_DISTANCE_SIDES * np.hypot(*step.T)]),
             np.concatenate([found.first, first]),
             np.concatenate([found.middle, last]),
             np.concatenate([found.last, last]),
@@ -177,7 +177,7 @@ def neighbour_graph(centers: Floats, longest: float) -> Indices:
     length = np.hypot(*(one - other).T)
     # By Apollonius' theorem, a third mark blocks the link if it is this near to the midpoint, as the two
     # marks themselves are.
-    reach = length * np.sqrt((BLOCKING - 0.5) / 2)
+    reach = length * np.sqrt((BLOCKING_RATIO - 0.5) / 2)
     near = np.asarray(tree.query_ball_point((one + other) / 2, reach, return_length=True))
     edges = pairs[(near == 2) & (length > 0)]
     return np.asarray(edges[np.lexsort((edges[:, 1], edges[:, 0]))], np.int64)
@@ -217,8 +217,8 @@ def corners(centers: Floats, edges: Indices) -> Corners:
     c, a, b = (np.concatenate(part) for part in (middle, first, last))
     one, other = centers[a] - centers[c], centers[b] - centers[c]
     lengths = np.hypot(*one.T), np.hypot(*other.T)
-    open_ = np.abs((one * other).sum(axis=1)) < FLAT * lengths[0] * lengths[1]
-    reach = CLOSED * (lengths[0] + lengths[1])[open_] / 2
+    open_ = np.abs((one * other).sum(axis=1)) < MAX_CORNER_COSINE * lengths[0] * lengths[1]
+    reach = CLOSING_DISTANCE_SIDES * (lengths[0] + lengths[1])[open_] / 2
     return Corners((centers[c] + one + other)[open_], reach, a[open_], c[open_], b[open_])
 
 

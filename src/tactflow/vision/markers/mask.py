@@ -15,7 +15,7 @@ from tactflow.vision.arrays import check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers
-from tactflow.vision.markers.spots import ONE_SIZE
+from tactflow.vision.markers.spots import SAME_SIZE_RATIO
 
 Bytes = NDArray[np.uint8]
 Polarity = Literal["dark", "bright"]
@@ -23,14 +23,14 @@ Polarity = Literal["dark", "bright"]
 CIRCLE_POINTS: Final = 12
 """Number of points on the circle that a spot is compared with. Chosen by hand."""
 
-SHARPEST_CIRCLE: Final = 4.0
+MIN_CIRCLE_DISTANCE_PX: Final = 4.0
 """Minimum distance of the circle from the centre's dot, px, so that the blurred border of a small dot is not
 taken for gel. Chosen by hand."""
 
 CONTRAST_FRACTION: Final = 0.25
 """Minimum contrast of a dot, relative to the median. Worn dots keep that much. Chosen by hand."""
 
-LEAST_CONTRAST: Final = 6.0
+MIN_CONTRAST_GREY: Final = 6.0
 """Minimum contrast of a dot, grey levels: 120 / 20, the threshold of the original script over its gain."""
 
 
@@ -44,7 +44,7 @@ class Dot:
 
     radius: float
     polarity: Polarity = "dark"
-    contrast: float = LEAST_CONTRAST
+    contrast: float = MIN_CONTRAST_GREY
     others: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -91,7 +91,7 @@ def find_dot(
     contrast = np.median(_contrast(_even(image), found.dot_radius, found.polarity), axis=2)
     columns, rows = np.clip(np.rint((found.centers - 0.5) / 2).astype(int).T, 0, None)
     at = contrast[np.minimum(rows, contrast.shape[0] - 1), np.minimum(columns, contrast.shape[1] - 1)]
-    least = max(LEAST_CONTRAST, CONTRAST_FRACTION * float(np.median(at)))
+    least = max(MIN_CONTRAST_GREY, CONTRAST_FRACTION * float(np.median(at)))
     return Dot(found.dot_radius, found.polarity, least, _other_sizes(found))
 
 
@@ -100,7 +100,7 @@ def _other_sizes(found: Detection) -> tuple[float, ...]:
     if found.radii is None:
         return ()
     # A circle fits marks that are smaller or larger by up to this ratio.
-    step = np.rint(np.log(found.radii / found.dot_radius) / np.log(ONE_SIZE**2))
+    step = np.rint(np.log(found.radii / found.dot_radius) / np.log(SAME_SIZE_RATIO**2))
     sizes, counts = np.unique(step, return_counts=True)
     return tuple(float(np.median(found.radii[step == s])) for s in sizes[(counts > 1) & (sizes != 0)])
 
@@ -169,7 +169,7 @@ def _contrast(whole: Bytes, radius: float, polarity: Polarity) -> Bytes:
 
 def _circle_radius(radius: float) -> float:
     """Radius of the circle at half resolution for a dot whose radius is given at full resolution."""
-    return (radius + max(radius, SHARPEST_CIRCLE) + 1) / 2
+    return (radius + max(radius, MIN_CIRCLE_DISTANCE_PX) + 1) / 2
 
 
 def _corner(radius: float) -> int:

@@ -11,24 +11,24 @@ from tactflow.vision.arrays import Flags, Floats, Indices
 from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import components, nearest
 
-MOST_STRAIN: Final = 0.5
+MAX_STRAIN: Final = 0.5
 """Strain of a link above which its two marks do not move together; 0.3 and 0.7 change no identity in six
 scenes and seven recordings (measured)."""
 
-REACH: Final = 0.4
+SEARCH_RADIUS_PITCHES: Final = 0.4
 """Scatter of the displacement field, pitches: maximum distance of a spot from the predicted position of its
 mark. With 0.3 three times as many marks of wedge_roll are missed, with 0.5 some take a shadow half a pitch
 away (measured)."""
 
-LEAST_SHARE: Final = 0.15
+MIN_KNOWN_SHARE: Final = 0.15
 """Minimum share, by weight, of known neighbours to predict a mark: a single one is not enough. With 0.2,
 jumps of 0.9 pitches cost identities; with 0.1, marks of sts_torque160, 3 px apart, take the spots of others
 in 2 % of all cases (measured)."""
 
-NEIGHBOURS: Final = 24
+MAX_NEIGHBOURS: Final = 24
 """Maximum number of neighbours in a fit: the two rings of a square grid, 8 + 16."""
 
-WEIGHT_SIGMA: Final = 1.1
+WEIGHT_SIGMA_PITCHES: Final = 1.1
 """Standard deviation of the Gaussian weight of a neighbour, pitches: the weight is 0.66 at one pitch. Chosen
 by hand."""
 
@@ -104,7 +104,7 @@ def check_links(
         x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
         y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
         both = seen[one] and seen[other]
-        smooth[e] = both and np.sqrt(x * x + y * y) < MOST_STRAIN * length[e]
+        smooth[e] = both and np.sqrt(x * x + y * y) < MAX_STRAIN * length[e]
         torn = torn or (both and not smooth[e])
     return torn
 
@@ -147,7 +147,7 @@ class Interpolator:
             basis[..., number] = term
         weighted = (basis * weight[:, :, None]).transpose(0, 2, 1)
         fitted = np.linalg.solve(weighted @ basis + RIDGE, weighted @ moved)[:, 0]
-        supported = weight.sum(axis=1) > LEAST_SHARE * self._weight[missing].sum(axis=1)
+        supported = weight.sum(axis=1) > MIN_KNOWN_SHARE * self._weight[missing].sum(axis=1)
         placed = np.asarray(missing[supported], np.int64)
         position[placed] = self._origin[placed] + fitted[supported]
         return placed
@@ -155,8 +155,8 @@ class Interpolator:
 
 def surroundings(origin: Floats, pitch: float) -> tuple[Indices, Floats]:
     """The up to 24 nearest neighbours of each mark, and their weights: two (N, n) arrays."""
-    away, near = nearest(origin, NEIGHBOURS)
-    return near, np.exp(-(away**2) / (2 * (WEIGHT_SIGMA * pitch) ** 2))
+    away, near = nearest(origin, MAX_NEIGHBOURS)
+    return near, np.exp(-(away**2) / (2 * (WEIGHT_SIGMA_PITCHES * pitch) ** 2))
 
 
 def grow(
@@ -239,6 +239,8 @@ def common_displacement(position: Floats, spots: Floats, pitch: float, farthest:
     if len(votes) == 0:
         return np.zeros(2)
     tree = KDTree(votes)
-    best = np.asarray(tree.query_ball_point(votes, REACH * pitch, return_length=True)).argmax()
-    agree = tree.query_ball_point(votes[best], REACH * pitch)
+    best = np.asarray(
+        tree.query_ball_point(votes, SEARCH_RADIUS_PITCHES * pitch, return_length=True)
+    ).argmax()
+    agree = tree.query_ball_point(votes[best], SEARCH_RADIUS_PITCHES * pitch)
     return np.asarray(votes[agree].mean(axis=0), np.float64)

@@ -8,13 +8,13 @@ import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
 from tactflow.vision.compiled import kernel
-from tactflow.vision.markers.lattice import BESIDE
-from tactflow.vision.markers.matching import LEAST_SHARE, surroundings
+from tactflow.vision.markers.lattice import NEIGHBOUR_COUNT
+from tactflow.vision.markers.matching import MIN_KNOWN_SHARE, surroundings
 
-REST: Final = 0.1
+REST_DISPLACEMENT_PITCHES: Final = 0.1
 """Maximum displacement of a resting mark along either axis, pitches. Chosen by hand."""
 
-BEST_AGREEMENT: Final = 0.25
+MIN_RELATIVE_SCATTER: Final = 0.25
 """Expected scatter of a mark's displacement about the mean of its neighbours, relative to this mean, at best.
 Chosen by hand."""
 
@@ -57,7 +57,7 @@ class MotionEvidence:
     def __init__(self, origin: Floats, pitch: float, prior: Floats, against: Floats) -> None:
         self._around, weight = surroundings(origin, pitch)
         self._share = weight / np.maximum(weight.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-        self._rest = REST * pitch
+        self._rest = REST_DISPLACEMENT_PITCHES * pitch
         self._log_odds = np.log(prior / (1 - prior))
         self.against = against
         self.left: Indices = self._leaving()
@@ -106,7 +106,7 @@ def weigh_motion(
         moving = moving or moves[n]
     for n in range(len(displacement) if moving else 0):
         beside = False
-        for k in range(min(BESIDE, around.shape[1])):
+        for k in range(min(NEIGHBOUR_COUNT, around.shape[1])):
             beside = beside or (moves[around[n, k]] and seen[around[n, k]])
         if moves[n] or not (seen[n] and beside):
             continue
@@ -116,11 +116,11 @@ def weigh_motion(
                 x, y = displacement[around[n, k]]
                 total, squares = total + share[n, k], squares + share[n, k] * (x * x + y * y)
                 mean_x, mean_y = mean_x + share[n, k] * x, mean_y + share[n, k] * y
-        if total < LEAST_SHARE:
+        if total < MIN_KNOWN_SHARE:
             continue
         mean_x, mean_y = mean_x / total, mean_y / total
         length = mean_x * mean_x + mean_y * mean_y
-        expected = (squares / total - length) / 2 + stderr[n] * stderr[n] + BEST_AGREEMENT**2 * length
+        expected = (squares / total - length) / 2 + stderr[n] * stderr[n] + MIN_RELATIVE_SCATTER**2 * length
         along = mean_x * displacement[n, 0] + mean_y * displacement[n, 1]
         against[n] = max(against[n], (length / 2 - along) / expected)
     return moving

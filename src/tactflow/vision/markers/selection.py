@@ -15,63 +15,63 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
-from tactflow.vision.markers.lattice import BESIDE, LONGEST_LINK, Lattice, nearest, support
+from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, NEIGHBOUR_COUNT, Lattice, nearest, support
 from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, Spots, joined
 
 Sign = Literal["dark", "bright"]
 
-LEAST_STRENGTH: Final = 0.35
+MIN_STRENGTH_RATIO: Final = 0.35
 """Minimum response of a mark, relative to the typical one of its scale: dirt and grain are a tail. With 0.25,
 grain between marks that are 3 px apart takes their places (sts_torque160)."""
 
-BETWEEN: Final = 0.55
+MIN_SPACING_PITCHES: Final = 0.55
 """Distance, pitches, below which the weaker of two spots lies between marks. Chosen by hand."""
 
-RANDOM_SHARE: Final = 0.3
+RANDOM_CLOSED_SHARE: Final = 0.3
 """Share of closed parallelograms without a lattice: 0.1 to 0.25 on rendered textures, 0.31 for spots that
 keep nearly the distance of a lattice from each other (measured)."""
 
-APART: Final = 0.9
+MIN_SPACING_RADII: Final = 0.9
 """Minimum distance of two marks, in sums of their radii: with 1, crowded marks are lost (sts_torque160)."""
 
-CLEAR: Final = 0.65
+ISOLATED_CLEARANCE: Final = 0.65
 """Minimum clearance of a mark that little else supports: an isolated one, or one that a single corner or line
 of the lattice predicts. Dots on an even background have 0.8 to 1, pieces of edges and lines 0.3 to 0.7
 (tactip_video, sts_640)."""
 
-NEAR: Final = 3.2
+MAX_STRENGTH_RATIO: Final = 3.2
 """Maximum ratio of the responses of a spot and of the marks around, either way, where the lattice predicts a
 mark: uneven light and dirt weaken marks."""
 
-ALIKE: Final = 1.5
+MAX_SIZE_RATIO: Final = 1.5
 """Maximum ratio of the radii of a spot and of the marks around, either way; and of their responses, where
 only clearance supports it."""
 
-LEAST_BEND: Final = 0.15
+MIN_BEND_RATIO: Final = 0.15
 """Minimum bend of a mark, relative to the median: a piece of an edge or a line has 0. With 0.2, 0.2 % more of
 the dots labelled on 18 sensors are lost; with 0.1, there are a fifth more false dots."""
 
-LEAST_SUPPORT: Final = 2
+MIN_SUPPORT: Final = 2
 """Minimum number of corners and lines of the lattice that predict a mark: one may be a coincidence."""
 
-RING_CONTRAST: Final = 0.3
+MIN_CLEARANCE: Final = 0.3
 """Minimum clearance of a spot: pieces of edges, lines and textures have less. Chosen by hand."""
 
-LIKENESS: Final = 0.64
+MIN_LIKENESS: Final = 0.64
 """Minimum likeness of a spot to the marks around, where the lattice predicts a mark and other marks are too
 near for the ring. Chosen on pictures of eight sensors, shrunk until their marks were 3 to 8 px apart: 0.6
 finds 0.2 % more marks and 0.2 % more false ones."""
 
-LEAST_CLUSTER: Final = 6
+MIN_CLUSTER_SIZE: Final = 6
 """Minimum number of marks in a lattice beside a larger one: four or five spots form a parallelogram by chance
 (sts_torque160)."""
 
-PROBABILITY: Final = (-0.37, -4.72, 5.65, 2.42)
+PROBABILITY_WEIGHTS: Final = (-0.37, -4.72, 5.65, 2.42)
 """Log odds of a mark: constant, and weights of its `evidence`. Fitted to 18 sensors by `python -m
 lab.probability dots`, which also reports the calibration of the probability on sensors that were
 left out."""
 
-WINDOW: Final = 2.6
+LIKENESS_WINDOW_RADII: Final = 2.6
 """Radius of the discs that are compared, in radii of the marks: they include the gaps to the neighbours.
 Chosen on sts_640 and sts_torque160, where glare correlates less with marks than with 1.9 radii."""
 
@@ -106,12 +106,12 @@ def candidates(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Candidate]:
     found = []
     for polarity, by_scale in scales.items():
         for sigma, spots in by_scale.items():
-            members = _alike(spots.at(spots.clear > RING_CONTRAST))
+            members = _alike(spots.at(spots.clear > MIN_CLEARANCE))
             if len(members.points):
                 lattice = Lattice(members.points)
                 # More contrast is more evidence, but six lamps must not beat a hundred faint dots.
                 total = float(np.median(members.strength)) * len(members.points)
-                score = max(lattice.closed_share - RANDOM_SHARE, 0.0) * total**0.5
+                score = max(lattice.closed_share - RANDOM_CLOSED_SHARE, 0.0) * total**0.5
                 found.append(Candidate(members, sigma * RADIUS_PER_SIGMA, polarity, score, lattice))
     return sorted(found, key=lambda one: (one.score, float(one.spots.strength.sum())), reverse=True)
 
@@ -121,13 +121,13 @@ def marks_of(gray: NDArray[np.float32], chosen: Candidate, by_scale: Mapping[flo
 
     gray : (H, W) float32, grey levels. by_scale : the spots of its polarity.
     """
-    least = 1 / NEAR * float(np.percentile(chosen.spots.strength, 10))
+    least = 1 / MAX_STRENGTH_RATIO * float(np.percentile(chosen.spots.strength, 10))
     spots = joined(*(spots.at(spots.strength > least) for spots in by_scale.values()))
-    larger = spots.at((spots.radius > 1.01 * chosen.radius) & (spots.clear > RING_CONTRAST))
+    larger = spots.at((spots.radius > 1.01 * chosen.radius) & (spots.clear > MIN_CLEARANCE))
     covers = np.any(cdist(larger.points, chosen.spots.points) < larger.radius[:, None], axis=1)
     either = joined(chosen.spots, larger.at(covers))
     marks = _grown(gray, _in_lattice(_apart(either, either.strength)), spots)
-    return marks.at(marks.bend > LEAST_BEND * np.median(marks.bend)) if len(marks.points) else marks
+    return marks.at(marks.bend > MIN_BEND_RATIO * np.median(marks.bend)) if len(marks.points) else marks
 
 
 def evidence(gray: NDArray[np.float32], marks: Spots) -> Floats:
@@ -136,7 +136,7 @@ def evidence(gray: NDArray[np.float32], marks: Spots) -> Floats:
     The absolute logarithm of the ratio of its response to that of the marks around; its likeness to them, -1
     to 1; and the share of closed ones among its parallelograms, 0 to 1.
     """
-    _, around = nearest(marks.points, BESIDE)
+    _, around = nearest(marks.points, NEIGHBOUR_COUNT)
     if not around.size:
         return np.full((len(marks.points), 3), np.nan)
     strength = np.log(marks.strength / np.median(marks.strength[around], axis=1))
@@ -156,7 +156,9 @@ def probability(evidence: Floats) -> Floats:
     >>> probability(np.array([[0.1, 0.9, 0.8], [1.0, 0.1, 0.0]])) > 0.5
     array([ True, False])
     """
-    return np.asarray(1 / (1 + np.exp(-PROBABILITY[0] - evidence @ PROBABILITY[1:])), np.float64)
+    return np.asarray(
+        1 / (1 + np.exp(-PROBABILITY_WEIGHTS[0] - evidence @ PROBABILITY_WEIGHTS[1:])), np.float64
+    )
 
 
 def _alike(spots: Spots) -> Spots:
@@ -169,15 +171,17 @@ def _alike(spots: Spots) -> Spots:
     ranked = spots.strength[order]
     typical = ranked[0]
     for _ in range(8):
-        typical = float(np.median(ranked[ranked > LEAST_STRENGTH * typical]))
-    kept = spots.at(order[ranked > LEAST_STRENGTH * typical])
+        typical = float(np.median(ranked[ranked > MIN_STRENGTH_RATIO * typical]))
+    kept = spots.at(order[ranked > MIN_STRENGTH_RATIO * typical])
     for _ in range(3):
         if len(kept.points) < 3:
             return kept
         distances, near = nearest(kept.points, 2)
         pitch = float(np.median(distances[:, 0]))
-        between = (distances[:, 0] < BETWEEN * pitch) & (kept.strength < kept.strength[near[:, 0]])
-        lonely = distances[:, 1] > LONGEST_LINK * pitch
+        between = (distances[:, 0] < MIN_SPACING_PITCHES * pitch) & (
+            kept.strength < kept.strength[near[:, 0]]
+        )
+        lonely = distances[:, 1] > MAX_LINK_PITCHES * pitch
         if not (between | lonely).any():
             break
         kept = kept.at(~(between | lonely))
@@ -186,19 +190,19 @@ def _alike(spots: Spots) -> Spots:
 
 def _in_lattice(marks: Spots) -> Spots:
     """The marks that belong to a lattice, or stand isolated on an even background."""
-    if len(marks.points) < BESIDE:
+    if len(marks.points) < NEIGHBOUR_COUNT:
         return marks
     lattice = Lattice(marks.points)
     cluster = lattice.cluster_sizes
-    member = (cluster >= min(LEAST_CLUSTER, cluster.max())) & (lattice.own_shares >= RANDOM_SHARE)
-    alike = _ratio(marks.strength, np.median(marks.strength)) < ALIKE
-    return marks.at(member | (alike & (marks.clear > CLEAR)))
+    member = (cluster >= min(MIN_CLUSTER_SIZE, cluster.max())) & (lattice.own_shares >= RANDOM_CLOSED_SHARE)
+    alike = _ratio(marks.strength, np.median(marks.strength)) < MAX_SIZE_RATIO
+    return marks.at(member | (alike & (marks.clear > ISOLATED_CLEARANCE)))
 
 
 def _grown(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     """Extend the marks by spots where their lattice predicts one, row by row."""
-    while len(marks.points) >= BESIDE:
-        touching = APART * (spots.radius[:, None] + marks.radius)
+    while len(marks.points) >= NEIGHBOUR_COUNT:
+        touching = MIN_SPACING_RADII * (spots.radius[:, None] + marks.radius)
         spots = spots.at(np.all(cdist(spots.points, marks.points) > touching, axis=1))
         new = _wanted(gray, marks, spots)
         if len(new.points) == 0:
@@ -212,15 +216,15 @@ def _wanted(gray: NDArray[np.float32], marks: Spots, spots: Spots) -> Spots:
     count = support(spots.points, Lattice(marks.points).predicted)
     wanted, count = spots.at(count > 0), count[count > 0]
     away = cdist(wanted.points, marks.points)
-    around = np.argsort(away, axis=1, kind="stable")[:, :BESIDE]
+    around = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOUR_COUNT]
     usual = np.median(marks.radius[around], axis=1)
     radius = _ratio(wanted.radius, usual)
     strength = _ratio(wanted.strength, np.median(marks.strength[around], axis=1))
-    fits = (radius < ALIKE) & (strength < NEAR)
-    sure = (wanted.clear > CLEAR) & (strength < ALIKE)
-    chosen = (wanted.clear > RING_CONTRAST) & ((count >= LEAST_SUPPORT) | sure)
+    fits = (radius < MAX_SIZE_RATIO) & (strength < MAX_STRENGTH_RATIO)
+    sure = (wanted.clear > ISOLATED_CLEARANCE) & (strength < MAX_SIZE_RATIO)
+    chosen = (wanted.clear > MIN_CLEARANCE) & ((count >= MIN_SUPPORT) | sure)
     left = np.flatnonzero(fits & ~chosen)
-    chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > LIKENESS
+    chosen[left] = likeness(gray, wanted.points[left], marks.points[around[left]], usual[left]) > MIN_LIKENESS
     rank = wanted.strength / radius
     return _apart(wanted.at(fits & chosen), rank[fits & chosen])
 
@@ -238,7 +242,7 @@ def _apart(spots: Spots, rank: Floats) -> Spots:
         if left[n]:
             kept.append(n)
             away = np.hypot(*(spots.points - spots.points[n]).T)
-            left &= away > APART * (spots.radius + spots.radius[n])
+            left &= away > MIN_SPACING_RADII * (spots.radius + spots.radius[n])
     return spots.at(np.array(kept, np.int64))
 
 
@@ -271,7 +275,7 @@ def likeness(gray: NDArray[np.float32], points: Floats, others: Floats, radius: 
     count, compared = others.shape[:2]
     if not count:
         return np.zeros(0)
-    reach = WINDOW * radius
+    reach = LIKENESS_WINDOW_RADII * radius
     own = _surroundings(gray, points, reach)
     theirs = _surroundings(gray, others.reshape(-1, 2), np.repeat(reach, compared))
     return np.asarray(np.einsum("np,nkp->nk", own, theirs.reshape(count, compared, -1)).mean(axis=1))

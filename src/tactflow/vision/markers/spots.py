@@ -18,42 +18,42 @@ RADIUS_PER_SIGMA: Final = 1.83
 """Radius of the disc with the strongest response, over the narrower width. Measured on rendered discs of
 radius 2 to 12 px."""
 
-LEAST_SIGMA: Final = 0.75
+MIN_SIGMA_PX: Final = 0.75
 """Smallest scale, px: marks of radius 1.4. Chosen by hand."""
 
 SIGMA_STEP: Final = 1.2
 """Ratio of adjacent scales. Chosen by hand."""
 
-LARGEST_MARK: Final = 1 / 16
+MAX_SIGMA_SHARE: Final = 1 / 16
 """Largest scale, over the shorter side of the image. Chosen by hand."""
 
-ONE_SIZE: Final = 1.3
+SAME_SIZE_RATIO: Final = 1.3
 """Largest ratio of the radii of marks that count as equal in size: the uncertainty of one step of scale
 either way. Up to 1.6 it changes no identity in seven recordings (measured)."""
 
-FULL_SIZE_SIGMA: Final = 4.0
+FULL_SIZE_SIGMA_PX: Final = 4.0
 """Scales from this one on are computed in a shrunk picture, px: the peaks are the same at a bounded cost."""
 
-LEAST_STRENGTH: Final = 1.0
+MIN_STRENGTH_GREY: Final = 1.0
 """Minimum response of a spot, grey levels: weaker ones are rounding."""
 
-MOST_PEAKS: Final = 3000
+MAX_PEAKS: Final = 3000
 """Maximum number of peaks of one scale, the strongest ones: bounds the time on a textured picture."""
 
-RING: Final = 1.9
+RING_RADII: Final = 1.9
 """Radius of the ring that a spot is compared with, in radii of the spot. Chosen by hand."""
 
 RING_POINTS: Final = 16
 """Number of points of that ring. Chosen by hand."""
 
-RING_MISSES: Final = 2
+MAX_RING_MISSES: Final = 2
 """Number of points of the ring that need not differ from the spot, where something touches it. Chosen by
 hand."""
 
-OVERLAP: Final = 1.3
+MIN_PEAK_SPACING_RADII: Final = 1.3
 """Minimum distance of neighbouring marks, in radii: closer spots are ridges of a pattern."""
 
-BORDER_MARGIN: Final = 0.8
+BORDER_MARGIN_RADII: Final = 0.8
 """Minimum distance of a mark from the border of the image, in radii: closer ones are cut by it."""
 
 
@@ -86,9 +86,9 @@ def sigmas(dot_radius: float | None, shortest: int) -> list[float]:
     """Scales to search, px: that of one radius, or all that fit a picture with this shorter side."""
     if dot_radius is not None:
         return [dot_radius / RADIUS_PER_SIGMA]
-    largest = max(SIGMA_STEP, shortest * LARGEST_MARK)
-    count = 1 + int(np.floor(np.log(largest / LEAST_SIGMA) / np.log(SIGMA_STEP)))
-    return [LEAST_SIGMA * SIGMA_STEP**step for step in range(count)]
+    largest = max(SIGMA_STEP, shortest * MAX_SIGMA_SHARE)
+    count = 1 + int(np.floor(np.log(largest / MIN_SIGMA_PX) / np.log(SIGMA_STEP)))
+    return [MIN_SIGMA_PX * SIGMA_STEP**step for step in range(count)]
 
 
 def find_spots(
@@ -109,16 +109,16 @@ def find_spots(
     Lindeberg, "Feature detection with automatic scale selection", IJCV 30 (1998); Lowe, "Distinctive image
     features from scale-invariant keypoints", IJCV 60 (2004), for the difference of Gaussians.
     """
-    factor, smooth, response = _respond(gray, sigma, polarity, FULL_SIZE_SIGMA)
+    factor, smooth, response = _respond(gray, sigma, polarity, FULL_SIZE_SIGMA_PX)
     fine, radius = sigma / factor, sigma * RADIUS_PER_SIGMA
     # Marks do not overlap: peaks that are nearer to each other are the border of one spot of a larger scale.
-    peaks, strength = _peaks(response, LEAST_STRENGTH, OVERLAP * radius / factor)
-    strongest = np.argsort(-strength, kind="stable")[:MOST_PEAKS]
+    peaks, strength = _peaks(response, MIN_STRENGTH_GREY, MIN_PEAK_SPACING_RADII * radius / factor)
+    strongest = np.argsort(-strength, kind="stable")[:MAX_PEAKS]
     peaks, strength = peaks[strongest], strength[strongest]
     clear = _clearance(smooth, peaks, radius / factor)
     points = peaks * factor + (factor - 1) / 2
     spots = Spots(points, np.full(len(points), radius), strength, clear, fine**2 * _bend(response, peaks))
-    margin, (height, width) = BORDER_MARGIN * radius, gray.shape
+    margin, (height, width) = BORDER_MARGIN_RADII * radius, gray.shape
     inside = ((points >= margin) & (points <= np.array([width, height]) - 1 - margin)).all(axis=1)
     spots = spots.at(np.flatnonzero(inside))
     return spots if valid is None else spots.at(_on_gel(valid, spots.points, radius))
@@ -134,7 +134,7 @@ def find_peaks(
     gray : (H, W) float32, grey levels. sigma : px. least : grey levels. Returns (M, 2), (M,) float64.
     """
     # At half the resolution of detection: where they are is measured by templates.
-    factor, _, response = _respond(gray, sigma, polarity, FULL_SIZE_SIGMA / 2)
+    factor, _, response = _respond(gray, sigma, polarity, FULL_SIZE_SIGMA_PX / 2)
     peaks, strength = _peaks(response, least, RADIUS_PER_SIGMA * sigma / factor)
     return peaks * factor + (factor - 1) / 2, strength
 
@@ -142,8 +142,8 @@ def find_peaks(
 def _respond(
     gray: NDArray[np.float32], sigma: float, polarity: Literal["dark", "bright"], full_size: float
 ) -> tuple[int, NDArray[np.float32], NDArray[np.float32]]:
-    """By which factor the picture is shrunk, for scales from `full_size` px on; the shrunk picture at the
-    scale, with dark marks; and its difference of Gaussians, positive on marks."""
+    """Shrink factor (above 1 for scales from `full_size` px on), the shrunk picture at the scale, with dark
+    marks, and its difference of Gaussians, positive on marks."""
     factor = 1
     while sigma >= factor * full_size:
         factor *= 2
@@ -202,11 +202,11 @@ def _bend(response: NDArray[np.float32], peaks: Floats) -> Floats:
 
 
 def _clearance(smooth: NDArray[np.float32], peaks: Floats, radius: float) -> Floats:
-    """Contrast of dark peaks with all but `RING_MISSES` points of the ring around, over the median one."""
+    """Contrast of dark peaks with all but `MAX_RING_MISSES` points of the ring, over the median one."""
     if len(peaks) == 0:
         return np.zeros(0)
     angles = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
-    ring = peaks[:, None] + RING * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring = peaks[:, None] + RING_RADII * radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     limits = np.array([smooth.shape[1] - 1, smooth.shape[0] - 1])
     ring = np.rint(ring).astype(np.int64)
     column, row = np.clip(ring, 0, limits).transpose(2, 0, 1)
@@ -215,15 +215,17 @@ def _clearance(smooth: NDArray[np.float32], peaks: Floats, radius: float) -> Flo
     # What the ring meets beyond the border is not known, and says nothing.
     inside = ((ring >= 0) & (ring <= limits)).all(axis=2)
     above = np.sort(np.where(inside, above, np.float32(np.inf)), axis=1)
-    half = np.maximum(inside.sum(axis=1) // 2, RING_MISSES)
+    half = np.maximum(inside.sum(axis=1) // 2, MAX_RING_MISSES)
     median = np.take_along_axis(above, half[:, None], axis=1)[:, 0]
     median = np.where(np.isfinite(median), median, 0.0)
-    return np.asarray(np.where(median > 0, above[:, RING_MISSES] / np.maximum(median, 1e-3), 0.0), np.float64)
+    return np.asarray(
+        np.where(median > 0, above[:, MAX_RING_MISSES] / np.maximum(median, 1e-3), 0.0), np.float64
+    )
 
 
 def _on_gel(valid: NDArray[np.uint8], points: Floats, radius: float) -> NDArray[np.bool_]:
     """Which points have gel in at least half of the square around them."""
-    side = 2 * round(RING * radius) + 1
+    side = 2 * round(RING_RADII * radius) + 1
     share = cv2.boxFilter((valid > 0).astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE)
     limits = np.array([valid.shape[1] - 1, valid.shape[0] - 1])
     column, row = np.clip(np.rint(points).astype(np.int64), 0, limits).T

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
 from tactflow.vision.compiled import helper, kernel
-from tactflow.vision.markers.spots import ONE_SIZE
+from tactflow.vision.markers.spots import SAME_SIZE_RATIO
 
 Bytes = NDArray[np.uint8]
 Levels = NDArray[np.int16]
@@ -20,17 +20,17 @@ PHASES: Final = 4
 the nearest one, where the error of the linear model is far below the noise; if another phase is nearer, one
 more step is made. Chosen by hand."""
 
-ROUNDS: Final = 3
+MAX_STEPS: Final = 3
 """Maximum number of steps after the first one. Chosen by hand."""
 
-SAMPLING_ERROR: Final = 0.003
+SAMPLING_ERROR_PX: Final = 0.003
 """Error without noise, px: edges sharper than the sampling limit cannot be interpolated exactly. Measured on
 rendered dots of radius 4.6 px with edges of 0.7 px standard deviation."""
 
-PATCH_SCALE: Final = 1.55
+PATCH_RADII: Final = 1.55
 """Radius of a template over that of its mark: it includes the mark's border and some gel. Chosen by hand."""
 
-PATCH_MARGIN: Final = 1.2
+PATCH_MARGIN_PX: Final = 1.2
 """Additional margin of a template, px, for the shift of a phase and a step. Chosen by hand."""
 
 RIDGE: Final = 1e-6
@@ -40,11 +40,11 @@ are never accepted. Chosen by hand."""
 TINY: Final = np.finfo(np.float32).tiny
 """Keeps quotients finite."""
 
-LEAST_GAIN: Final = np.float32(0.2)
+MIN_GAIN: Final = np.float32(0.2)
 """Minimum contrast of a visible mark, relative to its template, and lower bound of the divisor of a step:
 that of a fainter mark would be all noise. Chosen by hand."""
 
-LEAST_R_SQUARED: Final = np.float32(0.5)
+MIN_R_SQUARED: Final = np.float32(0.5)
 """Minimum fraction of a visible mark's contrast that its template explains. Only then is another step made,
 since it would not converge. Chosen by hand."""
 
@@ -128,7 +128,7 @@ class MarkerTemplates:
 
     def add(self, reference: Floats32, origin: Floats, radii: Floats) -> None:
         """Append marks (n, 2), px, with radii (n,), px, with templates from another frame."""
-        step = np.floor(np.log(radii / radii.min()) / np.log(ONE_SIZE) + 1e-6)
+        step = np.floor(np.log(radii / radii.min()) / np.log(SAME_SIZE_RATIO) + 1e-6)
         sizes, size_of = np.unique(step, return_inverse=True)
         place = np.empty(len(radii), np.int64)
         known = len(self._models)
@@ -163,7 +163,7 @@ class MarkerTemplates:
 
 def _model(reference: Floats32, origin: Floats, radius: float, dark: bool) -> _Model:
     """The model of marks (N, 2), px, of one size. Arguments as of `MarkerTemplates`."""
-    extent = PATCH_SCALE * radius + PATCH_MARGIN
+    extent = PATCH_RADII * radius + PATCH_MARGIN_PX
     reach = int(np.ceil(extent))
     axis = np.arange(-reach, reach + 1)
     grid_y, grid_x = np.meshgrid(axis, axis, indexing="ij")
@@ -297,7 +297,7 @@ def align_marks(
         seen_left, seen_top, varies = -1, -1, 0.0
         phase_x, phase_y = nearest_phase(x, y, width, height)
         before_x, before_y = -1, -1
-        for _ in range(ROUNDS + 1):
+        for _ in range(MAX_STEPS + 1):
             left, top = phase_x // PHASES, phase_y // PHASES
             which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + place
             # A step of less than a pixel often needs the same patch at another phase.
@@ -307,8 +307,8 @@ def align_marks(
             gain, shift_x, shift_y, r_squared, rest = fit_template(
                 weights[which], terms[which], patch, varies
             )
-            seen[n] = gain > LEAST_GAIN and r_squared > LEAST_R_SQUARED
-            safe = max(gain, LEAST_GAIN)
+            seen[n] = gain > MIN_GAIN and r_squared > MIN_R_SQUARED
+            safe = max(gain, MIN_GAIN)
             now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
             now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
             next_x, next_y = nearest_phase(now_x, now_y, width, height)
@@ -323,7 +323,7 @@ def align_marks(
             before_x, before_y, phase_x, phase_y = phase_x, phase_y, next_x, next_y
         position[n, 0], position[n, 1] = x, y
         noise = rest * terms[which, 9] / (safe * safe)
-        stderr[n] = np.sqrt(noise + np.float32(SAMPLING_ERROR * SAMPLING_ERROR))
+        stderr[n] = np.sqrt(noise + np.float32(SAMPLING_ERROR_PX * SAMPLING_ERROR_PX))
 
 
 @helper

@@ -19,22 +19,22 @@ from tactflow.vision.markers.detection import (
     to_gray,
 )
 from tactflow.vision.markers.matching import (
-    REACH,
+    SEARCH_RADIUS_PITCHES,
     Interpolator,
     MarkerGraph,
     common_displacement,
     grow,
 )
 from tactflow.vision.markers.motion import MotionEvidence
-from tactflow.vision.markers.selection import LEAST_STRENGTH
-from tactflow.vision.markers.spots import LEAST_SIGMA, RADIUS_PER_SIGMA, find_peaks
+from tactflow.vision.markers.selection import MIN_STRENGTH_RATIO
+from tactflow.vision.markers.spots import MIN_SIGMA_PX, RADIUS_PER_SIGMA, find_peaks
 from tactflow.vision.markers.template import Alignment, MarkerTemplates
 from tactflow.vision.types import Markers, MarkerStatus
 
-SEARCH_INTERVAL: Final = 10
+SEARCH_INTERVAL_FRAMES: Final = 10
 """Number of frames between two searches for marks that stay missing. Chosen by hand."""
 
-MAX_DISPLACEMENT: Final = 1.3
+MAX_DISPLACEMENT_PITCHES: Final = 1.3
 """Default maximum displacement of a mark between two frames, pitches. Chosen by hand."""
 
 JOINING_PROBABILITY: Final = 0.95
@@ -117,15 +117,15 @@ class MarkerTracker:
         self._prior = detection.probability
         # A visible mark moves at most across the frame; the votes for a jump take memory.
         across = float(np.hypot(*self._shape))
-        self._farthest = min(max_displacement or MAX_DISPLACEMENT * self._pitch, across)
+        self._farthest = min(max_displacement or MAX_DISPLACEMENT_PITCHES * self._pitch, across)
         self._polarity = detection.polarity
         self._origin = np.array(detection.centers, np.float64)
         dark = detection.polarity == "dark"
         self._templates = MarkerTemplates(mean, self._origin, _radii(detection), dark)
-        self._sigma = max(self._radius / RADIUS_PER_SIGMA, LEAST_SIGMA)
+        self._sigma = max(self._radius / RADIUS_PER_SIGMA, MIN_SIGMA_PX)
         peaks, strength = find_peaks(mean, self._sigma, self._polarity, 0.0)
         usual = strength[KDTree(peaks).query(self._origin)[1]] if len(peaks) else np.ones(1)
-        self._least = LEAST_STRENGTH * float(np.median(usual))
+        self._least = MIN_STRENGTH_RATIO * float(np.median(usual))
         self._know(self._origin, detection.edges)
         self.reset()
 
@@ -166,7 +166,7 @@ class MarkerTracker:
         # If marks stay missing, search again from time to time.
         missing = np.count_nonzero(found.seen) < self._count - len(self._evidence.left)
         self._age = self._age + 1 if missing else 0
-        if torn or self._age >= SEARCH_INTERVAL or (missing and (self._seen & ~found.seen).any()):
+        if torn or self._age >= SEARCH_INTERVAL_FRAMES or (missing and (self._seen & ~found.seen).any()):
             found = self._search(image, found, smooth)
             self._age = 0
         position, stderr, seen = found
@@ -217,7 +217,7 @@ class MarkerTracker:
         placed = np.concatenate([self._position, centers])
         Interpolator(origin, self._pitch).place(placed, known)
         origin[~known] -= placed[~known] - centers
-        self._know(origin, lattice.neighbour_graph(origin, lattice.LONGEST_LINK * self._pitch))
+        self._know(origin, lattice.neighbour_graph(origin, lattice.MAX_LINK_PITCHES * self._pitch))
         self._prior = np.concatenate([self._prior, found.probability[joins]])
         self._evidence = self._weigh(np.append(self._evidence.against, np.zeros(len(centers))))
         self._position = np.concatenate([self._position, centers])
@@ -231,10 +231,10 @@ class MarkerTracker:
         inliers = self._best_start(image, found, smooth, spots)
         # The position of a visible mark that is not an inlier is a spot like any other.
         own = found.position[found.seen & ~inliers]
-        spots = np.concatenate([spots, own[_are_apart(own, spots, REACH * self._pitch)]])
-        spots = spots[_are_apart(spots, found.position[inliers], REACH * self._pitch)]
+        spots = np.concatenate([spots, own[_are_apart(own, spots, SEARCH_RADIUS_PITCHES * self._pitch)]])
+        spots = spots[_are_apart(spots, found.position[inliers], SEARCH_RADIUS_PITCHES * self._pitch)]
         found.position[~inliers], found.seen[~inliers] = self._position[~inliers], False
-        reach = np.minimum(REACH * self._apart, self._farthest)
+        reach = np.minimum(SEARCH_RADIUS_PITCHES * self._apart, self._farthest)
         marks, chosen = grow(found.position, inliers, spots, self._interpolator, reach)
         if len(marks):
             found.put(marks, self._templates.align(image, spots[chosen], marks))

@@ -19,24 +19,24 @@ import numpy as np
 
 from tactflow.vision.arrays import Floats, Floats32, Indices
 from tactflow.vision.compiled import helper, kernel
-from tactflow.vision.pose.imprint import BLOCKS, PATCH, Imprint, Template
+from tactflow.vision.pose.imprint import MIN_PATCH_CELLS, PATCHES_PER_SIDE, Imprint, Template
 from tactflow.vision.pose.rigid import rigid, vector
 
-STEPS: Final = 12
+MAX_STEPS: Final = 12
 """Largest number of steps of Gauss-Newton."""
-CONVERGED: Final = 0.3
+MIN_STEP_STDERRS: Final = 0.3
 """Length of the last step, in standard errors: it need not be tested."""
-FREE: Final = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
+MOTION_PRIOR_STDDEV: Final = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
 """Prior standard deviation of a motion, mm and radians."""
-PRIOR: Final = np.column_stack([np.diag(1 / FREE), np.zeros(6)])
+PRIOR_ROWS: Final = np.column_stack([np.diag(1 / MOTION_PRIOR_STDDEV), np.zeros(6)])
 """(6, 7): rows of the system, see `_Comparison`, for the prior; errors are 0."""
-NORMAL_NOISE: Final = 0.02
+NORMAL_STDDEV_RAD: Final = 0.02
 """Standard deviation of the common error of the normals of a patch, 1 degree: weights the parts before
 residuals are known. Normals on other sensors of a kind err by 1 to 4 degrees, mostly alike in both
 imprints."""
-HEIGHT_NOISE: Final = 0.005
+HEIGHT_STDDEV_MM: Final = 0.005
 """Standard deviation of the change of mean height, mm, in addition to that from the scale of heights."""
-FEWEST: Final = 12
+MIN_POINTS: Final = 12
 """Smallest number of points of the template that both imprints show."""
 
 
@@ -98,11 +98,11 @@ def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> A
     if found is None:
         return None
     scale = 1.0
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         information = found.system[:6, :6]
         step = np.asarray(scale * np.linalg.solve(information, -found.system[:6, 6]), np.float64)
         tried = motion @ rigid(step)
-        if step @ information @ step < CONVERGED**2:
+        if step @ information @ step < MIN_STEP_STDERRS**2:
             motion = tried
             break
         better = _compared(template, now, tried, gel)
@@ -113,7 +113,7 @@ def align(template: Template, now: Imprint, start: Floats, gel: Gel | None) -> A
             motion, found, scale = tried, better, 1.0
     total = float(found.weight.sum())
     misfit = float(found.weight @ (found.error**2).sum(axis=1))
-    noise = max(misfit, 2 * total * NORMAL_NOISE**2)
+    noise = max(misfit, 2 * total * NORMAL_STDDEV_RAD**2)
     honest = _efficiency(found, template.blocks) * _without_noise(found.by_normals, noise, template)
     return Alignment(
         motion,
@@ -135,16 +135,16 @@ def _compared(template: Template, now: Imprint, motion: Floats, gel: Gel | None)
         error, weight, normals, height, totals,
     )  # fmt: skip
     shown, mean = int(totals[0]), height / totals[1] if totals[1] else height
-    if shown < FEWEST:
+    if shown < MIN_POINTS:
         return None
-    patches = min(BLOCKS**2, shown * template.every / PATCH**2)
-    unit = patches / (NORMAL_NOISE**2 * totals[1])
+    patches = min(PATCHES_PER_SIDE**2, shown * template.every / MIN_PATCH_CELLS**2)
+    unit = patches / (NORMAL_STDDEV_RAD**2 * totals[1])
     normals *= unit
     weight *= unit
     rows = np.empty((7 if gel is None else 10, 7))
-    rows[:6] = PRIOR
-    rows[:6, 6] = vector(motion) / FREE
-    rows[6] = mean[:7] / math.hypot(HEIGHT_NOISE, now.error * mean[7])
+    rows[:6] = PRIOR_ROWS
+    rows[:6, 6] = vector(motion) / MOTION_PRIOR_STDDEV
+    rows[6] = mean[:7] / math.hypot(HEIGHT_STDDEV_MM, now.error * mean[7])
     if gel is not None:
         rows[7:] = _gel_rows(template, now, gel, motion)
     return _Comparison(shown, error, weight, normals[:6, :6], normals + rows.T @ rows)
@@ -249,6 +249,6 @@ def _efficiency(found: _Comparison, blocks: Indices) -> float:
 def _without_noise(information: Floats, misfit: float, template: Template) -> Floats:
     """Information (6, 6) less that of the noise in the template's gradients, which would seem to hold a
     smooth surface in place. Half of the misfit is the template's."""
-    patch = PATCH * math.sqrt(float(np.prod(template.imprint.cell)))
+    patch = MIN_PATCH_CELLS * math.sqrt(float(np.prod(template.imprint.cell)))
     values, axes = np.linalg.eigh(information - misfit / (2 * patch**2) * template.levers)
     return np.asarray((axes * np.maximum(values, 0)) @ axes.T)

@@ -8,25 +8,25 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from tactflow.vision.arrays import Floats, Mask
-from tactflow.vision.flow.displacement_field import CELL, DisplacementField
+from tactflow.vision.flow.displacement_field import CELL_PITCHES, DisplacementField
 from tactflow.vision.geometry.similarity import as_complex, fit_similarity
-from tactflow.vision.pose.align import FREE, Alignment, Gel, align
+from tactflow.vision.pose.align import MOTION_PRIOR_STDDEV, Alignment, Gel, align
 from tactflow.vision.pose.imprint import Imprint, Template, imprint_of, template_of
 from tactflow.vision.pose.rigid import adjoint, inverse, vector
 from tactflow.vision.types import Depth, Pose, Scale
 
-OVERLAP: Final = 0.7
+MIN_OVERLAP: Final = 0.7
 """A keyframe that shows a smaller share of the present contact, of object or gel, is replaced."""
-LEAST: Final = 30
+MIN_CELLS: Final = 30
 """Smallest number of cells inside the rim of a tracked object: a contact of 25 px."""
-TOLERATED: Final = 82.0
+MAX_MISFIT: Final = 82.0
 """Largest misfit due to errors of the expected size: the mean of chi squared with 44 degrees of freedom (25
 patches, two components, six unknowns) plus four standard deviations."""
-UNLIKE: Final = 0.6
+MAX_RESIDUAL: Final = 0.6
 """Residual of the normals, over their spread, above which an imprint is of another object."""
-DEPTH_ERROR: Final = 0.1
+DEFAULT_HEIGHT_ERROR: Final = 0.1
 """Relative error of heights with an unknown error."""
-BY_SLOPES: Final = np.array([0, 0, 1, 1, 1, 0])
+SLOPE_ERROR_PARTS: Final = np.array([0, 0, 1, 1, 1, 0])
 """Parts of a small motion with the relative error of all slopes and heights: height and tilts."""
 _TO_DEGREES: Final = np.array([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
 """Degrees per radian of a small motion's last three parts."""
@@ -107,7 +107,7 @@ class PoseTracker:
         seq : of the frame. mask : (H, W) uint8, 255 in contact. slipping : whether it slides over the gel.
         """
         frame = self._seen(depth, mask, field)
-        if frame is None or frame.imprint.area < LEAST:
+        if frame is None or frame.imprint.area < MIN_CELLS:
             self.reset()
             return None
         key = self._key
@@ -119,20 +119,20 @@ class PoseTracker:
         self._slid |= slipping
         found, gel = self._aligned(key, frame)
         if found is None:
-            lost = self._pose("lost", self._last, key.covariance + np.diag(FREE**2))
+            lost = self._pose("lost", self._last, key.covariance + np.diag(MOTION_PRIOR_STDDEV**2))
             self.reset()
             return lost
         motion, covariance, by_slopes = self._since_start(key, found)
         self._last = motion
         overlap = found.overlap if gel is None else min(found.overlap, gel.overlap)
-        if overlap < OVERLAP or (self._slid and not slipping):
+        if overlap < MIN_OVERLAP or (self._slid and not slipping):
             self._key = self._keyframe(frame, template_of(frame.imprint), motion, covariance, by_slopes)
             self._slid = slipping
         error = frame.imprint.error
         return self._pose("tracked", motion, covariance + error**2 * np.outer(by_slopes, by_slopes))
 
     def _seen(self, depth: Depth, mask: Mask, field: DisplacementField | None) -> _Frame | None:
-        error = DEPTH_ERROR
+        error = DEFAULT_HEIGHT_ERROR
         if depth.greatest_stderr is not None and depth.greatest > 0:
             error = depth.greatest_stderr / depth.greatest
         imprint = imprint_of(depth.heights, mask, self._scale, error)
@@ -145,9 +145,9 @@ class PoseTracker:
         """The alignment, and the gel that it used."""
         gel = None if self._slid else self._same_gel(key.frame, now)
         found = self._matched(key, now, gel)
-        if gel is not None and (found is None or found.misfit > TOLERATED):
+        if gel is not None and (found is None or found.misfit > MAX_MISFIT):
             without = self._matched(key, now, None)
-            if without is not None and without.misfit <= TOLERATED:
+            if without is not None and without.misfit <= MAX_MISFIT:
                 # The object does not move with the gel below it.
                 self._slid = True
                 return without, None
@@ -158,7 +158,7 @@ class PoseTracker:
         start = self._last @ key.back
         start[:3, 3] -= key.center
         found = align(key.template, now.imprint, start, gel)
-        return found if found is not None and found.residual < UNLIKE * key.template.signal else None
+        return found if found is not None and found.residual < MAX_RESIDUAL * key.template.signal else None
 
     def _keyframe(
         self, frame: _Frame, template: Template, motion: Floats, covariance: Floats, by_slopes: Floats
@@ -175,7 +175,7 @@ class PoseTracker:
         motion = found.motion @ key.motion
         motion[:3, 3] += key.center
         covariance = key.covariance + key.carry @ found.covariance @ key.carry.T
-        return motion, covariance, key.by_slopes + key.carry @ (BY_SLOPES * vector(found.motion))
+        return motion, covariance, key.by_slopes + key.carry @ (SLOPE_ERROR_PARTS * vector(found.motion))
 
     def _same_gel(self, before: _Frame, now: _Frame) -> Gel | None:
         """How the gel that is in contact in both frames has moved."""
@@ -194,7 +194,9 @@ class PoseTracker:
         # The residual of the rigid motion; displacements a pitch apart are independent.
         square = float(share @ np.abs(new - fit.mean) ** 2)
         stretch = (fit.spread + square) / 2 - abs(fit.slope) * fit.spread
-        variance = (old_stderr**2 + stderr**2) * float(self._mm.prod()) + stretch / max(total * CELL**2, 1.0)
+        variance = (old_stderr**2 + stderr**2) * float(self._mm.prod()) + stretch / max(
+            total * CELL_PITCHES**2, 1.0
+        )
         overlap = total / float(new_share.sum())
         return Gel(fit.middle, fit.mean, cmath.phase(fit.slope), variance, fit.spread, overlap)
 
