@@ -121,6 +121,11 @@ class Record(OutputSink, Recorder):
         if self.params.begins == "start":
             self._open_file(expanded(self.params.path), self.params.overwrite)
 
+    def begin(self) -> None:
+        """Empty the file, if it is replaced, and write what precedes the frames."""
+        if self._file is not None:
+            self._file.begin()
+
     @property
     def recording(self) -> bool:
         """Whether a file is being written. With a ring, this ends by itself."""

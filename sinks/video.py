@@ -52,6 +52,11 @@ class Video(OutputSink):
         p = self.params
         self._film = Film(expanded(p.path), fps=p.fps, overwrite=p.overwrite)
 
+    def begin(self) -> None:
+        """Empty the file, if it is replaced."""
+        if self._film is not None:
+            self._film.begin()
+
     def counters(self) -> dict[str, int]:
         """frames : written so far."""
         return {"frames": 0 if self._film is None else self._film.frames}

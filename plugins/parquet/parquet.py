@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from itertools import repeat
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import orjson
@@ -75,7 +76,7 @@ class Parquet(OutputSink):
         self._schemas: dict[str, pa.Schema] = {}
         self._rows: Rows = {name: [] for name in TABLES}
         self._flushed = 0.0
-        self._next = 0
+        self._next: int | None = None
         self._counts = {"frames": 0, "parts": 0}
 
     def open(self) -> None:
@@ -95,7 +96,11 @@ class Parquet(OutputSink):
         try:
             for name in TABLES:
                 make_folder(self._folder / name)
-            self._check_existing()
+            if self.params.refuses_existing and self._parts():
+                raise StageError(
+                    f"{self._folder}: already holds tables; set overwrite: true to replace them, append: "
+                    "true to extend them, or choose another folder"
+                )
         except OSError as error:
             raise cannot_write(self._folder, error) from error
         files = kept_files(self._control).items()
@@ -103,6 +108,22 @@ class Parquet(OutputSink):
         about = {"schema": SCHEMA, **facts(self._sensor, self._control), **texts}
         self._schemas = _make_schemas(about)
         self._flushed = time.monotonic()
+
+    def begin(self) -> None:
+        """Remove tables that are replaced. Called once, or by the first `write`."""
+        if self._next is not None:
+            return
+        present = self._parts()
+        if self.params.overwrite:
+            try:
+                # Frames first, so that none remains without its rows in the other tables.
+                for part in reversed(present):
+                    part.unlink()
+            except OSError as error:
+                raise cannot_write(self._folder, error) from error
+            present = []
+        numbers = (part.stem.removeprefix("part-") for part in present)
+        self._next = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
 
     def counters(self) -> Mapping[str, int]:
         """frames : in complete parts. parts : per table."""
@@ -113,6 +134,7 @@ class Parquet(OutputSink):
 
         Raises StageError if the part cannot be written, as on a full disk. Earlier parts stay.
         """
+        self.begin()
         message = orjson.loads(encode_message(result, detail=True))
         for name, rows in _rows(message).items():
             self._rows[name].extend(rows)
@@ -125,21 +147,9 @@ class Parquet(OutputSink):
         with self._lock:
             self._flush()
 
-    def _check_existing(self) -> None:
-        """Refuse existing tables, remove them, or continue them."""
-        present = [part for name in TABLES for part in (self._folder / name).glob("part-*.parquet")]
-        if present and self.params.refuses_existing:
-            raise StageError(
-                f"{self._folder}: already holds tables; set overwrite: true to replace them, append: true to "
-                "extend them, or choose another folder"
-            )
-        if self.params.overwrite:
-            # Frames first, so that none remains without its rows in the other tables.
-            for part in reversed(present):
-                part.unlink()
-            present = []
-        numbers = (part.stem.removeprefix("part-") for part in present)
-        self._next = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
+    def _parts(self) -> list[Path]:
+        """The parts of all tables, those of `frames` last."""
+        return [part for name in TABLES for part in (self._folder / name).glob("part-*.parquet")]
 
     def _flush(self) -> None:
         import pyarrow.parquet as pq
@@ -147,7 +157,7 @@ class Parquet(OutputSink):
         rows, self._rows = self._rows, {name: [] for name in TABLES}
         self._flushed = time.monotonic()
         count = len(rows["frames"])
-        if not count:
+        if not count or self._next is None:
             return
         try:
             for name, schema in self._schemas.items():

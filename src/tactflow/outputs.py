@@ -88,7 +88,8 @@ def open_output(
 ) -> BufferedRandom:
     """Open a file for appending, create its folder, and lock it against other runs until it is closed.
 
-    overwrite, append : truncate or continue an existing file, which is otherwise refused unless it is empty.
+    overwrite, append : accept an existing file, which is otherwise refused unless it is empty. Its content
+        stays until the caller truncates it, once nothing else can refuse the run (`Sink.begin`).
     advice : a remedy for an existing file besides overwrite, such as `append: true to continue it, `.
 
     Raises
@@ -106,9 +107,7 @@ def open_output(
     try:
         if not lock(file.fileno()):
             raise _taken(path)
-        if overwrite:
-            file.truncate(file.seek(0))
-        elif not append and os.fstat(file.fileno()).st_size:
+        if not (overwrite or append) and os.fstat(file.fileno()).st_size:
             raise StageError(
                 f"{path}: this file exists; set overwrite: true to replace it, {advice}or give another path"
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,17 @@ def look_at_lines(path: Path) -> str:
     text = path.read_text()
     assert text == "" or text.endswith("\n"), "a line is cut off"
     seqs = [json.loads(line)["seq"] for line in text.splitlines()]
+    assert seqs == sorted(set(seqs))
+    return f"{len(seqs)} lines"
+
+
+def look_at_rows(path: Path) -> str:
+    """Rows of a table, all of which are complete and in order."""
+    text = path.read_text()
+    assert text == "" or text.endswith("\n"), "a row is cut off"
+    header, *rows = csv.reader(text.splitlines()) if text else ([],)
+    assert {len(row) for row in rows} <= {len(header)}
+    seqs = [int(row[header.index("seq")]) for row in rows]
     assert seqs == sorted(set(seqs))
     return f"{len(seqs)} lines"
 
@@ -78,6 +90,7 @@ class Kind:
 
 KINDS = {
     "jsonl": Kind("out.jsonl", "path", {"flush": 0}, look_at_lines),
+    "csv": Kind("out.csv", "path", {"flush": 0}, look_at_rows),
     "images": Kind("pictures", "folder", PICTURE, look_at_pictures),
     "video .avi": Kind("film.avi", "path", PICTURE, look_at_film),
     "video .mkv": Kind("film.mkv", "path", PICTURE, look_at_film),

@@ -18,6 +18,7 @@ from tactflow.outputs import locked_folder
 from tests.faults.outputs import KINDS, settings_of
 from tests.faults.rig import FRAMES, At, Seen, array, fill, run, small_disk, write_pipeline
 
+WRITES = ("jsonl", "csv", "images", "video .avi", "record", "parquet")
 THEIRS = "somebody else's"
 
 
@@ -52,6 +53,13 @@ def check_promise(kind: str, output: Path, seen: Seen) -> str:
     [
         (
             "jsonl",
+            "disk full",
+            3,
+            "No space left.* lines written before are complete; free some space",
+            "lines",
+        ),
+        (
+            "csv",
             "disk full",
             3,
             "No space left.* lines written before are complete; free some space",
@@ -93,7 +101,7 @@ def test_something_happens_to_an_output_in_mid_run(
     Seen(seen.exit, seen.said, left).must_be(code, said, kept)
 
 
-@pytest.mark.parametrize("kind", ["jsonl", "images", "video .avi", "record", "parquet"])
+@pytest.mark.parametrize("kind", WRITES)
 def test_a_folder_that_is_read_only_is_refused_at_the_start(kind: str, tmp_path: Path) -> None:
     with ExitStack() as stack:
         if os.geteuid() == 0:
@@ -111,7 +119,7 @@ def test_a_folder_that_is_read_only_is_refused_at_the_start(kind: str, tmp_path:
 @pytest.mark.parametrize(
     ("kind", "existing"),
     [
-        *((kind, "overwrite") for kind in ("jsonl", "images", "video .avi", "record", "parquet")),
+        *((kind, "overwrite") for kind in WRITES),
         *(("jsonl", "append"), ("record", None)),
     ],
 )
@@ -132,7 +140,7 @@ def test_a_second_run_to_the_same_output_is_refused(kind: str, existing: str | N
     assert KINDS[kind].look(output).startswith(f"{FRAMES} ")
 
 
-@pytest.mark.parametrize("kind", ["jsonl", "images", "video .avi", "record", "parquet"])
+@pytest.mark.parametrize("kind", WRITES)
 def test_existing_output_is_replaced_only_when_asked(kind: str, tmp_path: Path) -> None:
     output, source = tmp_path / KINDS[kind].output, str(array(tmp_path, 9))
     sinks = settings_of(kind, output)
@@ -144,6 +152,24 @@ def test_existing_output_is_replaced_only_when_asked(kind: str, tmp_path: Path) 
     _, seen = run(tmp_path, {kind.split()[0]: settings | {"overwrite": True}}, source=source, max_frames=5)
     seen.must_be(0)
     assert KINDS[kind].look(output).startswith("9 " if kind == "images" else "5 ")
+
+
+@pytest.mark.parametrize("kind", [kind for kind in WRITES if kind != "images"])
+def test_a_run_that_another_sink_refuses_leaves_earlier_output_alone(kind: str, tmp_path: Path) -> None:
+    output, source = tmp_path / KINDS[kind].output, str(array(tmp_path, 9))
+    sinks = settings_of(kind, output)
+    run(tmp_path, sinks, source=source)
+    ((id_, settings),) = sinks.items()
+    refused = tmp_path / "theirs.jsonl"
+    refused.write_text("{}\n")
+    again = {id_: settings | {"overwrite": True}, "last": {"use": "jsonl", "path": str(refused)}}
+    _, seen = run(tmp_path, again, source=source)
+    seen.must_be(3, "theirs.jsonl: this file exists")
+    assert KINDS[kind].look(output).startswith("9 ")
+    refused.unlink()
+    _, seen = run(tmp_path, again, source=source, max_frames=5)
+    seen.must_be(0)
+    assert KINDS[kind].look(output).startswith("5 ")
 
 
 def test_a_second_export_to_the_same_folder_is_refused(

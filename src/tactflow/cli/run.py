@@ -46,6 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--jsonl", metavar="PATH", help="also write a result message for each frame ('-': standard output)"
     )
     parser.add_argument(
+        "--csv", metavar="PATH", help="also write a table with a row for each frame ('-': standard output)"
+    )
+    parser.add_argument(
         "--video",
         metavar="PATH",
         help="also write a video with the results drawn on the pictures (.mp4, .avi, ...)",
@@ -113,7 +116,7 @@ def _arguments(args: argparse.Namespace, file: Path, pipeline: Pipeline, sinks: 
 
 def _added_sinks(args: argparse.Namespace, sensor: str | None) -> Sinks:
     """The sinks that options add, for one of several sensors, or, for None, the only one."""
-    paths = {"jsonl": args.jsonl, "video": args.video, "record": args.out}
+    paths = {"jsonl": args.jsonl, "csv": args.csv, "video": args.video, "record": args.out}
     sinks: Sinks = {}
     for use, path in paths.items():
         if path is not None:

@@ -44,16 +44,24 @@ class Film:
         self._held: list[tuple[float, NDArray[np.uint8]]] = []
         self._writer: cv2.VideoWriter | None = None
         self._size: tuple[int, int] | None = None
+        self._begun = False
         # OpenCV opens the file again; this one holds the lock.
         self._file = open_output(path, overwrite=overwrite)
         self._ours = os.fstat(self._file.fileno())
         self._codec = CODECS[path.suffix.lower()]
+
+    def begin(self) -> None:
+        """Empty a file that is replaced. Called once, or by the first `add`."""
+        if not self._begun:
+            self._begun = True
+            self._file.truncate(0)
 
     def add(self, t: float, picture: NDArray[np.uint8]) -> None:
         """Add one frame. t : its time, s. picture : (H, W, 3) uint8 BGR.
 
         Also refuses a picture of another size, and ends the film when the disk is nearly full.
         """
+        self.begin()
         size = (picture.shape[1], picture.shape[0])
         self._size = self._size or size
         if size != self._size:
@@ -69,7 +77,10 @@ class Film:
             self._start(*size)
 
     def close(self) -> None:
-        """Finish the file, and check that all frames are in it; without any, it is removed."""
+        """Finish the file, and check that all frames are in it; without any, it is removed.
+
+        Without `begin`, a file that would have been replaced stays.
+        """
         try:
             if self._held and self._size is not None:
                 self._start(*self._size)
@@ -83,7 +94,7 @@ class Film:
             problem = film_problem(self._path, self.frames)
             if problem is not None:
                 raise StageError(f"{self._path}: {problem}; is the disk full, or the size of files limited?")
-        elif self.frames == 0:
+        elif self.frames == 0 and (self._begun or self._ours.st_size == 0):
             self._path.unlink(missing_ok=True)
 
     def _start(self, width: int, height: int) -> None:

@@ -13,7 +13,7 @@ engine. A constructor may also take, by name:
     calibration : Path | None the sensor's calibration file, if the pipeline names one
 
 In each run, `open()` is called once before the first frame, and `close()` once at the end for every part
-whose `open()` was started, even after an error.
+whose `open()` was started, even after an error. `begin()` of a sink follows when all parts are open.
 """
 
 from __future__ import annotations
@@ -218,6 +218,12 @@ class Sink(Part):
     takes_references: ClassVar[bool] = False
     """Whether it gets every reference frame even if it wants none, and a reference image that is not part of
     the source (`Frame.seq` -1)."""
+
+    def begin(self) -> None:
+        """Replace earlier output. Called once when every part of the run is open, before the first frame.
+
+        If a part cannot be opened, the run ends without it, and earlier output stays.
+        """
 
     def wants(self) -> bool:
         """Whether it wants the next frame. Values that no sink wants are not computed.

@@ -167,3 +167,8 @@ class Pipeline:
     def sinks(self) -> Sequence[Node]:
         """The nodes that publish or write."""
         return [node for node in self.nodes.values() if node.component.kind == "sink"]
+
+    @property
+    def ports(self) -> frozenset[str]:
+        """Names of the outputs of all stages."""
+        return frozenset(port.name for node in self.nodes.values() for port in node.component.ports.outputs)

@@ -6,8 +6,8 @@ import logging
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -206,6 +206,10 @@ class Runner:
             self.nodes[node.id] = RunningNode(
                 node, instance, self.slots, skipping=pipeline.skipping, check=self.check
             )
+        for running in self.nodes.values():
+            if running.sink is not None:
+                with _located(running.node, StageError):
+                    running.sink.begin()
 
     def _build(self, node: Node, kind: type[TactflowError]) -> Part:
         """Construct and open the part of a node."""
@@ -217,20 +221,10 @@ class Runner:
             "control": self,
             "calibration": pipeline.calibration,
         }
-        try:
+        with _located(node, kind):
             instance = build(node.component.make, node.params, offered)
             self._opened.append((node.id, instance))
             instance.open()
-        except kind as error:
-            raise kind(f"{node.id} ({node.mark}): {error}") from error
-        except TactflowError:
-            raise
-        except Exception as error:
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            raise kind(
-                f"{node.id} ({node.mark}): cannot be opened: {type(error).__name__}: {error}\n"
-                f"  in {place.filename}:{place.lineno}"
-            ) from error
         return instance
 
     def _start(self) -> None:
@@ -401,6 +395,23 @@ class Runner:
             "links": {link.name: link.stats() for link in self._links},
             "latency_ms": {"p50": self.latency.milliseconds(0.5), "p99": self.latency.milliseconds(0.99)},
         }
+
+
+@contextmanager
+def _located(node: Node, kind: type[TactflowError]) -> Iterator[None]:
+    """Add the node and its line to errors of opening it."""
+    try:
+        yield
+    except kind as error:
+        raise kind(f"{node.id} ({node.mark}): {error}") from error
+    except TactflowError:
+        raise
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise kind(
+            f"{node.id} ({node.mark}): cannot be opened: {type(error).__name__}: {error}\n"
+            f"  in {place.filename}:{place.lineno}"
+        ) from error
 
 
 def _wants(node: RunningNode, frame: Frame) -> bool:

@@ -6,7 +6,8 @@ concatenated; values missing in a message are null.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ field has thousands of numbers per frame."""
 PAIRS = {"size": ("width", "height"), "axes": ("major", "minor"), "shear": ("1", "2"), "shear_mm": ("1", "2")}
 """Pair -> names of its parts, if not x and y."""
 XYZ = ("x", "y", "z")
+UNIT = re.compile(r"(?:^|, )(px(?:\^2|/s)?|mm(?:\^[23]|/s| per px)?|degrees|s|N)(?=[;:, ]|$)")
+"""Unit in a description, which is its first words or stands behind a comma."""
 
 
 class Column(NamedTuple):
@@ -41,6 +44,24 @@ class Column(NamedTuple):
             if value is None:
                 return None
         return list(value.items()) if self.kind == "words" else value
+
+    @property
+    def unit(self) -> str:
+        """The unit that the description names; empty without one, or where parts of it differ.
+
+        >>> Column("t", ("t",), "number", "capture time, s: from the start").unit
+        's'
+        """
+        units = set(UNIT.findall(self.description))
+        return units.pop() if len(units) == 1 else ""
+
+    @property
+    def heading(self) -> str:
+        """The name as in the message, with the unit, such as `contact.center.x [px]`."""
+        words = [key for key in self.path if isinstance(key, str)]
+        if len(words) < len(self.path):
+            words.append(self.name.removeprefix("_".join(words) + "_"))
+        return ".".join(words) + (f" [{self.unit}]" if self.unit else "")
 
 
 MARKER_COLUMNS = (
@@ -78,6 +99,25 @@ def contact_columns() -> Sequence[Column]:
     """
     schema = message_schema()
     return tuple(_columns(schema["properties"]["contacts"]["items"], schema["$defs"], (), ()))
+
+
+def scalar_columns(ports: Collection[str] | None = None, *, detail: bool = True) -> Sequence[Column]:
+    """The columns of `frames` that hold a number or a word; `skipped` counts as one.
+
+    ports : outputs of the stages that run; leaves out parts of the message that need another port. None: all.
+    detail : include the columns of detailed messages.
+
+    >>> [column.heading for column in scalar_columns((), detail=False)][5:8]
+    ['contact.area [px^2]', 'contact.center.x [px]', 'contact.center.y [px]']
+    """
+    always = message_schema()["required"]
+    return [
+        column
+        for column in frame_columns()
+        if column.kind not in ("numbers", "points")
+        and (ports is None or column.path[0] in ports or column.path[0] in always)
+        and (detail or not column.description.endswith("detail)"))
+    ]
 
 
 def _columns(

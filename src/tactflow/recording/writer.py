@@ -59,26 +59,37 @@ class RecordingWriter:
     ) -> None:
         self.path = path
         self.frames = self.begins = self.bytes = 0
+        self._sensor = sensor
+        self._facts = facts or {}
+        self._files = files or {}
+        self._channels: dict[str, int] = {}
         self._file = open_output(path, overwrite=overwrite)
         self._writer = Writer(self._file, chunk_size=NEVER, compression=CompressionType.NONE)
-        self._writer.start(profile="", library="tactflow")
+
+    def begin(self) -> None:
+        """Empty a file that is replaced, and write what precedes the frames. Called once, or by the first
+        `write`."""
+        if self._channels:
+            return
         with self._errors():
-            self._describe(sensor, facts or {}, files or {})
+            self._file.truncate(self._file.seek(0))
+            self._writer.start(profile="", library="tactflow")
+            self._describe()
             self._flush()
 
-    def _describe(self, sensor: str, facts: Mapping[str, str], files: Mapping[str, bytes]) -> None:
+    def _describe(self) -> None:
         writer = self._writer
-        self._channels: dict[str, int] = {}
         for name, kind in channel_types().items():
             schema = writer.register_schema(kind.name, *kind.schema)
-            self._channels[name] = writer.register_channel(f"/{sensor}/{name}", kind.packing, schema)
-        writer.add_metadata("tactflow", dict(facts))
+            self._channels[name] = writer.register_channel(f"/{self._sensor}/{name}", kind.packing, schema)
+        writer.add_metadata("tactflow", dict(self._facts))
         schema_file = {"message.schema.json": json.dumps(message_schema(), indent=1).encode()}
-        for name, data in {**schema_file, **files}.items():
+        for name, data in {**schema_file, **self._files}.items():
             writer.add_attachment(0, 0, name, MEDIA_TYPES[Path(name).suffix], data)
 
     def write(self, entry: Entry, time: int | None = None) -> None:
         """Write the messages of a frame. time : log time, ns, if not that of the frame."""
+        self.begin()
         at = max(entry.time if time is None else time, 0)
         with self._errors():
             for name, data in entry.data.items():
@@ -95,7 +106,10 @@ class RecordingWriter:
         self.frames += 1
 
     def finish(self) -> None:
-        """Add the index and close the file."""
+        """Add the index and close the file. Without `begin`, it stays as it was."""
+        if not self._channels:
+            self.close()
+            return
         with self._errors():
             self._refuse_interference()
             self._writer.finish()  # type: ignore[no-untyped-call]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -128,6 +129,25 @@ def test_tables_are_whole_only_with_all_their_parts(call: Call) -> None:
     call(format_="parquet")
     assert "1 done now, 1 done before" in call.stderr
     assert len(list(tables.rglob("*.parquet"))) == 3
+
+
+def test_without_the_package_of_parquet_a_batch_writes_csv(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert main(["batch", "p.yaml", "rec", "--out", "out"]) == 0
+    out = call.folder / "out"
+    with (out / "runs.csv").open(newline="") as file:
+        runs = list(csv.DictReader(file))
+    assert [(run["name"], run["touching_frames"]) for run in runs] == [
+        ("a/press.npy", "4"),
+        ("b/press.npy", "4"),
+    ]
+    with (out / runs[1]["result"]).open(newline="") as file:
+        areas = [row["contact.area [px^2]"] for row in csv.DictReader(file)]
+    assert [area != "" for area in areas] == [False] * 2 + [True] * 4
+    assert call(format_="parquet") == 2
+    assert "pip install 'tactflow[parquet]'; or use --format csv or jsonl" in call.stderr
 
 
 def test_one_that_fails_stops_no_other_and_is_tried_again(call: Call) -> None:

@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import get_args
 
 from tactflow.cli.options import add_overrides, add_quiet, add_sensor, writing
 from tactflow.config.load import sensor_names
@@ -19,9 +20,9 @@ from tactflow.system.arguments import positive
 from tactflow.system.signals import INTERRUPTED, ending_handled
 from tactflow.system.terminal import progress_bar, say
 from tactflow.tools.batch.recordings import Recording, find_recordings
-from tactflow.tools.batch.report import require_pyarrow, write_page, write_runs
+from tactflow.tools.batch.report import chosen_format, write_page, write_runs
 from tactflow.tools.batch.run import Batch, Result, make_plan
-from tactflow.tools.batch.store import Outcome, Store
+from tactflow.tools.batch.store import Format, Outcome, Store
 from tactflow.tools.batch.work import Request, resolved
 from tactflow.tools.batch.workers import DaskCluster, LocalProcesses
 
@@ -41,9 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument(
         "--format",
-        choices=("parquet", "jsonl"),
-        default="parquet",
-        help="of the results and of the table of runs (default: %(default)s)",
+        choices=get_args(Format),
+        help="of the results and of the table of runs (default: parquet, or csv where pyarrow is missing)",
     )
     add_overrides(parser)
     add_sensor(parser)
@@ -74,15 +74,14 @@ def run(args: argparse.Namespace) -> int:
     ConfigError : the command line or the pipeline is wrong; nothing was started.
     StageError : the table or the page cannot be written.
     """
-    if args.format == "parquet":
-        require_pyarrow()
+    format_, note = chosen_format(args.format)
     file, words = _pipeline_and_sources(args.words)
     sensors = sensor_names(file, args.overrides)
     if len(sensors) > 1 and args.sensor is None:
         raise ConfigError(
             f"{file} has the sensors {', '.join(sensors)}; a recording is of one: give --sensor {sensors[0]}"
         )
-    request = resolved(file, args.overrides, args.sensor, args.format)
+    request = resolved(file, args.overrides, args.sensor, format_)
     recordings, store = find_recordings(words), Store(args.out.absolute())
     tell: Callable[[str], None] = (lambda _: None) if args.quiet else say
     signals: list[int] = []
@@ -92,6 +91,8 @@ def run(args: argparse.Namespace) -> int:
         ending_handled(lambda signal, _: signals.append(signal)),
     ):
         plan = make_plan(store, recordings[number - 1 :: of], request)
+        for line in note:
+            tell(line)
         tell(f"{request.file}: {plan}{'' if of == 1 else f' (part {number} of {of})'}")
         result = Result(dict(plan.done))
         if plan.left and not signals:
@@ -109,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
             tell(line)
         runs = [(recording, _outcome(recording, result, store, request)) for recording in recordings]
         with writing(store.path):
-            write_runs(store, runs, args.format)
+            write_runs(store, runs, format_)
             page = write_page(store, runs, f"{file.stem}: {len(runs)} recordings")
         tell(f"report: {page}")
     if signals and result.undone:

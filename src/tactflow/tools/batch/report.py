@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from html import escape
@@ -30,10 +31,19 @@ _TYPES = {"int": "int64", "float": "float64"}
 Runs = Sequence[tuple[Recording, Outcome]]
 
 
-def require_pyarrow() -> None:
-    """Raise ConfigError with installation instructions if pyarrow is missing."""
-    if problem := missing("Parquet tables", "parquet", ["pyarrow"]):
-        raise ConfigError(f"{problem}; or use --format jsonl, which needs no package")
+def chosen_format(requested: Format | None) -> tuple[Format, Sequence[str]]:
+    """The requested format, or else Parquet if pyarrow is installed, or else CSV; and a note about that.
+
+    Raises ConfigError with installation instructions if Parquet is requested and pyarrow is missing.
+    """
+    problem = missing("Parquet tables", "parquet", ["pyarrow"])
+    if requested is not None and not (requested == "parquet" and problem):
+        return requested, ()
+    if requested is not None:
+        raise ConfigError(f"{problem}; or use --format csv or jsonl, which need no package")
+    if problem:
+        return "csv", (f"results are written as CSV; {problem}",)
+    return "parquet", ()
 
 
 def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
@@ -44,6 +54,11 @@ def write_runs(store: Store, runs: Runs, format_: Format) -> Path:
     with completed(path) as partial:
         if format_ == "jsonl":
             partial.write_bytes(b"".join(orjson.dumps(row) + b"\n" for row in rows))
+        elif format_ == "csv":
+            with partial.open("w", newline="", encoding="utf-8") as file:
+                table = csv.DictWriter(file, [column.name for column in columns], lineterminator="\n")
+                table.writeheader()
+                table.writerows(rows)
         else:
             import pyarrow as pa  # type: ignore[import-untyped]
             import pyarrow.parquet as pq  # type: ignore[import-untyped]

@@ -1,6 +1,6 @@
 """The output folder of a batch, `--out`.
 
-    results/NAME            per recording: a folder of Parquet tables, or NAME.jsonl
+    results/NAME            per recording: a folder of Parquet tables, NAME.csv or NAME.jsonl
     records/NAME.json       its outcome, written after the result
     records/NAME.0.jpg ...  its largest contacts, which the page shows
     unfinished/SHARD/       results being written; removed at the end
@@ -28,7 +28,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.system.files import completed, lock_folder, make_folder
 from tactflow.tools.batch.recordings import Recording
 
-Format = Literal["parquet", "jsonl"]
+Format = Literal["parquet", "csv", "jsonl"]
 Status = Literal["done", "failed", "not done"]
 Fingerprint = tuple[int, int]
 """Size, bytes, and modification time, ns."""

@@ -10,7 +10,7 @@ import os
 import socket
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,6 +36,8 @@ _SRC = Mark("recording", 0, 0)
 """Position of the source in error messages: it is not in the pipeline file."""
 _MAX_WARNINGS = 5
 """Warnings kept per recording; further ones are mostly repetitions."""
+RESULT_SUFFIXES: Mapping[Format, str] = {"parquet": "", "csv": ".csv", "jsonl": ".jsonl"}
+"""End of the name of a result, by format; Parquet tables are a folder."""
 _OUTPUT_ONLY = {"path", "overwrite", "append", "flush"}
 """Sink parameters that do not change the content of the output."""
 
@@ -190,7 +192,7 @@ def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, list[
         warnings="\n".join(texts) or None,
         recording_is=before,
         result_is=fingerprint(unfinished),
-        result=f"results/{unfinished.name}{'.jsonl' if task.request.format == 'jsonl' else ''}",
+        result=f"results/{unfinished.name}{RESULT_SUFFIXES[task.request.format]}",
         pictures=tuple(picture.t for picture in pictures),
     )
     return done, [picture.jpeg for picture in pictures]
