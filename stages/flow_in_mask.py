@@ -20,10 +20,11 @@ class FlowInMask(Stage):
     class Params(StageParams):
         """How the flow is measured."""
 
-        method: Literal["field", "mean"] = Field(
+        method: Literal["field", "mean", "median"] = Field(
             "field",
             description="field: the integral of the displacement field over the contact, where a stage field "
-            "stands above; mean, and where none does: the mean over the markers inside",
+            "stands above; mean, and where none does: the mean over the markers inside; median: of each "
+            "component, which a few wrong markers do not move",
         )
 
     params: Params
@@ -36,6 +37,7 @@ class FlowInMask(Stage):
         evidence: Evidence | None = None,
     ) -> Flow:
         """The flow inside the contact; its mean is None where no marker is inside, or none near."""
-        if field is None or self.params.method == "mean":
-            return flow_in_mask(markers, contact_mask)
+        if field is None or self.params.method != "field":
+            average: Literal["mean", "median"] = "median" if self.params.method == "median" else "mean"
+            return flow_in_mask(markers, contact_mask, average=average)
         return flow_of_field(field, markers, contact_mask, coarse=evidence == "dots")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Frame
+from tactflow.parameters import MarkParams
 from tactflow.ports import Image, Valid
 from tactflow.vision.markers.detection import Detection, detect_markers
 from tactflow.vision.markers.tracking import MarkerTracker
@@ -21,15 +20,9 @@ class Tracker(Stage):
 
     memory = "stateful"
 
-    class Params(StageParams):
-        """What the marks look like, and how far they may go."""
+    class Params(MarkParams):
+        """How far marks may go."""
 
-        dot: float | None = Field(
-            None, ge=1, le=200, description="radius of a mark, processed px; null finds it"
-        )
-        polarity: Literal["auto", "dark", "bright"] = Field(
-            "auto", description="marks against the gel; auto takes the better lattice"
-        )
         max_displacement: float | None = Field(
             None,
             gt=0,

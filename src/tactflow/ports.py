@@ -6,7 +6,7 @@ Besides these arrays and signals, `Frame` and the dataclasses of `tactflow.visio
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,3 +57,13 @@ Suspect = Annotated[bool, SignalPort("suspect", closed="at_rest", otherwise="rep
 
 Held = Annotated[bool, SignalPort("held", closed=None)]
 """Another signal, extended in time."""
+
+
+class ContactPorts(NamedTuple):
+    """The outputs of a stage that detects contact.
+
+    contact_mask : 255 in contact. touching : whether anything is.
+    """
+
+    contact_mask: ContactMask
+    touching: Touching

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tactflow.classic.functions import difference, mask_marker
-from tactflow.classic.stages import Difference
 from tactflow.engine.frame import Frame
+from tactflow.stages.classic_difference import ClassicDifference as Difference
 
 BRIGHTER_BY = 14
 """Smallest brightening, grey levels, that passes the script's threshold of 140."""

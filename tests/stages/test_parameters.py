@@ -39,7 +39,7 @@ WRONG: dict[str, list[dict[str, Any]]] = {
         *({"min_area": -1}, {"merge": "near"}, {"min_aera": 3}),
     ],
     "tracker": [{"dot": 0.2}, {"polarity": "red"}, {"max_displacement": 0}],
-    "flow_in_mask": [{"method": "median"}],
+    "flow_in_mask": [{"method": "mode"}],
     "visualize": [{"arrow_scale": -1}, {"view": "x"}, {"arrows": 3}, {"deepest": 0}],
 }
 

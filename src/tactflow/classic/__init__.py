@@ -1,1 +1,1 @@
-"""The original script, faithfully: its functions, and stages for `pipelines/classic.yaml`."""
+"""The original script, faithfully: the functions behind the stages `classic_*`."""

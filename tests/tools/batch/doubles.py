@@ -15,7 +15,7 @@ PIPELINE = """
 stages:
   capture: {source: "sim:idle", settle: 0}
   preprocess: {rotate: 0, downsample: 1}
-  difference: {in: {unmarked: preprocess.image}, use: "tactflow.classic.stages:Difference"}
+  difference: {in: {unmarked: preprocess.image}, use: classic_difference}
   hull: {when: touching}
 sinks: {}
 """

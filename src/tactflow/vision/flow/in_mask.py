@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from tactflow.vision.types import Flow, Markers, MarkerStatus
 MAX_UNKNOWN_SHARE: Final = 0.1
 """Largest unknown share of the variance of a mean flow. Simulated contacts within the grid of markers have
 less than 0.04; for those beyond the last markers, which have more, the mean is wrong by pixels."""
+MEDIAN_STDERR_RATIO: Final = math.sqrt(math.pi / 2)
+"""Standard error of a median over that of the mean, of many normally distributed values. Derived."""
 _MIN_SPREAD_RATIO: Final = 1e-3
 """Spread of markers across a line over that along it, 1, up to which they do not span a plane. Chosen by
 hand."""
@@ -23,13 +25,14 @@ _TRACKED: Final = int(MarkerStatus.TRACKED)
 _LOST: Final = int(MarkerStatus.LOST)
 
 
-def flow_in_mask(markers: Markers, mask: Mask) -> Flow:
+def flow_in_mask(markers: Markers, mask: Mask, *, average: Literal["mean", "median"] = "mean") -> Flow:
     """Summarise the displacement of the markers inside the contact.
 
     Parameters
     ----------
     markers : as the tracker gives them, processed pixels.
     mask : (H, W) uint8, not 0 inside the contact. A marker is inside if its *current* centre is.
+    average : "median" takes that of each component, which a few wrong markers do not move, as the mean.
 
     Returns
     -------
@@ -62,7 +65,7 @@ def flow_in_mask(markers: Markers, mask: Mask) -> Flow:
     moved = np.asarray(markers.position[chosen], np.float64) - origin
     fit = fit_similarity(as_complex(origin), as_complex(moved), np.full(len(chosen), 1 / len(chosen)))
     rest = as_complex(moved) - fit.mean
-    rotation = divergence = residual = None
+    rotation = divergence = residual = stderr = None
     parameters = 1
     # Product over squared sum of the principal scatters; about their ratio where one is small.
     squares = abs(complex((fit.away * fit.away).mean()))
@@ -72,13 +75,16 @@ def flow_in_mask(markers: Markers, mask: Mask) -> Flow:
         rotation = _rotation(fit.slope.real, fit.slope.imag)
         divergence = _divergence(fit.slope.real, fit.slope.imag)
         residual = math.sqrt(float((np.abs(rest) ** 2).mean()))
-    stderr = None
     if len(tracked) >= 2:
         # The similarity has four parameters, two for each axis; the mean has one for each.
         count = (len(chosen) - parameters) * len(tracked)
         x, y = rest.real, rest.imag
         stderr = math.sqrt(float(x @ x) / count), math.sqrt(float(y @ y) / count)
-    return Flow((fit.mean.real, fit.mean.imag), len(chosen), stderr, rotation, divergence, residual)
+    mean = fit.mean.real, fit.mean.imag
+    if average == "median":
+        mean = float(np.median(moved[:, 0])), float(np.median(moved[:, 1]))
+        stderr = stderr and (MEDIAN_STDERR_RATIO * stderr[0], MEDIAN_STDERR_RATIO * stderr[1])
+    return Flow(mean, len(chosen), stderr, rotation, divergence, residual)
 
 
 def flow_of_field(field: DisplacementField, markers: Markers, mask: Mask, *, coarse: bool = False) -> Flow:

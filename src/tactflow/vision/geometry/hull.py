@@ -80,6 +80,42 @@ def contact_parts(
     return parts
 
 
+def large_contours(mask: Mask, min_area: float) -> list[NDArray[Any]]:
+    """Outer outlines of the components of a mask (8-connected) with at least so many pixels, holes filled.
+
+    mask : (H, W) uint8, not 0 inside the contact. min_area : px^2, >= 0. Each outline is (n, 1, 2) int32, px.
+
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:30, 10:50] = mask[50:55, 10:20] = 255
+    >>> len(large_contours(mask, 1)), len(large_contours(mask, 100))
+    (2, 1)
+    """
+    check_mask(mask)
+    return [contour for contour in measure_region(mask).contours() if _filled_area(contour) >= min_area]
+
+
+def contact_of_outline(
+    contours: Contours,
+    center: tuple[float, float],
+    theta: float | None,
+    confidence: float,
+    region_area: float,
+) -> Contact:
+    """A contact with the hull of its outlines, and with centre and direction as given; it has no ellipse.
+
+    contours : of `large_contours`, at least one. center : (x, y), px. theta : of its axis, radians, from +x
+    towards +y (y down); None for no direction. confidence : of the direction, 0 to 1. region_area : px^2.
+
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:30, 10:50] = 255
+    >>> contact_of_outline(large_contours(mask, 1), (29.5, 24.5), 0.0, 0.9, 400.0).area
+    400.0
+    """
+    angle, slope = (None, None) if theta is None else axis_direction(theta)
+    polygon, area = _hull(contours)
+    return Contact(area, center, angle, slope, polygon, None, confidence, region_area)
+
+
 def _large_regions(mask: Mask, min_area: float, min_confidence: float) -> tuple[Region, Contours]:
     """The components of a mask that are large enough, and their outlines.
 
