@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from pathlib import Path
 from typing import Literal
 
 import cv2
 from pydantic import Field
 
-from tactflow.engine.contract import Output, Sink, StageParams
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Tick
 from tactflow.outputs import cannot_write, locked_folder
 from tactflow.ports import Picture
-from tactflow.system.files import expanded, next_name
+from tactflow.system.files import expanded
 
 UNFINISHED = ".unfinished"
 """Name of a picture until it is complete."""
@@ -37,6 +38,11 @@ class Images(Sink):
         quality: int = Field(95, ge=1, le=100, description="of a jpg; 100 is the best and largest")
         overwrite: bool = Field(False, description="write into a folder that already holds frames")
 
+        @property
+        def refuses_existing(self) -> bool:
+            """Whether existing frames are an error."""
+            return not self.overwrite
+
     def __init__(self, params: Params) -> None:
         """Prepare; nothing is written yet."""
         super().__init__(params)
@@ -47,14 +53,9 @@ class Images(Sink):
         self._options = [cv2.IMWRITE_JPEG_QUALITY, params.quality] if params.format == "jpg" else []
 
     @classmethod
-    def outputs(cls, params: Images.Params) -> Sequence[Output]:
+    def outputs(cls, params: Images.Params) -> Mapping[str, Path]:
         """The folder."""
-        return (Output(expanded(params.folder), "folder", "folder", refuses_existing=not params.overwrite),)
-
-    @classmethod
-    def on_restart(cls, params: Images.Params) -> Images.Params:
-        """Continue in another folder, `images-001`."""
-        return params.changed(folder=str(next_name(expanded(params.folder))), overwrite=False)
+        return {"folder": expanded(params.folder)}
 
     def open(self) -> None:
         """Create the folder.

@@ -96,11 +96,6 @@ class View(Sink):
         self._due = float("-inf")
         self._encoded = 0
 
-    @classmethod
-    def among(cls, params: View.Params, folder: Path, address: str | None) -> View.Params:  # noqa: ARG003
-        """With tabs for the other sensors."""
-        return params.changed(neighbours=str(folder))
-
     def open(self) -> None:
         """Serve the page; afterwards `description` is its address, or None if it cannot be served."""
         p = self.params

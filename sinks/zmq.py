@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import logging
 import threading
-from pathlib import Path
 
 import numpy as np
 import orjson
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field
 
 from tactflow.drawing.jpeg import encode_jpeg
-from tactflow.engine.contract import Publication, Sink
+from tactflow.engine.contract import Sink
 from tactflow.engine.control import Control
 from tactflow.engine.rate import RateLimit
 from tactflow.message.result import MessageParams, Result, encode_message
-from tactflow.network.address import Address
 from tactflow.network.commands import ControlSocket
+from tactflow.network.parameters import PublisherParams
 from tactflow.network.publisher import Publisher
 from tactflow.ports import Image
 
@@ -45,68 +44,15 @@ class Zmq(Sink):
     threaded = True
     when_live = "latest"
 
-    class Params(MessageParams):
-        """Address, queue, and access of subscribers and of commands."""
+    class Params(PublisherParams, MessageParams):
+        """Address, queue, access of subscribers and of commands, and content."""
 
-        endpoint: str = Field(
-            "tcp://127.0.0.1:5556",
-            description="address: tcp://127.0.0.1:PORT (* picks a free port) or ipc:///PATH on this machine, "
-            "tcp://*:PORT for the network, which requires keys",
-        )
-        keys: str | None = Field(
-            None,
-            min_length=1,
-            description="publisher's folder of tactflow keys new: only its subscribers are admitted",
-        )
-        open_to_all: bool = Field(False, description="let everybody on other machines read, without keys")
-        backlog: int = Field(
-            32,
-            ge=1,
-            le=2**31 - 1,
-            description="messages queued for each subscriber; more bridge longer pauses, fewer are fresher",
-        )
-        linger: float = Field(1.0, ge=0, le=60, description="time to deliver the last messages, s")
         wait_for_subscriber: float = Field(0.0, ge=0, description="longest wait for a first subscriber, s")
         stats_every: float = Field(1.0, ge=0, le=3600, description="interval of tactflow.stats, s; 0: none")
         pictures: float = Field(
             0.0, ge=0, le=240, description="rate of tactflow_picture and tactflow_depth, Hz; 0: none"
         )
         quality: int = Field(80, ge=1, le=100, description="of the pictures; higher is sharper and larger")
-        control: str | None = Field(
-            None,
-            min_length=1,
-            description="address for commands, such as tcp://127.0.0.1:5557; null: none",
-        )
-        control_keys: str | None = Field(
-            None, min_length=1, description="folder of keys for commands; null: same as keys"
-        )
-
-        @field_validator("endpoint", "control")
-        @classmethod
-        def _is_an_address(cls, endpoint: str | None) -> str | None:
-            return endpoint and Address.parse(endpoint).text
-
-        @model_validator(mode="after")
-        def _guarded(self) -> Zmq.Params:
-            if self.keys is None and not self.open_to_all and not Address.parse(self.endpoint).is_local:
-                raise ValueError(
-                    f"{self.endpoint} can be reached from other machines, so keys are required: make some "
-                    "with tactflow keys new and set keys to the publisher's folder, or endpoint to "
-                    "tcp://127.0.0.1:5556; open_to_all: true lets everybody read"
-                )
-            open_control = self.control is not None and not Address.parse(self.control).is_local
-            if open_control and self.commanders is None:
-                raise ValueError(
-                    f"{self.control} can be reached from other machines, so commands require keys: make some "
-                    "with tactflow keys new and set keys or control_keys to the publisher's folder, or "
-                    "control to tcp://127.0.0.1:5557"
-                )
-            return self
-
-        @property
-        def commanders(self) -> str | None:
-            """The folder of keys for commands; None: everybody who can reach the address."""
-            return self.control_keys or self.keys
 
     def __init__(self, params: Params, sensor: str = "main", control: Control | None = None) -> None:
         """Prepare; nothing is bound yet.
@@ -128,25 +74,6 @@ class Zmq(Sink):
         self._closing = threading.Event()
         self._stats_thread: threading.Thread | None = None
         self._commands: ControlSocket | None = None
-
-    @classmethod
-    def binds(cls, params: Zmq.Params) -> dict[str, str]:
-        """The address for commands; sensors can share only that of the results."""
-        control = params.control
-        return {} if control is None or Address.parse(control).picks_a_port else {"control": control}
-
-    @classmethod
-    def publishes(cls, params: Zmq.Params) -> Publication:
-        """Its endpoint."""
-        return Publication(params.endpoint, params.backlog, params.keys, params.linger)
-
-    @classmethod
-    def among(cls, params: Zmq.Params, folder: Path, address: str | None) -> Zmq.Params:  # noqa: ARG003
-        """With a local endpoint: the relay requires the keys."""
-        if address is None:
-            return params
-        kept = params.commanders if params.control is not None else params.control_keys
-        return params.changed(endpoint=address, keys=None, control_keys=kept)
 
     @property
     def control_endpoint(self) -> str | None:

@@ -11,11 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from tactflow.config.registry import catalogue
 from tests.clock import PATIENCE
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONTRIBUTING = (REPOSITORY / "CONTRIBUTING.md").read_text()
 PAGES = ["CONTRIBUTING.md", "docs/architecture.md"]
+
+OUTER = ("tactflow.tools", "tactflow.plugins", "lab")
+"""Tools, plug-ins and the laboratory, which the core does not import."""
 
 ROOMS = {
     "src/tactflow/engine": ("cv2", "zmq", "numba", "tactflow.vision", "tactflow.config", "tactflow.stages"),
@@ -49,6 +53,39 @@ def test_a_room_imports_nothing_that_it_must_not_know(room: str) -> None:
         if any(module == banned or module.startswith(f"{banned}.") for banned in ROOMS[room])
     ]
     assert not found
+
+
+def files_of_the_core() -> list[Path]:
+    tools = REPOSITORY / "src/tactflow/tools"
+    folders = [REPOSITORY / folder for folder in ("src", "stages", "sinks")]
+    return [file for folder in folders for file in folder.rglob("*.py") if tools not in file.parents]
+
+
+def test_arrows_go_from_tools_plugins_and_laboratory_to_the_core_and_never_back() -> None:
+    outer = [REPOSITORY / folder for folder in ("src/tactflow/tools", "plugins")]
+    outside = [file for folder in outer for file in folder.rglob("*.py")]
+    found = [
+        f"{file.relative_to(REPOSITORY)}: {module}"
+        for files, banned in ((files_of_the_core(), OUTER), (outside, ("lab",)))
+        for file in files
+        for module in imports(file)
+        if any(module == name or module.startswith(f"{name}.") for name in banned)
+    ]
+    assert not found
+
+
+def test_the_engine_names_no_port_but_that_of_its_source_and_no_way_of_publishing() -> None:
+    ports = {port.name for component in catalogue()[0] for port in component.ports.outputs} - {"frame"}
+    assert {"contact", "contact_mask", "touching"} <= ports
+    engine = {file: file.read_text() for file in (REPOSITORY / "src/tactflow/engine").rglob("*.py")}
+    named = [
+        f"{file.name}:{node.lineno}: {node.value}"
+        for file, text in engine.items()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Constant) and node.value in ports
+    ]
+    assert not named
+    assert not [file for file, text in engine.items() if re.search("zmq|zeromq", text, re.I)]
 
 
 class Imports(ast.NodeVisitor):

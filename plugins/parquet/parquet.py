@@ -52,7 +52,6 @@ class Parquet(OutputSink):
     process ends abruptly, at most the rows since the last part are lost.
     """
 
-    output_kind = "folder"
     queue_capacity = 16
 
     class Params(AppendParams):

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import BufferedRandom
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from tactflow.engine.contract import Output, Sink, StageParams
+from tactflow.engine.contract import Sink, StageParams
 from tactflow.engine.errors import StageError
-from tactflow.system.files import expanded, is_device, lock, lock_folder, make_folder, next_name
+from tactflow.system.files import expanded, is_device, lock, lock_folder, make_folder
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk and an exhausted quota."""
@@ -55,7 +55,6 @@ class OutputSink(Sink):
     """Base class of sinks that write `params.path`, in their own thread."""
 
     threaded = True
-    output_kind: ClassVar[Literal["file", "folder"]] = "file"
 
     def __init__(self, params: Any) -> None:
         """Prepare; nothing is opened yet."""
@@ -63,17 +62,9 @@ class OutputSink(Sink):
         self.description = params.path
 
     @classmethod
-    def outputs(cls, params: Any) -> Sequence[Output]:
+    def outputs(cls, params: Any) -> Mapping[str, Path]:
         """The file or folder."""
-        return (Output(expanded(params.path), cls.output_kind, "path", params.refuses_existing),)
-
-    @classmethod
-    def on_restart(cls, params: Any) -> StageParams:
-        """Continue the output, or a numbered one beside it."""
-        if isinstance(params, AppendParams):
-            return params.changed(overwrite=False, append=True)
-        output: OutputParams = params
-        return output.changed(path=str(next_name(expanded(output.path))), overwrite=False)
+        return {"path": expanded(params.path)}
 
 
 def cannot_write(path: Path | str, error: OSError, kept: str = "") -> StageError:

@@ -13,15 +13,15 @@ from pydantic import ValidationError
 
 from tactflow.cli.main import main
 from tactflow.config.load import load_pipeline
-from tactflow.engine.contract import Publication
 from tactflow.engine.errors import StageError
 from tactflow.network.keys import WrongKeysError, make_keys
+from tactflow.network.parameters import PublisherParams
 from tactflow.network.publisher import Publisher
 from tactflow.network.remote_control import RemoteControl
 from tactflow.network.subscriber import Subscriber
 from tactflow.sinks.zmq import Zmq
 from tactflow.tools.fleet.relay import relay
-from tactflow.tools.fleet.sinks import problems
+from tactflow.tools.fleet.sinks import beside_others, problems
 from tests.clock import PATIENCE
 from tests.paths import REPOSITORY
 
@@ -104,9 +104,10 @@ def test_the_relay_of_several_sensors_requires_keys_and_their_own_processes_need
 ) -> None:
     sensor, finder = Publisher(ANY_PORT, 10), Publisher(ANY_PORT, 10)
     finder.close()
+    together = PublisherParams(endpoint=finder.endpoint, backlog=10, keys=str(folders[0]), linger=0)
     try:
         with (
-            relay(Publication(finder.endpoint, 10, str(folders[0]), 0.0), [sensor.endpoint]),
+            relay(together, [sensor.endpoint]),
             Subscriber(finder.endpoint, timeout=PATIENCE, keys=folders[1]) as messages,
         ):
             assert sensor.socket.recv() == b"\x01tactflow."
@@ -139,7 +140,7 @@ def test_an_address_that_other_machines_reach_needs_keys_or_an_explicit_word() -
 
 def test_among_several_sensors_commands_still_require_the_keys_of_all() -> None:
     alone = Zmq.Params(control="tcp://*:5557", keys="mine")
-    among = Zmq.among(alone, Path(), "ipc:///tmp/left")
+    among = beside_others(alone, Path(), "ipc:///tmp/left")
     assert (among.keys, among.commanders) == (None, "mine")
 
 

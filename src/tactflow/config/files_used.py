@@ -28,7 +28,7 @@ def files_written(cls: type, params: StageParams) -> list[str]:
     """The real paths of the files and folders that a sink writes, without devices; empty for a stage."""
     if not issubclass(cls, Sink):
         return []
-    paths = [str(output.path) for output in cls.outputs(params)]
+    paths = [str(path) for path in cls.outputs(params).values()]
     # The sink reports names with NUL, which no file can have.
     return [os.path.realpath(path) for path in paths if "\0" not in path and not is_device(path)]
 

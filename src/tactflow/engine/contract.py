@@ -19,7 +19,6 @@ whose `open()` was started, even after an error. `begin()` of a sink follows whe
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
@@ -157,35 +156,6 @@ class Stage(Part):
         """Clear the state: a new reference follows, in a new epoch."""
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
-    """A file or folder that a sink writes.
-
-    path : its location. kind : its type. parameter : name of the parameter with the path. refuses_existing :
-    whether `open` fails if it has content; the sink itself must check this.
-    """
-
-    path: Path
-    kind: Literal["file", "folder"]
-    parameter: str
-    refuses_existing: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Publication:
-    """An address at which a sink publishes.
-
-    backlog : messages queued for each subscriber at most. keys : folder with the keys of admitted
-    subscribers; None admits every client that can reach the address. linger : time to deliver the last
-    messages, s.
-    """
-
-    address: str
-    backlog: int
-    keys: str | None = None
-    linger: float = 1.0
-
-
 class Sink(Part):
     """Writes, publishes or shows results.
 
@@ -237,43 +207,12 @@ class Sink(Part):
         return {}
 
     @classmethod
-    def outputs(cls, params: Any) -> Sequence[Output]:  # noqa: ARG003 (for sinks that write files)
-        """The files and folders that a sink with these parameters writes, without standard output and
-        devices.
+    def outputs(cls, params: Any) -> Mapping[str, Path]:  # noqa: ARG003 (for sinks that write files)
+        """The files and folders that a sink with these parameters writes: parameter with the path -> path.
 
-        Two sinks that write the same file are an error. A run of several sensors monitors these files.
-        """
-        return ()
-
-    @classmethod
-    def on_restart(cls, params: Any) -> StageParams:
-        """The parameters after a restart of its sensor in the same run, for a sink that can continue."""
-        unchanged: StageParams = params
-        return unchanged
-
-    @classmethod
-    def binds(cls, params: Any) -> Mapping[str, str]:  # noqa: ARG003 (for sinks that listen)
-        """The addresses that it binds exclusively: parameter -> address; without those of `publishes`.
-
-        Several sensors with the same address are an error. An address that picks a free port is left out.
+        Without standard output and devices. Two sinks that write the same file are an error.
         """
         return {}
-
-    @classmethod
-    def publishes(cls, params: Any) -> Publication | None:  # noqa: ARG003 (for sinks that publish)
-        """The address at which it publishes over ZeroMQ, for which a relay can forward several sensors; or
-        None."""
-        return None
-
-    @classmethod
-    def among(cls, params: Any, folder: Path, address: str | None) -> StageParams:  # noqa: ARG003
-        """The parameters in a run of several sensors.
-
-        folder : shared by the sensors of the run, removed at its end. address : for a sink that `publishes`,
-        the address of the relay that publishes for all sensors; else None.
-        """
-        unchanged: StageParams = params
-        return unchanged
 
 
 class Recorder(Sink):

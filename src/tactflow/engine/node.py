@@ -17,9 +17,6 @@ from tactflow.engine.stats import NodeStats, SignalStats
 Slots = Mapping[tuple[str, str], int]
 """(node id, port name) of every output -> its slot in a tick's table of values, from 1."""
 
-CONTACT = "contact"
-"""An output that is counted like a signal although it is not boolean."""
-
 UNCONNECTED = 0
 """The slot that always holds None, for unconnected optional inputs."""
 
@@ -57,7 +54,8 @@ class RunningNode:
     ----------
     instance : of the class; `sink` or `stage` is the same object, the other is None.
     slots : of its outputs. gates : each with the slot of its signal.
-    signals : output port -> (slot, counts of true values); for `contact`, counts of present values.
+    signals : boolean output port -> (slot, counts of true values). presences : the same for outputs that may
+    be absent, counting the present values.
     makers, signal_makers : nodes of the same segment that produce its inputs and the signals of its gates.
     pulled : index of the last tick in which it was evaluated. disabled : whether it failed and is not called
     any more. last : the outputs of its last run, for repeating gates and repeated inputs.
@@ -79,11 +77,13 @@ class RunningNode:
         self.slots = [slots[node.id, port.name] for port in ports.outputs]
         gates = node.gates if skipping else ()
         self.gates = [(gate, slots[gate.signal.node, gate.signal.port]) for gate in gates]
-        self.signals = {
-            port.name: (slot, SignalStats())
-            for slot, port in zip(self.slots, ports.outputs, strict=True)
-            if port.name == CONTACT or isinstance(port_type(port.annotation), SignalPort)
-        }
+        self.signals: dict[str, tuple[int, SignalStats]] = {}
+        self.presences: dict[str, tuple[int, SignalStats]] = {}
+        for slot, port in zip(self.slots, ports.outputs, strict=True):
+            if isinstance(port_type(port.annotation), SignalPort):
+                self.signals[port.name] = slot, SignalStats()
+            elif port.optional:
+                self.presences[port.name] = slot, SignalStats()
         self.makers: list[RunningNode] = []
         self.signal_makers: list[RunningNode] = []
         self.pulled = -1
@@ -174,8 +174,8 @@ class RunningNode:
                 tick.reasons[slot] = value.reason
             elif inherited is not None:
                 tick.reasons[slot] = inherited
-        if self.signals:
-            self._read_signals(tick)
+        if self.signals or self.presences:
+            self._count(tick)
 
     def _inherited_reason(self, tick: TickState) -> str | None:
         """Why its outputs are repeated: the reason of the first input, if all connected inputs have one.
@@ -193,17 +193,19 @@ class RunningNode:
         for number, slot in enumerate(self.slots):
             tick.values[slot] = absent if last is None else last[number]
             tick.reasons[slot] = absent.reason
-        if self.signals:
-            self._read_signals(tick)
+        if self.signals or self.presences:
+            self._count(tick)
 
-    def _read_signals(self, tick: TickState) -> None:
-        for port, (slot, signal) in self.signals.items():
-            value = tick.values[slot]
-            is_true = not isinstance(value, Absent)
-            if is_true and port != CONTACT:
+    def _count(self, tick: TickState) -> None:
+        values = tick.values
+        for slot, signal in self.signals.values():
+            value, is_true = values[slot], False
+            if not isinstance(value, Absent):
                 # Gates compare with Python's True, which NumPy's is not.
-                tick.values[slot] = is_true = bool(value)
+                values[slot] = is_true = bool(value)
             signal.add(is_true)
+        for slot, presence in self.presences.values():
+            presence.add(not isinstance(values[slot], Absent))
 
 
 def _outputs(result: Any, count: int) -> Sequence[Any]:

@@ -390,7 +390,7 @@ class Runner:
             "signals": {
                 f"{node.id}.{port}": signal.entry()
                 for node in nodes
-                for port, (_, signal) in node.signals.items()
+                for port, (_, signal) in (node.signals | node.presences).items()
             },
             "links": {link.name: link.stats() for link in self._links},
             "latency_ms": {"p50": self.latency.milliseconds(0.5), "p99": self.latency.milliseconds(0.99)},

@@ -83,8 +83,9 @@ class NodeStats:
 
 @dataclass(slots=True)
 class SignalStats:
-    """Counts of a boolean port, or of contacts. true : ticks in which it was true. rises : changes to true.
-    last : value in the last tick.
+    """Counts of a boolean port, or of the presence of an output that may be absent.
+
+    true : ticks in which it was true. rises : changes to true. last : value in the last tick.
     """
 
     true: int = 0

@@ -10,13 +10,12 @@ import select
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping
 from io import BufferedRandom
 from pathlib import Path
 
 from pydantic import Field
 
-from tactflow.engine.contract import Output
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
@@ -310,9 +309,9 @@ class LineSink(OutputSink):
         raise NotImplementedError
 
     @classmethod
-    def outputs(cls, params: LineParams) -> Sequence[Output]:
+    def outputs(cls, params: LineParams) -> Mapping[str, Path]:
         """The file, or none for standard output."""
-        return () if params.path == "-" else super().outputs(params)
+        return {} if params.path == "-" else super().outputs(params)
 
     def open(self) -> None:
         """Open or create the file and its folder, or wait for the reader of a pipe.

@@ -74,4 +74,4 @@ def test_the_last_messages_get_the_longest_time_that_one_of_the_sensors_gives_th
     file.write_text(f"{sensors}\n{STAGES}sinks: {{zmq: {{linger: 3}}}}\n")
     pipelines = {name: load_pipeline(file, sensor=name) for name in ("left", "right")}
     (shared,) = shared_addresses(pipelines)
-    assert (shared.publication.linger, shared.publication.backlog) == (7, 64)
+    assert (shared.together.linger, shared.together.backlog) == (7, 64)

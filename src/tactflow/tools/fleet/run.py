@@ -12,7 +12,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.system.signals import ending_handled
 from tactflow.tools.fleet.relay import relay
-from tactflow.tools.fleet.sinks import Shared, WatchedSink, changes, shared_addresses
+from tactflow.tools.fleet.sinks import Shared, WatchedSink, beside_others, changes, shared_addresses
 from tactflow.tools.fleet.sinks import problems as problems
 from tactflow.tools.fleet.supervisor import Member, Supervisor
 
@@ -37,9 +37,9 @@ def run(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequence[str]
         # The path of a local socket has 107 bytes at most (Linux), and TMPDIR may be longer.
         short = None if len(tempfile.gettempdir()) < 40 else "/tmp"
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tactflow-", dir=short)))
-        for sinks, publication in shared:
-            upstream = [_private(scratch, sensor, node) for sensor, node in sinks]
-            stack.enter_context(relay(publication, upstream))
+        for sinks, together in shared:
+            upstream = [_private(scratch, sensor, node) for sensor, node, _ in sinks]
+            stack.enter_context(relay(together, upstream))
         members = []
         for sensor, pipeline in pipelines.items():
             # Without -P, Python would search the current folder first for every module.
@@ -52,11 +52,11 @@ def run(pipelines: Mapping[str, Pipeline], arguments: Mapping[str, Sequence[str]
 
 def _side_by_side(sensor: str, pipeline: Pipeline, shared: Sequence[Shared], scratch: Path) -> list[str]:
     """Settings of one sensor's sinks that depend on the other sensors."""
-    relayed = {node.id for sinks, _ in shared for name, node in sinks if name == sensor}
+    relayed = {node.id for sinks, _ in shared for name, node, _ in sinks if name == sensor}
     settings = []
     for node in pipeline.sinks:
         address = _private(scratch, sensor, node) if node.id in relayed else None
-        settings += changes(node, node.component.cls.among(node.params, scratch, address))
+        settings += changes(node, beside_others(node.params, scratch, address))
     return settings
 
 

@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 from tactflow.config.overrides import as_yaml
 from tactflow.config.sensors import PLACEHOLDER
-from tactflow.engine.contract import Output, Publication, StageParams
+from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Node, Pipeline
-from tactflow.system.files import STREAMS, is_device, status
+from tactflow.network.address import Address
+from tactflow.network.parameters import PublisherParams
+from tactflow.system.files import STREAMS, is_device, next_name, status
 
 
 class WatchedSink:
@@ -20,7 +22,7 @@ class WatchedSink:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._before = {output: _state(output) for output in written_files(node, node.params)}
+        self._before = {path: _state(path) for path in written_files(node, node.params).values()}
 
     @property
     def overrides(self) -> list[str]:
@@ -33,24 +35,52 @@ class WatchedSink:
     @property
     def refused(self) -> Path | None:
         """An existing output that the sink would refuse to replace if restarted now, or None."""
-        for output in written_files(self._node, self._params):
-            now = _state(output)
-            if output.refuses_existing and now is not None and now[0] > 0:
-                return output.path
-        return None
+        params = self._params
+        if not getattr(params, "refuses_existing", False):
+            return None
+        states = {path: _state(path) for path in written_files(self._node, params).values()}
+        return next((path for path, state in states.items() if state is not None and state[0] > 0), None)
 
     @property
     def _params(self) -> StageParams:
-        begun = any(_state(output) not in (None, before) for output, before in self._before.items())
-        return self._node.component.cls.on_restart(self._node.params) if begun else self._node.params
+        begun = any(_state(path) not in (None, before) for path, before in self._before.items())
+        return _continued(self._node) if begun else self._node.params
 
 
-def written_files(node: Node, params: StageParams) -> Sequence[Output]:
-    """The files and folders that a sink declares, without devices and streams."""
-    declared: Sequence[Output] = node.component.cls.outputs(params)
-    return [
-        output for output in declared if str(output.path) not in STREAMS and not is_device(str(output.path))
-    ]
+def _continued(node: Node) -> StageParams:
+    """The parameters with which a sink keeps what it has written: it appends, or else writes beside it."""
+    params = node.params
+    settings: dict[str, object] = {}
+    if "append" in type(params).model_fields:
+        settings["append"] = True
+    else:
+        settings = {name: str(next_name(path)) for name, path in written_files(node, params).items()}
+    if "overwrite" in type(params).model_fields:
+        settings["overwrite"] = False
+    return params.changed(**settings)
+
+
+def beside_others(params: StageParams, folder: Path, address: str | None) -> StageParams:
+    """The parameters of a sink in a run of several sensors.
+
+    params : its own. folder : shared by the sensors of the run, removed at its end. address : at which it
+    publishes for the relay; None for a sink that has an address of its own, or none.
+    """
+    if "neighbours" in type(params).model_fields:
+        return params.changed(neighbours=str(folder))
+    if isinstance(params, PublisherParams) and address is not None:
+        # The relay requires the keys of subscribers.
+        kept = params.commanders if params.control is not None else params.control_keys
+        return params.changed(endpoint=address, keys=None, control_keys=kept)
+    return params
+
+
+def written_files(node: Node, params: StageParams) -> dict[str, Path]:
+    """The files and folders that a sink declares, by parameter; without devices and streams."""
+    declared: Mapping[str, Path] = node.component.cls.outputs(params)
+    return {
+        name: path for name, path in declared.items() if str(path) not in STREAMS and not is_device(str(path))
+    }
 
 
 def changes(node: Node, params: StageParams) -> list[str]:
@@ -65,10 +95,10 @@ def problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
     pipelines : sensor -> its pipeline. Results may be published at one address with the same keys.
     """
     found = [
-        f"{node.mark}  sinks.{node.id}.keys: required the same for all that publish at {together.address}"
+        f"{node.mark}  sinks.{node.id}.keys: required the same for all that publish at {together.endpoint}"
         for sinks, together in shared_addresses(pipelines)
-        for _, node in sinks
-        if node.component.cls.publishes(node.params).keys != together.keys
+        for _, node, params in sinks
+        if params.keys != together.keys
     ]
     owners: dict[str, str] = {}
     for sensor, pipeline in pipelines.items():
@@ -84,36 +114,39 @@ def problems(pipelines: Mapping[str, Pipeline]) -> list[str]:
 
 def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
     """Resources that a sink needs exclusively: (parameter, "write FILE" or "listen at ADDRESS", advice)."""
-    for output in written_files(node, node.params):
+    for parameter, path in written_files(node, node.params).items():
         advice = f"put {PLACEHOLDER} into it, as in out/{PLACEHOLDER}.jsonl"
-        yield output.parameter, f"write {output.path}", advice
-    for parameter, address in node.component.cls.binds(node.params).items():
-        advice = f"give {sensor} its own, as sensors.{sensor}.sinks.{node.id}.{parameter}"
-        yield parameter, f"listen at {address}", advice
+        yield parameter, f"write {path}", advice
+    control = node.params.control if isinstance(node.params, PublisherParams) else None
+    if control is not None and not Address.parse(control).picks_a_port:
+        advice = f"give {sensor} its own, as sensors.{sensor}.sinks.{node.id}.control"
+        yield "control", f"listen at {control}", advice
 
 
 class Shared(NamedTuple):
-    """An address at which several sinks publish: (sensor, sink) of each, and what a relay does for all."""
+    """An address at which several sinks publish.
 
-    sinks: Sequence[tuple[str, Node]]
-    publication: Publication
+    sinks : (sensor, sink, its parameters) of each. together : parameters of a sink that publishes for all.
+    """
+
+    sinks: Sequence[tuple[str, Node, PublisherParams]]
+    together: PublisherParams
 
 
 def shared_addresses(pipelines: Mapping[str, Pipeline]) -> list[Shared]:
     """Addresses shared by sinks of several sensors. pipelines : sensor -> its pipeline."""
-    by_address: dict[str, list[tuple[str, Node, Publication]]] = {}
+    by_address: dict[str, list[tuple[str, Node, PublisherParams]]] = {}
     for sensor, pipeline in pipelines.items():
         for node in pipeline.sinks:
-            publication = node.component.cls.publishes(node.params)
-            if publication is not None:
-                by_address.setdefault(publication.address, []).append((sensor, node, publication))
+            if isinstance(node.params, PublisherParams):
+                by_address.setdefault(node.params.endpoint, []).append((sensor, node, node.params))
     shared = []
-    for address, sinks in by_address.items():
+    for sinks in by_address.values():
         if len(sinks) > 1:
-            backlog = sum(publication.backlog for *_, publication in sinks)
-            linger = max(publication.linger for *_, publication in sinks)
-            together = Publication(address, backlog, sinks[0][2].keys, linger)
-            shared.append(Shared([(sensor, node) for sensor, node, _ in sinks], together))
+            backlog = sum(params.backlog for *_, params in sinks)
+            linger = max(params.linger for *_, params in sinks)
+            together = sinks[0][2].changed(backlog=backlog, linger=linger)
+            shared.append(Shared(sinks, together))
     return shared
 
 
@@ -121,11 +154,10 @@ def _plain(params: StageParams) -> dict[str, object]:
     return params.model_dump(mode="json", by_alias=True)
 
 
-def _state(output: Output) -> tuple[int, ...] | None:
+def _state(path: Path) -> tuple[int, ...] | None:
     """Size (of a folder: number of entries), identity and modification time; None if it does not exist."""
-    file = status(str(output.path))
-    is_kind = stat.S_ISDIR if output.kind == "folder" else stat.S_ISREG
-    if file is None or not is_kind(file.st_mode):
+    file = status(str(path))
+    if file is None:
         return None
-    size = len(os.listdir(output.path)) if output.kind == "folder" else file.st_size
+    size = len(os.listdir(path)) if stat.S_ISDIR(file.st_mode) else file.st_size
     return size, file.st_dev, file.st_ino, file.st_mtime_ns
