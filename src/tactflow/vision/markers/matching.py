@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tactflow.vision.arrays import Flags, Floats, Indices
-from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import components, nearest
 
 MAX_STRAIN: Final = 0.5
@@ -79,8 +78,12 @@ class MarkerGraph:
 
         position : (N, 2), px. seen : (N,), whether a mark is visible.
         """
-        smooth = np.empty(len(self._edges), np.bool_)
-        return smooth, check_links(position, seen, self._origin, self._edges, self._length, smooth)
+        one, other = self._edges.T
+        moved = position - self._origin
+        x, y = (moved[one] - moved[other]).T
+        both = seen[one] & seen[other]
+        smooth = both & (x * x + y * y < (MAX_STRAIN * self._length) ** 2)
+        return smooth, bool((both & ~smooth).any())
 
     def largest_component(self, seen: Flags, smooth: Flags) -> Flags:
         """The visible marks (N,) of the largest component of each grid, connected by links of little
@@ -91,22 +94,6 @@ class MarkerGraph:
         best = np.zeros(len(seen))
         np.maximum.at(best, self._grid, rank)
         return np.asarray(seen & (rank == best[self._grid]))
-
-
-@kernel("boolean(float64[:, ::1], boolean[::1], float64[:, ::1], int64[:, ::1], float64[::1], boolean[::1])")
-def check_links(
-    position: Floats, seen: Flags, origin: Floats, edges: Indices, length: Floats, smooth: Flags
-) -> bool:
-    """Fill `smooth`, (E,); returns whether a link between visible marks is not smooth."""
-    torn = False
-    for e in range(len(edges)):
-        one, other = edges[e, 0], edges[e, 1]
-        x = position[one, 0] - origin[one, 0] - position[other, 0] + origin[other, 0]
-        y = position[one, 1] - origin[one, 1] - position[other, 1] + origin[other, 1]
-        both = seen[one] and seen[other]
-        smooth[e] = both and np.sqrt(x * x + y * y) < MAX_STRAIN * length[e]
-        torn = torn or (both and not smooth[e])
-    return torn
 
 
 class Interpolator:
