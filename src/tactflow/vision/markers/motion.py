@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import NEIGHBOUR_COUNT
 from tactflow.vision.markers.matching import MIN_KNOWN_SHARE, surroundings
 
@@ -74,22 +75,52 @@ class MotionEvidence:
 
         displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool, visible marks.
         """
-        moves = np.abs(displacement).max(axis=1) > self._rest
-        if not moves.any():
-            return False
-        beside = (moves & seen)[self._around[:, :NEIGHBOUR_COUNT]].any(axis=1)
-        resting = np.flatnonzero(seen & beside & ~moves)
-        around = self._around[resting]
-        share = self._share[resting] * seen[around]
-        total = share.sum(axis=1)
-        known = total >= MIN_KNOWN_SHARE
-        resting, around, share = resting[known], around[known], share[known] / total[known, None]
-        x, y = displacement[around].transpose(2, 0, 1)
-        mean_x, mean_y, squares = ((share * part).sum(axis=1) for part in (x, y, x * x + y * y))
-        length = mean_x**2 + mean_y**2
-        expected = (squares - length) / 2 + stderr[resting] ** 2 + MIN_RELATIVE_SCATTER**2 * length
-        along = mean_x * displacement[resting, 0] + mean_y * displacement[resting, 1]
-        self.against[resting] = np.maximum(self.against[resting], (length / 2 - along) / expected)
-        if self.against.max(initial=0) > LEAVING_EVIDENCE:
+        around = self._around, self._share, self._rest
+        moves = weigh_motion(displacement, stderr, seen, *around, self.against)
+        if moves and self.against.max() > LEAVING_EVIDENCE:
             self.left = self._leaving()
-        return True
+        return moves
+
+
+@kernel(
+    "boolean(float64[:, ::1], float32[::1], boolean[::1], int64[:, ::1], float64[:, ::1], float64,"
+    "float64[::1])"
+)
+def weigh_motion(
+    displacement: Floats,
+    stderr: Floats32,
+    seen: Flags,
+    around: Indices,
+    share: Floats,
+    rest: float,
+    against: Floats,
+) -> bool:
+    """Update `against`, (N,), with the evidence of a frame; returns whether a mark moves.
+
+    displacement : (N, 2). stderr, seen : (N,). around, share : (N, K), the neighbours, nearest first, and
+    their weights in a mean. rest : maximum displacement of a resting mark along an axis.
+    """
+    moves, moving = np.empty(len(displacement), np.bool_), False
+    for n in range(len(displacement)):
+        moves[n] = max(abs(displacement[n, 0]), abs(displacement[n, 1])) > rest
+        moving = moving or moves[n]
+    for n in range(len(displacement) if moving else 0):
+        beside = False
+        for k in range(min(NEIGHBOUR_COUNT, around.shape[1])):
+            beside = beside or (moves[around[n, k]] and seen[around[n, k]])
+        if moves[n] or not (seen[n] and beside):
+            continue
+        total = mean_x = mean_y = squares = 0.0
+        for k in range(around.shape[1]):
+            if seen[around[n, k]]:
+                x, y = displacement[around[n, k]]
+                total, squares = total + share[n, k], squares + share[n, k] * (x * x + y * y)
+                mean_x, mean_y = mean_x + share[n, k] * x, mean_y + share[n, k] * y
+        if total < MIN_KNOWN_SHARE:
+            continue
+        mean_x, mean_y = mean_x / total, mean_y / total
+        length = mean_x * mean_x + mean_y * mean_y
+        expected = (squares / total - length) / 2 + stderr[n] * stderr[n] + MIN_RELATIVE_SCATTER**2 * length
+        along = mean_x * displacement[n, 0] + mean_y * displacement[n, 1]
+        against[n] = max(against[n], (length / 2 - along) / expected)
+    return moving
