@@ -17,10 +17,19 @@ def test_the_table_has_a_line_for_every_stage_and_sink(terminal: Terminal) -> No
     assert err == ""
     heading, *rows = out.splitlines()
     assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT", "IT", "DOES"]
-    assert [row.split()[:2] for row in rows] == [[c.name, c.kind] for c in catalogue()[0]]
+    assert sorted(row.split()[:2] for row in rows) == sorted([c.name, c.kind] for c in catalogue()[0])
     hull = next(row for row in rows if row.startswith("hull "))
     ports = ["contact_mask,", "evidence?,", "deviations?", "contact"]
     assert hull.split()[:7] == ["hull", "stage", *ports, "built-in"]
+
+
+def test_alternatives_stand_below_the_stage_that_they_can_replace(terminal: Terminal) -> None:
+    assert terminal("stages") == 0
+    names = [row[:20].rstrip() for row in terminal.out.splitlines()]
+    below = names[names.index("hull") + 1 : names.index("inpaint")]
+    assert below == ["  classic_hull", "  fit_line", "  min_area_rect"]
+    assert terminal("stages", "tracker") == 0
+    assert "can be replaced by: classic_tracker, dis_flow, lucas_kanade, nearest_dots, rlof" in terminal.out
 
 
 def test_one_stage_is_explained_with_ports_and_parameters(tmp_path: Path, terminal: Terminal) -> None:

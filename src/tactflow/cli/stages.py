@@ -16,6 +16,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from tactflow.config.document import shown
 from tactflow.config.models import is_word
 from tactflow.config.registry import Section, catalogue, names, resolve
+from tactflow.config.replacements import grouped, replacements
 from tactflow.engine.conformance import declares
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Component
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join(details(components[0])))
         return 0
     heading = ("NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT IT DOES")
-    show(table([heading, *map(_row, components)]))
+    show(table([heading, *_rows(components)]))
     return 0
 
 
@@ -61,6 +62,8 @@ def details(component: Component) -> Iterator[str]:
     if component.kind == "stage":
         yield ""
         yield f"memory: {component.memory}"
+        if others := [other.name for other in replacements(component)]:
+            yield f"can be replaced by: {', '.join(others)}"
     if declares(component.cls):
         yield ""
         yield "inputs and outputs: as the parameters say"
@@ -95,11 +98,18 @@ def _find(name: str) -> Component:
     raise ConfigError(f"there is no stage or sink {name!r}{did_you_mean(name, known)}")
 
 
-def _row(component: Component) -> Sequence[str]:
+def _rows(components: Sequence[Component]) -> Iterator[Sequence[str]]:
+    """A row for each; indented below a stage, those that can take its place."""
+    for component, others in grouped(components):
+        yield _row(component)
+        yield from (_row(other, "  ") for other in others)
+
+
+def _row(component: Component, indent: str = "") -> Sequence[str]:
     inputs = ", ".join(port.name + ("?" if port.optional else "") for port in component.ports.inputs)
     outputs = ", ".join(port.name for port in component.ports.outputs)
     summary = inspect.cleandoc(component.cls.__doc__ or "").partition("\n")[0]
-    return component.name, component.kind, inputs, outputs, component.origin, summary
+    return indent + component.name, component.kind, inputs, outputs, component.origin, summary
 
 
 def _port_type(port: Port) -> str:

@@ -53,12 +53,11 @@ def resolve(use: str, section: Section, *folders: Path) -> Component:
     return resolved
 
 
-def catalogue() -> tuple[list[Component], list[str]]:
+def catalogue(sections: Sequence[Section] = get_args(Section)) -> tuple[list[Component], list[str]]:
     """All built-in and installed stages and sinks, stages first, by name; and a message for each that cannot
     be used."""
     components: list[Component] = []
     problems: list[str] = []
-    sections: tuple[Section, ...] = get_args(Section)
     for section in sections:
         for name in names(section):
             try:

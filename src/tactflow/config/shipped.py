@@ -7,6 +7,8 @@ from importlib.resources import as_file, files
 from itertools import takewhile
 from pathlib import Path
 
+import yaml
+
 from tactflow.config.document import SOURCE_OPTION
 from tactflow.engine.errors import ConfigError
 from tactflow.system.spelling import did_you_mean
@@ -26,6 +28,15 @@ def described_pipelines() -> dict[str, str]:
         comment = " ".join(line[2:] for line in takewhile(lambda line: line.startswith("# "), lines))
         descriptions[name] = re.split(r"\. |\.$", comment)[0]
     return descriptions
+
+
+def default_stages() -> list[str]:
+    """Ids of the stages of the shipped default pipeline, in its order; each is also the stage's name.
+
+    >>> default_stages()[:2]
+    ['capture', 'probe']
+    """
+    return list(yaml.safe_load(_packaged("default").read_text(encoding="utf-8"))["stages"])
 
 
 def find_pipeline(name: str | None) -> Path:

@@ -8,6 +8,7 @@ from typing import Any
 
 from tactflow.config.document import Document, Keys, dotted
 from tactflow.config.registry import Section, catalogue
+from tactflow.config.replacements import grouped
 from tactflow.engine.contract import StageParams
 from tactflow.engine.graph import Component, Gate, Mark, Ref
 from tactflow.engine.ports import Port, SignalPort, describe_type, fits, port_type
@@ -194,7 +195,9 @@ class _Wiring:
         if below is not None and below is not user:
             text += f"; {below.id} gives it but is below: move it up, or write in: "
             return text + f"{{{port.name}: {below.id}.{port.name}}}"
-        makers = [c.name for c in catalogue()[0] if port.name in (output.name for output in c.ports.outputs)]
+        # Of stages that can replace each other, the usual one.
+        known_stages = (component for component, _ in grouped(catalogue()[0]))
+        makers = [c.name for c in known_stages if port.name in (output.name for output in c.ports.outputs)]
         known = f"there are {', '.join(outputs)}" if outputs else "there are none"
         return f"{text}; {known}" + (f"; it comes from the stage {' or '.join(makers)}" if makers else "")
 

@@ -20,7 +20,7 @@ from tactflow.tools.tune.measure import Trial, judge, mark_unsound
 from tactflow.tools.tune.recording import Recording, take
 from tactflow.tools.tune.search import Goal, Tuned
 from tactflow.tools.tune.sensor import Fitted, Look, fit
-from tactflow.tools.tune.space import ORIGINAL, candidates
+from tactflow.tools.tune.space import ORIGINAL, candidates, swaps
 from tests.terminal import Terminal
 
 SMALL = Look((320, 240), "markers=10x8", noise=2.0)
@@ -57,6 +57,7 @@ def test_the_choice_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal
 ) -> None:
     monkeypatch.setattr(space, "AXES", FIELD)
+    monkeypatch.setattr(space, "swaps", lambda *_: [])
     monkeypatch.setattr(search, "SIMULATED", (Case("press", 24),))
     path = Fitted(SMALL, Case("press", 30), tmp_path, 3).path
     budget = 1.5
@@ -70,6 +71,35 @@ def test_the_choice_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     assert "field" in tactflow.load("tuned.yaml").nodes
     text = Path("tuned.yaml").read_text()
     assert all(f"# {line}".rstrip() in text for line in terminal.out.splitlines())
+
+
+def test_swaps_are_found_by_their_ports_and_keep_the_keys_of_the_file() -> None:
+    found = {trial.name: trial for trial in swaps(find_pipeline("markerless"))}
+    assert {"preprocess: pyramid", "difference: otsu", "hull: min_area_rect"} <= found.keys()
+    otsu = found["difference: otsu"]
+    # `shift`, which `otsu` does not have, is gone.
+    kept = {"when": "suspect", "in": {"unmarked": "preprocess.image"}, "use": "otsu"}
+    assert otsu.settings == {"stages.difference": kept}
+    assert otsu.pipeline.nodes["difference"].component.name == "otsu"
+    methods = {
+        name for name in (trial.name for trial in swaps(find_pipeline("default"))) if "inpaint" in name
+    }
+    assert methods == {f"inpaint: {name}" for name in ("telea", "ns", "none", "frequency_selective")}
+
+
+def test_only_swaps_that_gain_something_are_measured_in_full(
+    recorded: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search, "SIMULATED", (Case("press", 24),))
+    monkeypatch.setattr(search, "FIRST_LOOK", Case("press", 12))
+    original = Trial(ORIGINAL, {}, tactflow.load("default"))
+    slower_and_worse = tactflow.load("default", settings={"stages.tracker": {"use": "classic_tracker"}})
+    faster = tactflow.load("default", settings={"stages.fusion": None, "stages.field": None})
+    tried = [Trial("slow", {"x": 1}, slower_and_worse), Trial("fast", {"x": 2}, faster)]
+    told: list[str] = []
+    tuned = search.search([original], recorded, tmp_path, Goal(), told.append, tried)
+    assert {trial.name for trial in tuned.trials} == {ORIGINAL, "fast"}
+    assert any("2 stages swapped, worth a closer look: fast" in line for line in told)
 
 
 def test_the_order_follows_the_goal() -> None:

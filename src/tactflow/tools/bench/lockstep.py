@@ -9,6 +9,7 @@ memory then, as a camera's do, and not in the cache.
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
@@ -138,12 +139,13 @@ def take_turns(
     pipelines: Mapping[str, Pipeline],
     observe: Callable[[str, TimedResult], str],
     block: int = BLOCK,
+    limit_s: float = math.inf,
 ) -> tuple[dict[str, Times], dict[str, str]]:
     """Run pipelines in turns of a few frames until all recordings are over.
 
     pipelines : name -> pipeline, each with its recording. observe : called with (name, result) for each
     frame, after its turn; returns the kind of frame its time belongs to, except for references.
-    block : frames in a turn.
+    block : frames in a turn. limit_s : CPU time after which a pipeline is stopped, and counts as failed.
 
     Returns times : name -> kind of frame -> CPU times, s. failures : name -> why it stopped.
     """
@@ -165,6 +167,8 @@ def take_turns(
                 for result in results:
                     kind = observe(name, result)
                     times[name]["reference" if result.frame.reference else kind].append(result.cpu_s)
-                if not results:
+                if sum(map(sum, times[name].values())) > limit_s:
+                    failures[name] = f"takes more than {limit_s:g} s"
+                if not results or name in failures:
                     del running[name]
     return times, failures

@@ -1,24 +1,29 @@
 """Each stage's methods alone, on the same inputs.
 
-The alternatives are whatever the stage's `method` parameter allows and the classes that the pipelines use in
-its place, so a new one is measured without anything being added here. A method that a shipped pipeline uses
-is given that pipeline's parameters. The inputs come from the default pipeline's stages, the same for every
-alternative; geometry and flow are given the true contact mask, so that their errors are their own.
+The alternatives are whatever the stage's `method` parameter allows, the classes that the pipelines use in its
+place, and all built-in stages, plug-ins and classes in files of the pipelines with the same ports, so a new
+one is measured without anything being added here. A method that a shipped pipeline uses is given that
+pipeline's parameters. The inputs come from the default pipeline's stages, the same for every alternative;
+geometry and flow are given the true contact mask, so that their errors are their own.
+
+A method that is slower than its share of the run is measured on fewer frames.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.config.replacements import methods_of, replacements
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.sim import Truth
@@ -26,14 +31,14 @@ from tactflow.tools.bench import metrics, score
 from tactflow.tools.bench.quantities import Tally
 from tactflow.tools.bench.results import BenchResult
 from tactflow.tools.bench.scenes import Case, Rendered, rendered
-from tactflow.tools.bench.timing import BLOCK, Times, quiet
+from tactflow.tools.bench.timing import BLOCK, quiet
 
 
 def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Node]:
     """Every way to do a stage's work, the default pipeline's own first.
 
     A way is named after the stage's `method`; where the stage has none, or another pipeline uses the method
-    with other parameters, after the pipeline.
+    with other parameters, after the pipeline; others as in `use:`.
 
     pipelines : name -> pipeline, the default one first. stage : id of the stage.
     """
@@ -45,9 +50,14 @@ def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Nod
             method = str(getattr(node.params, "method", name))
             ways[name if method in ways else method] = node
     for node in nodes.values():
-        choices = node.component.params.model_fields.get("method")
-        for method in get_args(choices.annotation) if choices else ():
+        for method in methods_of(node.component):
             ways.setdefault(method, replace(node, params=node.params.changed(method=method)))
+    used = [node.component for pipeline in pipelines.values() for node in pipeline.nodes.values()]
+    known_classes = {way.component.cls for way in ways.values()}
+    for node in list(nodes.values())[:1]:
+        for other in replacements(node.component, used):
+            if other.cls not in known_classes:
+                ways.setdefault(other.name, replace(node, component=other, params=other.params()))
     return ways
 
 
@@ -145,6 +155,11 @@ STAGES: Mapping[str, frozenset[str]] = {
 measured only in frames that show one."""
 
 
+QUICK_BUDGET_S, FULL_BUDGET_S = 1.5, 6.0
+"""CPU time of a method on one scene, s, beyond which it is measured on fewer frames: a few seconds of a quick
+run of half a minute, and some minutes of a full one, even if several are as slow as that."""
+
+
 def measure_methods(
     result: BenchResult, scratch: Path, pipelines: Mapping[str, Pipeline], case: Case
 ) -> None:
@@ -163,32 +178,66 @@ def measure_methods(
 
 
 def _measure_stage(
-    result: BenchResult, stage: str, ways: Mapping[str, Node], frames: Sequence[_Inputs], scene: str
+    result: BenchResult,
+    stage: str,
+    ways: Mapping[str, Node],
+    frames: Sequence[_Inputs],
+    scene: str,
 ) -> None:
-    judges = {name: _Judge() for name in ways}
-    times: dict[str, Times] = {name: defaultdict(list) for name in ways}
-    calls = {name: _call(node, STAGES[stage]) for name, node in ways.items()}
-    failures: dict[str, str] = {}
+    budget_s = QUICK_BUDGET_S if result.quick else FULL_BUDGET_S
+    trials = {name: _Trial(stage, node, frames, budget_s) for name, node in ways.items()}
     with quiet():
         for first in range(0, len(frames), BLOCK):
-            turn = frames[first : first + BLOCK]
-            for name in [name for name in ways if name not in failures]:
-                answers = []
-                try:
-                    for item in turn:
-                        began = time.thread_time()
-                        answers.append(calls[name](item))
-                        times[name][item.kind].append(time.thread_time() - began)
-                except Exception as error:
-                    failures[name] = f"{type(error).__name__}: {error}"
-                for item, found in zip(turn, answers, strict=False):
-                    getattr(judges[name], stage)(item, None if isinstance(found, Absent) else found)
-    for name in ways:
-        if name in failures:
-            result.failures[f"{stage}/{name}/{scene}"] = failures[name]
+            for trial in trials.values():
+                trial.run(range(first, min(first + BLOCK, len(frames))))
+    for name, trial in trials.items():
+        if trial.failure:
+            result.failures[f"{stage}/{name}/{scene}"] = trial.failure
         else:
-            errors = judges[name].tally.errors()
-            result.add(stage, name, scene, errors, times=times[name], frames=len(frames))
+            errors, left_out = trial.judge.tally.errors(), len(frames) - trial.measured
+            result.add(
+                stage, name, scene, errors, times=trial.times, frames=trial.measured, left_out=left_out
+            )
+
+
+class _Trial:
+    """One method on one scene, until its CPU time is spent.
+
+    A method without memory that is too slow for all frames gets every n-th one; one with memory gets the
+    first ones, because it depends on those before.
+    """
+
+    def __init__(self, stage: str, node: Node, frames: Sequence[_Inputs], budget_s: float) -> None:
+        self.judge, self.times = _Judge(), defaultdict[str, list[float]](list)
+        self.measured, self.failure = 0, ""
+        self._compare = getattr(self.judge, stage)
+        self._frames, self._budget_s, self._spent_s, self._step = frames, budget_s, 0.0, 1
+        self._is_pure = node.component.memory == "pure"
+        self._call = _call(node, STAGES[stage])
+
+    def run(self, turn: range) -> None:
+        """Run the frames of a turn that are to be measured; what a method raises ends its trial."""
+        answers = []
+        for index in turn:
+            if index % self._step or self._spent_s > self._budget_s or self.failure:
+                continue
+            began = time.thread_time()
+            try:
+                answer = self._call(self._frames[index])
+            except Exception as error:
+                self.failure = f"{type(error).__name__}: {error}"
+                break
+            cost_s = time.thread_time() - began
+            answers.append((index, answer, cost_s))
+            self._spent_s += cost_s
+            # A first call may take longer than the others, but not a fifth of the budget.
+            if self._is_pure and cost_s > self._budget_s / 5:
+                self._step = max(self._step, math.ceil(cost_s * len(self._frames) / self._budget_s))
+        for index, answer, cost_s in answers:
+            inputs = self._frames[index]
+            self.times[inputs.kind].append(cost_s)
+            self.measured += 1
+            self._compare(inputs, None if isinstance(answer, Absent) else answer)
 
 
 def _call(node: Node, ports: frozenset[str]) -> Callable[[_Inputs], Any]:

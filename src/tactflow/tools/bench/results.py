@@ -6,7 +6,8 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from statistics import median
+
+import numpy as np
 
 from tactflow.engine.errors import ConfigError
 from tactflow.tools.bench.quantities import QUANTITIES
@@ -19,6 +20,8 @@ CLASSIC = "classic"
 """Name of the pipeline that is the yardstick: the original script."""
 TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
 """Kind of frame -> quantity that is its median CPU time, ms."""
+LEFT_OUT = "frames_left_out"
+"""Quantity that counts the frames a method was too slow for; there is none if it was measured on all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +30,8 @@ class Measurement:
 
     group : what is compared: "pipeline", or the id of a stage. method : name of the pipeline, or of the way
     to do the stage's work. scene : simulated scene.
-    values : key of `QUANTITIES`, or one of `TIMES`, or "frames" for the number of frames -> finite value.
+    values : finite numbers: errors by their keys in `QUANTITIES`; median CPU times by those in `TIMES`, and
+    their quartiles with `_low` and `_high` behind; "frames", the number of frames; and `LEFT_OUT`.
     """
 
     group: str
@@ -74,13 +78,24 @@ class BenchResult:
         *,
         times: Mapping[str, Collection[float]] | None = None,
         frames: int,
+        left_out: int = 0,
     ) -> None:
-        """Add the errors of a method on a scene, and the median of CPU times, s, of each kind of frame."""
+        """Add the errors of a method on a scene, and the quartiles of CPU times, s, of each kind of frame.
+
+        frames : number of measured frames. left_out : of those that the method was too slow for.
+        """
         values = dict(errors)
         for kind, quantity in TIMES.items():
             if samples := (times or {}).get(kind):
-                values[quantity] = 1e3 * median(samples)
+                low, middle, high = np.quantile(1e3 * np.array(list(samples)), [0.25, 0.5, 0.75])
+                values |= {
+                    quantity: float(middle),
+                    f"{quantity}_low": float(low),
+                    f"{quantity}_high": float(high),
+                }
         values["frames"] = float(frames)
+        if left_out:
+            values[LEFT_OUT] = float(left_out)
         self.measured.append(Measurement(group, method, scene, values))
 
     def measurements(self, group: str) -> list[Measurement]:
@@ -99,6 +114,7 @@ class BenchResult:
 def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
     """Errors of a stored run: group/method/scene -> quantity -> error.
 
+    Without those of methods that were too slow for all frames: which frames those are depends on the machine.
     Raises ConfigError if the file is not a result of the bench, or of a quick run while this one is full, or
     the other way round, because their scenes differ.
     """
@@ -116,6 +132,7 @@ def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
     return {
         key: {name: value for name, value in values.items() if name in QUANTITIES}
         for key, values in stored["values"].items()
+        if LEFT_OUT not in values
     }
 
 
@@ -129,10 +146,11 @@ def regressions(
     stored : of `load_errors`. scenes : the simulated scenes that were chosen, or None for all.
     """
     now = {m.key: m.errors for m in result.measured}
+    incomplete = {m.key for m in result.measured if LEFT_OUT in m.values}
     worse = []
     for key, errors in stored.items():
         scene = key.rpartition("/")[2]
-        if scenes is not None and scene not in scenes:
+        if key in incomplete or (scenes is not None and scene not in scenes):
             continue
         for name, value in errors.items():
             quantity, current = QUANTITIES[name], now.get(key, {}).get(name)

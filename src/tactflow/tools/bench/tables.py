@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 
 import numpy as np
 
 from tactflow.system.terminal import markdown
 from tactflow.tools.bench.quantities import QUANTITIES
-from tactflow.tools.bench.results import CLASSIC, PIPELINE, TIMES, BenchResult, Measurement
+from tactflow.tools.bench.results import CLASSIC, LEFT_OUT, PIPELINE, TIMES, BenchResult, Measurement
 
 TITLES = {
     PIPELINE: "Whole pipelines",
@@ -75,7 +75,7 @@ def _methods(result: BenchResult, group: str) -> Iterator[str]:
     rows = []
     for method in dict.fromkeys(m.method for m in measured):
         own = [m.values for m in measured if m.method == method]
-        row = [method]
+        row = [method + _measured_frames(own)]
         for key in TIMES.values():
             times = [values[key] for values in own if key in values]
             row.append(_number(median(times)) if times else "-")
@@ -85,7 +85,15 @@ def _methods(result: BenchResult, group: str) -> Iterator[str]:
             row.append(f"{_number(median(errors))} ({_number(worst)})" if errors else "-")
         rows.append(row)
     text = "Median over the scenes, in brackets the worst one."
+    if any(LEFT_OUT in m.values for m in measured):
+        text += " Methods with a number of frames behind their name were too slow for all of them."
     return markdown(TITLES.get(group, group), text, heads, rows)
+
+
+def _measured_frames(own: Sequence[Mapping[str, float]]) -> str:
+    """How many frames a method was measured on, if not all."""
+    left_out, frames = (int(sum(values.get(key, 0) for values in own)) for key in (LEFT_OUT, "frames"))
+    return f" ({frames} of {frames + left_out} frames)" if left_out else ""
 
 
 def _scenes(result: BenchResult) -> Iterator[str]:

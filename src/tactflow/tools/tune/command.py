@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from tactflow.tools.tune import report
     from tactflow.tools.tune.recording import take
     from tactflow.tools.tune.search import Goal, search
-    from tactflow.tools.tune.space import candidates
+    from tactflow.tools.tune.space import candidates, swaps
 
     with notes("ERROR"), tempfile.TemporaryDirectory(prefix="tactflow-tune-") as name:
         folder = Path(name)
@@ -72,7 +72,8 @@ def run(args: argparse.Namespace) -> int:
             file = find_pipeline("markerless")
             say(f"no dots are found: starting from {file.name}")
         trials = candidates(file, recording.size, None if dots is None else dots.pitch, args.sensor)
-        tuned = search(trials, recording, folder, Goal(args.max_error, args.max_ms), say)
+        goal = Goal(args.max_error, args.max_ms)
+        tuned = search(trials, recording, folder, goal, say, swaps(file, args.sensor))
     show(report.lines(tuned))
     if tuned.chosen is None:
         say(tuned.impossible())

@@ -14,7 +14,7 @@ from tactflow.tools.bench.lockstep import TimedResult, on_recording, take_turns,
 from tactflow.tools.bench.quantities import Tally, rms
 from tactflow.tools.bench.scenes import Rendered
 from tactflow.tools.bench.score import PipelineScore
-from tactflow.tools.bench.timing import Times
+from tactflow.tools.bench.timing import BLOCK, Times
 from tactflow.tools.tune.recording import Recording
 
 ERRORS: Final = {
@@ -35,7 +35,7 @@ outside a tolerance is unsound. Chosen by hand."""
 DISAGREEMENT: Final = 10.0
 """Frames of the recording, %, in which a pipeline may disagree with the most expensive one about contact: the
 simulator lacks the sensor's light, wrinkles and stains. All differ at the ends of presses. Chosen by hand."""
-FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask.method"})
+FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask", "stages.flow_in_mask.method"})
 """Settings that change nothing but the mean flow."""
 
 
@@ -68,8 +68,15 @@ class Trial:
         return not self.fault and math.isfinite(self.error)
 
 
-def judge(trials: Sequence[Trial], recordings: Sequence[Rendered]) -> None:
-    """Set the errors and faults of trials on simulated recordings, in turns."""
+def judge(
+    trials: Sequence[Trial], recordings: Sequence[Rendered], block: int = BLOCK, limit_s: float = math.inf
+) -> dict[str, float]:
+    """Set the errors and faults of trials on simulated recordings, in turns.
+
+    block, limit_s : as for `take_turns`. Returns the name of each trial without a fault -> median CPU time of
+    a frame with contact, ms, on the last recording.
+    """
+    ms: dict[str, float] = {}
     tallies = {trial.name: Tally() for trial in trials}
     scales = dict.fromkeys(tallies, 1.0)
     for rendered in recordings:
@@ -82,13 +89,15 @@ def judge(trials: Sequence[Trial], recordings: Sequence[Rendered]) -> None:
 
         running = [trial for trial in trials if not trial.fault]
         ready = {t.name: on_recording(_on_sensor(t.pipeline), rendered.path) for t in running}
-        _, failures = take_turns(ready, observe)
+        times, failures = take_turns(ready, observe, block, limit_s)
         for trial in running:
             trial.fault = failures.get(trial.name, "")
+        ms = {trial.name: _busy_ms(times[trial.name]) for trial in running if not trial.fault}
     for trial in trials:
         if not trial.fault:
             trial.quantities = tallies[trial.name].errors()
             trial.errors = _errors(tallies[trial.name], scales[trial.name])
+    return ms
 
 
 def _on_sensor(pipeline: Pipeline) -> Pipeline:

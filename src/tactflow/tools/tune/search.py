@@ -24,6 +24,13 @@ WORTHWHILE: Final = 0.95
 """Time, relative to the user's own pipeline, above which another one does not replace it: less is within the
 scatter of two measurements. Chosen by hand."""
 
+FIRST_LOOK: Final = Case("press", 24)
+"""Short recording on which single swaps are compared with the original, before those that are worth it are
+measured like the other candidates."""
+FIRST_LOOK_S, FIRST_TURN = 3.0, 4
+"""CPU time on that recording after which a swap is too slow, s, about 15 times that of the default pipeline;
+frames in a turn, so that a swap of a second a frame does not take much longer."""
+
 
 @dataclass(frozen=True)
 class Goal:
@@ -87,10 +94,13 @@ def search(
     folder: Path,
     goal: Goal,
     say: Callable[[str], None] = lambda _: None,
+    swaps: Sequence[Trial] = (),
 ) -> Tuned:
     """Measure all candidates, and choose the best.
 
-    candidates : most expensive first. folder : for temporary files. say : called with progress messages.
+    candidates : most expensive first, the original among them. folder : for temporary files. say : called
+    with progress messages. swaps : further candidates, each of which changes one stage of the original; those
+    that are neither faster nor more accurate than it at first sight are left out.
 
     Raises
     ------
@@ -99,6 +109,10 @@ def search(
     """
     look = fit(recording)
     say(f"fitted simulator: {look}")
+    if swaps:
+        worth = _at_first_sight(swaps, candidates, Fitted(look, FIRST_LOOK, folder, FIRST_LOOK.frames))
+        say(f"{len(swaps)} stages swapped, worth a closer look: {', '.join(t.name for t in worth) or 'none'}")
+        candidates = [*candidates, *worth]
     say(f"{len(candidates)} candidates on {sum(case.frames for case in SIMULATED)} simulated frames")
     judge(candidates, [Fitted(look, case, folder, case.frames) for case in SIMULATED])
     mark_unsound(candidates)
@@ -107,6 +121,25 @@ def search(
     measure_on_recording(candidates, recording)
     _require_usable(candidates)
     return Tuned(recording, look, goal.order(candidates), goal.choose(candidates))
+
+
+def _at_first_sight(swaps: Sequence[Trial], candidates: Sequence[Trial], rendered: Fitted) -> list[Trial]:
+    """The swaps that are sound, and faster or more accurate than the original, on a short recording."""
+    original = next(trial for trial in candidates if trial.name == ORIGINAL)
+    reference = Trial(ORIGINAL, {}, original.pipeline)
+    compared = [reference, *(Trial(swap.name, swap.settings, swap.pipeline) for swap in swaps)]
+    ms = judge(compared, [rendered], FIRST_TURN, FIRST_LOOK_S)
+    mark_unsound(compared)
+    better = {
+        trial.name
+        for trial in compared[1:]
+        if trial.usable
+        and (
+            ms[trial.name] < WORTHWHILE * ms.get(ORIGINAL, math.inf)
+            or trial.error < WORTHWHILE * reference.error
+        )
+    }
+    return [swap for swap in swaps if swap.name in better]
 
 
 def _require_usable(trials: Sequence[Trial]) -> None:

@@ -1,4 +1,6 @@
-"""The pipelines that `tactflow tune` tries: all combinations of a few alternatives."""
+"""The pipelines that `tactflow tune` tries: all combinations of a few alternatives, and single swaps of
+stages.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactflow.config.load import load_pipeline
+from tactflow.config.models import RESERVED
 from tactflow.config.overrides import from_settings
+from tactflow.config.replacements import methods_of, replacements
 from tactflow.engine.errors import ConfigError
 from tactflow.tools.tune.measure import Trial
 
@@ -25,9 +29,7 @@ AXES: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {
     "fusion": {"fusion": {}, "no fusion": {"stages.fusion": None}},
     "field": {"field": {}, "mean": {"stages.field": None, "stages.flow_in_mask.method": "mean"}},
 }
-"""Stage -> name of an alternative -> its settings, most expensive first. `inpaint` is not varied: telea and
-ns take 300 times as long as `normalized` and are no more accurate, and without inpainting the error of the
-contact's centre is three to eight times as large (scene `press`)."""
+"""Stage -> name of an alternative -> its settings, most expensive first. They are combined."""
 
 
 def candidates(
@@ -77,4 +79,39 @@ def candidates(
             found.append(Trial(", ".join(names), settings, pipeline))
     if not any(candidate.name == ORIGINAL for candidate in found):
         found.insert(1, Trial(ORIGINAL, {}, original))
+    return found
+
+
+def swaps(file: Path, sensor: str | None = None) -> list[Trial]:
+    """The original with one of its stages swapped for another: every `method` of each stage, and everything
+    registered that can take its place.
+
+    A swapped stage keeps the keys of the file, and the parameters that both have. Swaps that the pipeline
+    does not allow are left out.
+
+    file, sensor : as for `candidates`.
+
+    >>> from tactflow.config.shipped import find_pipeline
+    >>> [trial.name for trial in swaps(find_pipeline("markerless"))][-3:]
+    ['hull: classic_hull', 'hull: fit_line', 'hull: min_area_rect']
+    """
+    original = load_pipeline(file, sensor=sensor)
+    found = []
+    for id_, node in original.nodes.items():
+        entry = dict(original.settings["stages"].get(id_) or {}) if node.component.kind == "stage" else None
+        if entry is None:
+            continue
+        present = getattr(node.params, "method", None)
+        others = [method for method in methods_of(node.component) if method != present]
+        ways = {method: entry | {"method": method} for method in others}
+        for other in replacements(node.component, (node.component for node in original.nodes.values())):
+            shared = {key: entry[key] for key in entry if key in RESERVED or key in other.params.model_fields}
+            ways[other.name] = shared | {"use": other.name}
+        for name, changed in ways.items():
+            settings = {f"stages.{id_}": changed}
+            try:
+                pipeline = load_pipeline(file, from_settings(settings), sensor=sensor)
+            except ConfigError:
+                continue
+            found.append(Trial(f"{id_}: {name}", settings, pipeline))
     return found
