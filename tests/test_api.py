@@ -118,7 +118,7 @@ def test_of_a_live_source_a_slow_loop_gets_the_newest_results() -> None:
 
 @pytest.mark.usefixtures("folder")
 def test_a_loop_may_take_its_time_at_the_end_of_a_recording(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.0)
+    monkeypatch.setattr("tactflow.engine.threads.CLOSE_SECONDS", 0.0)
     seqs = []
     for result in tactflow.stream(max_frames=4):
         # Longer than a run looks on before it calls something hanging.
@@ -132,7 +132,7 @@ def test_an_unforeseen_error_reaches_the_loop(monkeypatch: pytest.MonkeyPatch) -
     def fail(*_: object) -> None:
         raise RuntimeError("not foreseen")
 
-    monkeypatch.setattr("tactflow.engine.run.Segment", fail)
+    monkeypatch.setattr("tactflow.engine.threads.Segment", fail)
     with pytest.raises(RuntimeError, match="not foreseen"):
         list(tactflow.stream())
 
@@ -150,7 +150,7 @@ def test_an_interrupt_reaches_who_has_started_the_run(monkeypatch: pytest.Monkey
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tactflow.engine.run.Runner._wait", interrupted)
+    monkeypatch.setattr("tactflow.engine.threads.Threads.wait", interrupted)
     with pytest.raises(KeyboardInterrupt):
         tactflow.run()
     assert not background()

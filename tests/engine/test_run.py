@@ -39,6 +39,11 @@ def ran(runner: Runner) -> RunResult:
     return result
 
 
+def threads_of_runs() -> list[str]:
+    """The threads of segments that have not ended."""
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("tactflow-")]
+
+
 # -- values -----------------------------------------------------------------------------------------------
 
 
@@ -500,7 +505,7 @@ def test_a_run_that_is_stopped_before_its_sinks_are_open_opens_none(toy_runner: 
 def test_a_slow_stage_may_finish_what_waits_after_a_stop(
     toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 1.0)
+    monkeypatch.setattr("tactflow.engine.threads.CLOSE_SECONDS", 1.0)
     queue = {"capacity": 8, "when_full": "block"}
     slow = {"join": {"seconds": 0.02, "segment": "slow", "queue": queue}, "capture": {"frames": 10_000}}
     runner = toy_runner(slow)
@@ -509,10 +514,10 @@ def test_a_slow_stage_may_finish_what_waits_after_a_stop(
         """As if the stage took 0.2 s for a frame, and nothing else any time."""
         return 0.2 * len(seen(runner, "join")) if "join" in runner.nodes else 0.0
 
-    monkeypatch.setattr("tactflow.engine.run.time", SimpleNamespace(perf_counter=clock))
+    monkeypatch.setattr("tactflow.engine.threads.time", SimpleNamespace(perf_counter=clock))
 
     def stop_when_full(_: object) -> None:
-        if any(link.stats()["high_water"] == 8 for link in runner._links):
+        if any(link["high_water"] == 8 for link in runner.snapshot()["links"].values()):
             runner.stop()
 
     result = runner.run(on_progress=stop_when_full)
@@ -526,21 +531,20 @@ def test_a_run_of_no_frames_is_a_mistake(toy_runner: MakeRunner) -> None:
 
 
 def test_a_stage_that_hangs_is_named(toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactflow.engine.run.CLOSE_SECONDS", 0.2)
+    monkeypatch.setattr("tactflow.engine.threads.CLOSE_SECONDS", 0.2)
     runner = toy_runner({"join": {"seconds": 60}, "capture": {"frames": 3}})
     result = runner.run(on_progress=lambda _: runner.stop())
     assert result.exit_code == 3
     assert "compute (in join) hangs" in str(result.error)
     runner.nodes["join"].instance.release.set()
-    for thread in runner._threads.values():
-        thread.join(PATIENCE)
+    until(lambda: not threads_of_runs())
 
 
 def interrupt_in_join(runner: Runner) -> RunResult:
     """Run, and interrupt as soon as `join` is being called."""
 
     def interrupt(_: object) -> None:
-        if runner._segments["compute"].current == "join":
+        if runner.nodes["join"].instance.called.is_set():
             raise KeyboardInterrupt
 
     return runner.run(on_progress=interrupt, interval_s=0.001)
@@ -549,24 +553,23 @@ def interrupt_in_join(runner: Runner) -> RunResult:
 def test_nothing_is_closed_while_a_thread_is_in_it(
     toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", 0.1)
+    monkeypatch.setattr("tactflow.engine.threads.LEAVE_SECONDS", 0.1)
     runner = toy_runner({"join": {"seconds": PATIENCE}, "capture": {"frames": 3}})
     assert interrupt_in_join(runner).exit_code == INTERRUPTED
     closed = {name: node.instance.closed for name, node in runner.nodes.items()}
     assert closed.pop("join") == 0
     assert set(closed.values()) == {1}
     runner.nodes["join"].instance.release.set()
-    for thread in runner._threads.values():
-        thread.join(PATIENCE)
+    until(lambda: not threads_of_runs())
 
 
 def test_an_interrupted_run_lets_its_threads_end_before_it_closes(
     toy_runner: MakeRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactflow.engine.run.LEAVE_SECONDS", PATIENCE)
+    monkeypatch.setattr("tactflow.engine.threads.LEAVE_SECONDS", PATIENCE)
     runner = toy_runner({"join": {"seconds": 0.2}, "capture": {"frames": 3}})
     assert interrupt_in_join(runner).exit_code == INTERRUPTED
-    assert not any(thread.is_alive() for thread in runner._threads.values())
+    assert not threads_of_runs()
     assert runner.nodes["join"].instance.closed == 1
 
 

@@ -97,7 +97,7 @@ class Counted:
         self.rows: list[Any] = []
         self.captured: list[float] = []
         self.opened = self.closed = self.resets = 0
-        self.release = threading.Event()
+        self.called, self.release = threading.Event(), threading.Event()
 
     def open(self) -> None:
         self.opened += 1
@@ -106,6 +106,7 @@ class Counted:
         self.closed += 1
 
     def saw(self, seq: int) -> None:
+        self.called.set()
         if self.params.seconds:
             self.release.wait(self.params.seconds)
         if seq == self.params.fail_at or seq >= self.params.fail_from:

@@ -10,21 +10,21 @@ from __future__ import annotations
 import logging
 import os
 import traceback
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tactflow.engine.conformance import METHODS
 from tactflow.engine.contract import Stage
+from tactflow.engine.ending import Ending
 from tactflow.engine.errors import StageError, TactflowError
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Node
 from tactflow.engine.link import Link
 from tactflow.engine.node import RunningNode, TickState
-
-if TYPE_CHECKING:
-    from tactflow.engine.run import Runner
+from tactflow.engine.plan import Plan
+from tactflow.engine.stats import Durations
 
 logger = logging.getLogger("tactflow")
 
@@ -70,7 +70,8 @@ class NewReferences:
 class Segment:
     """Evaluates the nodes of one segment for a tick.
 
-    name : in the plan. run : that it belongs to.
+    name : in the plan. nodes : all open ones of the run. ending : of the run. latency : of its data sinks.
+    retake : asks the source for a new reference.
 
     Attributes
     ----------
@@ -80,23 +81,32 @@ class Segment:
     request of its stages; None if other stages may have processed those frames already.
     """
 
-    def __init__(self, name: str, run: Runner) -> None:
+    def __init__(
+        self,
+        name: str,
+        plan: Plan,
+        nodes: Mapping[str, RunningNode],
+        ending: Ending,
+        latency: Durations,
+        retake: Callable[[], None],
+    ) -> None:
         self.name = name
-        self.run = run
-        ids = run.plan.segments[name]
-        self.nodes = [run.nodes[id_] for id_ in ids if id_ in run.nodes]
+        self._ending = ending
+        self._latency = latency
+        self._retake = retake
+        self.nodes = [nodes[id_] for id_ in plan.segments[name] if id_ in nodes]
         by_id = {node.id: node for node in self.nodes}
         for node in self.nodes:
             node.makers = _existing(by_id, [ref.node for ref in node.node.inputs.values() if ref])
             if node.gates:
                 node.signal_makers = _existing(by_id, [gate.signal.node for gate in node.node.gates])
-        roots = run.plan.roots(name)
+        roots = plan.roots(name)
         self._roots = [(by_id[id_], sinks) for id_, sinks in roots.items() if id_ in by_id]
         self._watchers = [
             (node.stage, maker, slot)
             for node in self.nodes
             if node.stage is not None
-            for maker, slot in _last_with(node.stage.watches, run.nodes.values())
+            for maker, slot in _last_with(node.stage.watches, nodes.values())
         ]
         self._data_sinks = [n for n in self.nodes if n.sink and not n.node.component.delivery.observer]
         self.inputs: list[Link[TickState]] = []
@@ -135,7 +145,7 @@ class Segment:
             stage.watched = maker not in self.nodes or tick.values[slot] is not False
         self.current = None
         if tick.demand and self._data_sinks:
-            self.run.latency.add(perf_counter() - tick.frame.captured)
+            self._latency.add(perf_counter() - tick.frame.captured)
 
     def _pull(self, node: RunningNode, tick: TickState) -> None:
         """Evaluate a node and what it needs, unless a gate, an absent or unchanged inputs make it skip."""
@@ -192,7 +202,7 @@ class Segment:
         if self.references is not None:
             self.references.ask(reason)
         else:
-            self.run.retake_reference()
+            self._retake()
 
     def _failed(self, node: RunningNode, tick: TickState, inputs: Sequence[Any], error: Exception) -> None:
         node.stats.errors += 1
@@ -210,7 +220,7 @@ class Segment:
                 failure = StageError(
                     f"{failure}\n  (the budget of {policy.budget} skipped frames is used up)"
                 )
-            self.run.fail(failure, error)
+            self._ending.fail(failure, error)
             raise NodeFailedError
 
     def _forward(self, tick: TickState) -> None:
@@ -247,7 +257,7 @@ class Segment:
         except NodeFailedError:
             pass
         except BaseException as error:
-            self.run.fail(StageError(f"segment {self.name}: {type(error).__name__}: {error}"), error)
+            self._ending.fail(StageError(f"segment {self.name}: {type(error).__name__}: {error}"), error)
         finally:
             for link in self.inputs:
                 link.abort()
