@@ -1,9 +1,9 @@
-# make run          the pipeline on the simulated sensor, publishing over ZeroMQ, with its live view
-# make test         lint, types, tests
+# make run          the pipeline on the simulated sensor, for a minute; open the printed address to watch
+# make test         lint, types, tests; the summary says what was skipped
 # make soak         what takes longer: faults in running processes, a million frames (two hours)
 # make load         results, drops, latency and memory against the load (five minutes)
 # make audit        known weaknesses of the packages that are used, where the list can be reached
-# make lock         pins the packages anew, with hashes; LOCK=--upgrade takes newer ones
+# make lock         requirements.lock anew: all packages of all environments; LOCK=--upgrade takes newer ones
 # make docs         the site in build/site, from docs/ and examples/gallery (an environment of its own)
 # make packages     the wheel and the sdist in dist/, checked as a package index does
 # make ros-env      rclpy in an environment of its own (130 MB), for the tests of the ROS 2 bridge
@@ -20,7 +20,10 @@ ROS := $(VENV)-ros
 LEROBOT := $(VENV)-lerobot
 DOCS := $(VENV)-docs
 PEERS := $(VENV)-peers
-PIP := $(PY) -m pip --quiet --disable-pip-version-check --no-input
+PIP := -m pip --quiet --disable-pip-version-check --no-input
+# Nothing is installed that is not the file whose hash stands in requirements.lock; what builds is one of them.
+LOCKED := packaging/lock.py install
+ITSELF := install --no-deps --no-build-isolation --editable .
 
 # Debian packages that tests use; without them those tests say that they were skipped.
 SYSTEM_DEPS := chromium ffmpeg
@@ -29,7 +32,7 @@ SYSTEM_DEPS := chromium ffmpeg
 	system-deps clean
 
 run: $(VENV)/.installed
-	$(VENV)/bin/tactflow run pipeline.yaml --realtime
+	$(VENV)/bin/tactflow run pipeline.yaml --realtime --source "sim:press?frames=3600"
 
 test: lint types
 	$(PY) -m pytest -m "not slow" --numprocesses auto --dist loadfile --no-loadscope-reorder
@@ -55,26 +58,23 @@ types: $(VENV)/.installed-test
 $(VENV)/bin/python:
 	python3 -m venv $(VENV)
 
-# Nothing is installed that is not the file whose hash stands here; what builds is one of them.
-$(VENV)/.installed: pyproject.toml setup.py requirements.txt | $(VENV)/bin/python
-	$(PIP) install --require-hashes --requirement requirements.txt
-	$(PIP) install --no-deps --no-build-isolation --editable .
+$(VENV)/.installed: pyproject.toml setup.py requirements.lock | $(VENV)/bin/python
+	$(PY) $(LOCKED) run
+	$(PY) $(PIP) $(ITSELF)
 	@touch $@
 
-$(VENV)/.installed-test: pyproject.toml setup.py requirements-test.txt | $(VENV)/bin/python
-	$(PIP) install --require-hashes --requirement requirements-test.txt
-	$(PIP) install --no-deps --no-build-isolation --editable .
+$(VENV)/.installed-test: pyproject.toml setup.py requirements.lock | $(VENV)/bin/python
+	$(PY) $(LOCKED) test
+	$(PY) $(PIP) $(ITSELF)
 	@touch $@ $(VENV)/.installed
 
 docs: $(DOCS)/.installed
 	$(DOCS)/bin/python docs/site/build.py build/site
 
-$(DOCS)/.installed: pyproject.toml setup.py docs/site/requirements.txt
+$(DOCS)/.installed: pyproject.toml setup.py requirements.lock
 	python3 -m venv $(DOCS)
-	$(DOCS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--require-hashes --requirement docs/site/requirements.txt
-	$(DOCS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--no-deps --no-build-isolation --editable .
+	$(DOCS)/bin/python $(LOCKED) docs
+	$(DOCS)/bin/python $(PIP) $(ITSELF)
 	@touch $@
 
 packages: $(TOOLS)/.installed
@@ -86,26 +86,25 @@ packages: $(TOOLS)/.installed
 ros-env: $(ROS)/.installed
 
 # Beside it there is no tactflow, as on a robot.
-$(ROS)/.installed: plugins/ros/requirements.txt
+$(ROS)/.installed: requirements.lock
 	python3 -m venv $(ROS)
-	$(ROS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--require-hashes --requirement plugins/ros/requirements.txt
+	$(ROS)/bin/python $(LOCKED) ros
 	@touch $@
 
 lerobot-env: $(LEROBOT)/.installed
 
-# Without what LeRobot's cameras do not import, see left_out.txt; the other packages are those that are listed.
-$(LEROBOT)/.installed: plugins/lerobot/camera/requirements.txt plugins/lerobot/camera/pyproject.toml pyproject.toml
+# Without what LeRobot's cameras do not import, see left_out.txt. Of the two packages that own the folder cv2,
+# the one with more in it comes last.
+$(LEROBOT)/.installed: requirements.lock plugins/lerobot/camera/pyproject.toml pyproject.toml
 	python3 -m venv $(LEROBOT)
-	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--no-deps --require-hashes --requirement plugins/lerobot/camera/requirements.txt
-	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--no-deps --no-build-isolation --editable . --editable plugins/lerobot/camera
+	$(LEROBOT)/bin/python $(LOCKED) lerobot
+	$(LEROBOT)/bin/python $(LOCKED) lerobot --again opencv-contrib-python-headless
+	$(LEROBOT)/bin/python $(PIP) $(ITSELF) --editable plugins/lerobot/camera
 	@touch $@
 
 # Bounds as in LeRobot 0.4.4. On a machine without CUDA, `pip config set global.extra-index-url` with PyTorch's index for CPUs saves 4 GB.
 lerobot-datasets: $(LEROBOT)/.installed
-	$(LEROBOT)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+	$(LEROBOT)/bin/python $(PIP) install \
 		"torch<2.11" "torchvision<0.26" "accelerate<2" "datasets<5" "huggingface-hub<0.36" "av<16" \
 		pandas pyarrow jsonlines einops
 
@@ -123,44 +122,31 @@ peers-page: peers
 # For CPUs alone, as for lerobot-datasets. pytouch's requirements have no wheels here; it imports an old torchvision.
 $(PEERS)/.installed: lab/peers/requirements.txt pyproject.toml
 	python3 -m venv $(PEERS)
-	$(PEERS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
-		--requirement lab/peers/requirements.txt
-	$(PEERS)/bin/python -m pip --quiet --disable-pip-version-check --no-input install \
+	$(PEERS)/bin/python $(PIP) install --requirement lab/peers/requirements.txt
+	$(PEERS)/bin/python $(PIP) install \
 		--no-deps --no-build-isolation pytouch==0.4.2 torchvision==0.15.2 --editable .
 	@touch $@
 
 $(PEERS)-others/%/.installed:
 	python3 -m venv $(@D)
-	$(@D)/bin/python -m pip --quiet --disable-pip-version-check --no-input install $(PIN_$*)
+	$(@D)/bin/python $(PIP) install $(PIN_$*)
 	@touch $@
 
 $(TOOLS)/.installed:
 	python3 -m venv $(TOOLS)
-	$(TOOLS)/bin/python -m pip --quiet --disable-pip-version-check install \
+	$(TOOLS)/bin/python $(PIP) install \
 		pip-audit uv build twine check-wheel-contents
 	@touch $@
 
-# For every Python from 3.11 on and every system. The second file is a part of the first.
-COMPILE = $(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
-	--custom-compile-command "make lock"
 lock: $(TOOLS)/.installed
-	echo "setuptools>=77" | $(COMPILE) $(LOCK) --extra test --output-file requirements-test.txt pyproject.toml -
-	echo "setuptools>=77" | $(COMPILE) --extra all --constraint requirements-test.txt \
-		--output-file requirements.txt pyproject.toml -
-	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
-		--custom-compile-command "make lock" $(LOCK) --output-file plugins/ros/requirements.txt plugins/ros/requirements.in
-	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
-		--custom-compile-command "make lock" $(LOCK) --override plugins/lerobot/camera/left_out.txt \
-		--output-file plugins/lerobot/camera/requirements.txt plugins/lerobot/camera/requirements.in
-	$(TOOLS)/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes --no-annotate \
-		--custom-compile-command "make lock" $(LOCK) --constraint requirements-test.txt --extra plot \
-		--output-file docs/site/requirements.txt docs/site/requirements.in pyproject.toml
+	$(TOOLS)/bin/python packaging/lock.py make $(LOCK)
 
 ADVISORIES := https://pypi.org/pypi/numpy/2.0.0/json
 audit: $(TOOLS)/.installed
 	@$(TOOLS)/bin/python -c "from urllib.request import urlopen; urlopen('$(ADVISORIES)', timeout=30)" 2>/dev/null || \
 		{ echo "audit: $(ADVISORIES) cannot be reached; nothing was checked" >&2; exit 1; }
-	$(TOOLS)/bin/pip-audit --strict --disable-pip --require-hashes --requirement requirements-test.txt
+	$(TOOLS)/bin/python packaging/lock.py show test > $(TOOLS)/requirements.txt
+	$(TOOLS)/bin/pip-audit --strict --disable-pip --require-hashes --requirement $(TOOLS)/requirements.txt
 
 # apt may be busy with something else: try again for a while.
 system-deps:

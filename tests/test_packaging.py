@@ -57,6 +57,40 @@ def test_the_conda_recipe_needs_what_the_wheel_needs() -> None:
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     recipe = yaml.safe_load((PACKAGING / "conda" / "recipe.yaml").read_text())
     ours = {line.replace(" ", "") for line in recipe["requirements"]["run"] if not line.startswith("python")}
-    theirs = {line.replace("opencv-python-headless", "py-opencv") for line in project["dependencies"]}
+    theirs = {line.replace("opencv-contrib-python-headless", "py-opencv") for line in project["dependencies"]}
     assert ours == theirs
     assert recipe["context"]["version"] == project["version"]
+
+
+def locked(environment: str) -> list[str]:
+    command = [sys.executable, str(PACKAGING / "lock.py"), "show", environment]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return re.findall(r"^\S+==\S+(?: ;.*?)?(?= \\$)", shown, re.MULTILINE)
+
+
+def test_the_lock_file_has_every_package_that_an_environment_needs() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    for environment, requirements in {"run": extras["all"], "test": extras["test"]}.items():
+        pinned = {line.partition("==")[0].lower() for line in locked(environment)}
+        pending, needed = [*project["dependencies"], *requirements], set()
+        while pending:
+            name, _, more = re.split(r"([\[<>=!~;]|$)", pending.pop().replace(" ", ""), maxsplit=1)
+            if name == "tactflow":
+                pending += [line for extra in more.rstrip("]").split(",") for line in extras[extra]]
+            else:
+                needed.add(name.lower())
+        assert needed <= pinned, environment
+
+
+@pytest.mark.parametrize("environment", ["run", "test", "docs", "ros", "lerobot"])
+def test_an_environment_holds_one_version_of_each_package(environment: str) -> None:
+    pins = locked(environment)
+    unconditional = [line.partition("==")[0] for line in pins if ";" not in line]
+    assert len(unconditional) > 20
+    assert len(set(unconditional)) == len(unconditional)
+
+
+def test_beside_lerobot_both_packages_of_opencv_have_the_same_version() -> None:
+    versions = {line.partition("==")[2] for line in locked("lerobot") if line.startswith("opencv-")}
+    assert len(versions) == 1

@@ -1,4 +1,4 @@
-"""Build the site: `make docs`, or `python docs/site/build.py OUT` with docs/site/requirements.txt installed.
+"""Build the site: `make docs`, or `python packaging/lock.py install docs; python docs/site/build.py OUT`.
 
 The pages are README.md, docs/*.md, CONTRIBUTING.md and CHANGELOG.md as they are. Here they are copied into
 one folder, with links to where the site has them, pages for the public names and for the gallery are added,
