@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import logging
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import wraps
+from functools import cache, wraps
 from itertools import count
 from pathlib import Path
 from types import FrameType
@@ -31,9 +32,12 @@ from tactflow.engine.graph import Pipeline
 from tactflow.engine.ports import Port
 from tactflow.engine.run import Runner, RunResult
 from tactflow.sources.memory import MemoryFrames
+from tactflow.system.opencv import opencv_conflict
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
 from tactflow.vision import compiled
+
+logger = logging.getLogger("tactflow")
 
 S = TypeVar("S", bound=Stage)
 
@@ -175,10 +179,19 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
 
     options : passed to `Runner`.
     """
+    _warn_of_opencv()
     compiled.load()
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
     return Runner(with_recorded_calibration(pipeline), **options)
+
+
+@cache
+def _warn_of_opencv() -> None:
+    """Say once if several packages of OpenCV are installed that differ."""
+    packages = Path(cv2.__file__).parents[1]
+    if conflict := opencv_conflict(packages, has_contrib=hasattr(cv2, "ximgproc")):
+        logger.warning("%s", conflict)
 
 
 @contextmanager

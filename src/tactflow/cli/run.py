@@ -141,7 +141,8 @@ def _load(args: argparse.Namespace, file: Path, sensor: str | None, sinks: Sinks
 
 def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
     """Run one sensor's pipeline in this process."""
-    runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check)
+    with notes():
+        runner = make_runner(pipeline, max_frames=args.max_frames, check=args.check)
     if args.end_with_stdin:
         threading.Thread(target=_stop_at_end_of_input, args=(runner,), daemon=True).start()
     with notes(), ended_by_signals(runner) as caught:
