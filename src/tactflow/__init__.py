@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from tactflow.network.subscriber import Subscriber as Subscriber
     from tactflow.notebook import contact as contact
     from tactflow.notebook import draw as draw
+    from tactflow.notebook import plot as plot
     from tactflow.notebook import to_frame as to_frame
     from tactflow.sim.scenes import open_scene as open_scene
     from tactflow.streaming import stream as stream
@@ -57,7 +58,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "tactflow.api": ("load", "check", "run", "stage"),
     "tactflow.streaming": ("stream",),
-    "tactflow.notebook": ("contact", "draw", "to_frame"),
+    "tactflow.notebook": ("contact", "draw", "plot", "to_frame"),
     "tactflow.network.subscriber": ("Subscriber",),
     "tactflow.network.remote_control": ("RemoteControl",),
     "tactflow.sim.scenes": ("open_scene",),

@@ -1,4 +1,5 @@
-"""Functions for a notebook: one contact from two pictures, a picture of a result, results as a table."""
+"""Functions for a notebook: one contact from two pictures, a picture of a result, results as a table or as
+curves."""
 
 from __future__ import annotations
 
@@ -8,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.drawing.curves import collected
+from tactflow.drawing.plots import styled_figure
 from tactflow.drawing.results import Annotator
 from tactflow.message.columns import frame_columns
 from tactflow.message.result import Result
@@ -16,6 +19,11 @@ from tactflow.vision.types import Contact
 
 if TYPE_CHECKING:
     import pandas as pd  # type: ignore[import-untyped]
+    from matplotlib.figure import Figure
+
+PLOT_COLUMNS = 3
+PLOT_WIDTH, PLOT_HEIGHT = 360, 220
+"""Plots beside each other, and the size of one, px."""
 
 _WHOLE = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1, "stages.capture.settle": 0}
 """Settings of the default pipeline that use pictures unchanged and in this order."""
@@ -95,6 +103,43 @@ def draw(result: Result, image: NDArray[np.uint8] | None = None, **options: Any)
         scale=result.scale,
         normals=result.normals,
     )
+
+
+def plot(results: Iterable[Result]) -> Figure:
+    """Plot results over time: area, centre, flow, depth, force, slip, whichever they have; contacts shaded.
+
+    Parameters
+    ----------
+    results : from `stream`, or received; read to the end.
+
+    Returns
+    -------
+    A figure of matplotlib, which a notebook shows; `figure.savefig("run.png")` writes it.
+
+    Raises
+    ------
+    ImportError : matplotlib is not installed. ValueError : there are no results.
+
+    Examples
+    --------
+    >>> import tactflow
+    >>> figure = tactflow.plot(tactflow.stream(source="sim:press", max_frames=60))
+    >>> [axes.get_title(loc="left") for axes in figure.axes][:2]
+    ['Area of the contact, px²', 'Centre of the contact, px']
+    """
+    curves = collected(result.to_dict() for result in results)
+    if not len(curves.t):
+        raise ValueError("there are no results to plot")
+    present = curves.present()
+    columns = max(1, min(PLOT_COLUMNS, len(present)))
+    rows = max(1, -(-len(present) // columns))
+    try:
+        with styled_figure(PLOT_WIDTH * columns, PLOT_HEIGHT * rows) as figure:
+            for place, quantity in enumerate(present):
+                curves.draw(figure.add_subplot(rows, columns, place + 1), quantity)
+    except ModuleNotFoundError:
+        raise ImportError("tactflow.plot needs matplotlib: pip install 'tactflow[plot]'") from None
+    return figure
 
 
 def to_frame(results: Iterable[Result]) -> pd.DataFrame:

@@ -24,3 +24,7 @@ TUNE: Final = Command(
     "find the cheapest pipeline within an error budget, for one sensor, from a recording of it",
     "tactflow.tools.tune.command",
 )
+REPORT: Final = Command(
+    "make a page of any run: curves, largest contacts, what was skipped, where time went",
+    "tactflow.tools.report.command",
+)

@@ -15,6 +15,8 @@ MAX_PICTURES = 4
 """Pictures per recording: they fit next to each other."""
 PICTURE_SIDE = 240
 """Longer side of a picture, px."""
+PAPER_GREY = 45
+"""Grey level of the picture on which results without one are drawn."""
 _QUALITY = 70
 """JPEG quality of a picture, 1 to 100: about 7 kB. Chosen by hand."""
 
@@ -46,7 +48,7 @@ class Summary:
         self.touching += 1
         self.contacts += self._best is None
         self.largest = max(self.largest, float(contact.area))
-        if self._best is None or self._best.contact is None or contact.area > self._best.contact.area:
+        if self._best is None or _rank(result) > _rank(self._best):
             self._best = result
 
     def _end_contact(self) -> None:
@@ -67,9 +69,21 @@ class Summary:
         return sorted(self._pictures)
 
 
+def _rank(result: Result) -> tuple[bool, float]:
+    """Results with a picture first, then those with a large contact."""
+    pictured = result.image is not None or result.frame.image.size > 0
+    return pictured, 0.0 if result.contact is None else float(result.contact.area)
+
+
 def _jpeg(result: Result) -> bytes:
-    """A small picture of the processed (or else the raw) frame with the results drawn on it."""
+    """A small picture of the processed (or else the raw) frame with the results drawn on it.
+
+    Results without a picture are drawn on a uniform one.
+    """
     image = result.frame.image if result.image is None else result.image
+    if not image.size:
+        width, height = result.size
+        image = np.full((max(1, height), max(1, width), 3), PAPER_GREY, np.uint8)
     annotate = Annotator(text=False)
     drawn = annotate(image, contact=result.contact, flow=result.flow, markers=result.markers)
     scale = min(1.0, PICTURE_SIDE / max(drawn.shape[:2]))
