@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLOT_COLUMNS = 3
+"""Plots beside each other."""
 PLOT_WIDTH, PLOT_HEIGHT = 360, 220
-"""Plots beside each other, and the size of one, px."""
+"""Size of a plot, px."""
 
 _WHOLE = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1, "stages.capture.settle": 0}
 """Settings of the default pipeline that use pictures unchanged and in this order."""
