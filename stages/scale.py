@@ -10,6 +10,7 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Absent
 from tactflow.ports import Untouched
+from tactflow.system.spelling import distinct
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale as MillimetresPerPixel
 
@@ -52,9 +53,10 @@ class Scale(Stage):
         unlike = 100 * calibration.unlikeness(untouched)
         misfit = calibration.misfit(mapping)
         if misfit is None and kind is not None and unlike > 100 * UNLIKE_KIND:
+            measured, limit = distinct(unlike, 100 * UNLIKE_KIND)
             misfit = (
-                f"the untouched gel differs from one by {unlike:.0f} % of its brightness "
-                f"({100 * UNLIKE_KIND:.0f} % at most): another sensor, a turned picture, or "
+                f"the untouched gel differs from one by {measured} % of its brightness "
+                f"({limit} % at most): another sensor, a turned picture, or "
                 "something touches it"
             )
         if misfit is not None:
@@ -66,10 +68,9 @@ class Scale(Stage):
             return None
         if kind is None and unlike > 100 * UNLIKE:
             logger.warning(
-                "scale: the untouched gel differs by %.0f %% of its brightness from the calibrated one "
-                "(%.0f %% is usual at most): another sensor, another light, or something touches it",
-                unlike,
-                100 * UNLIKE,
+                "scale: the untouched gel differs by %s %% of its brightness from the calibrated one "
+                "(%s %% is usual at most): another sensor, another light, or something touches it",
+                *distinct(unlike, 100 * UNLIKE),
             )
         elif kind is not None and first:
             _describe_default(calibration)

@@ -263,3 +263,36 @@ def test_results_and_commands_go_over_ipv6_too() -> None:
             assert run.ping()["message"] == "here"
     finally:
         publisher.sink.close()
+
+
+def test_a_subscriber_that_falls_behind_says_so_once(
+    publisher: Publisher, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Subscriber(publisher.endpoint, timeout=LONG) as results:
+        publisher.wait()
+        thread = threading.Thread(target=lambda: [results.receive() for _ in range(2)])
+        thread.start()
+        publisher.send(100, 101)
+        thread.join()
+        # As if they had waited in the queue: older by more than a second than the one before.
+        for seq, t in ((102, 9.3), (103, 8.9), (104, 8.8)):
+            publisher.sink.write(result_of(Tick(Frame("main", seq, t, IMAGE)), Results(IMAGE)))
+        queued = [results.receive() for _ in range(3)]
+    assert [result.seq for result in queued] == [102, 103, 104]
+    (said,) = [record.getMessage() for record in caplog.records if "behind" in record.getMessage()]
+    assert "Subscriber(..., latest=True) skips to the newest result" in said
+
+
+@pytest.mark.parametrize("latest", [False, True])
+def test_a_subscriber_that_keeps_up_says_nothing(
+    latest: bool, publisher: Publisher, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Subscriber(publisher.endpoint, latest=latest, timeout=LONG) as results:
+        publisher.wait()
+        publisher.send(*range(100))
+        while results.receive().seq < 99:
+            pass
+        # A new run begins anew.
+        publisher.send(0)
+        results.receive()
+    assert not caplog.records

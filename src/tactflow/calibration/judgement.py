@@ -9,6 +9,7 @@ import numpy as np
 from tactflow.calibration.file import PhotometricEntry
 from tactflow.calibration.presses import Session, usual_radius
 from tactflow.engine.errors import ConfigError
+from tactflow.system.spelling import distinct
 from tactflow.vision.arrays import Floats
 from tactflow.vision.types import Scale
 
@@ -72,9 +73,10 @@ def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) ->
 def check_explained(explained: float) -> None:
     """Raise ConfigError if too little of the slopes is explained for presses of a ball."""
     if explained < LEAST_EXPLAINED:
+        share, required = distinct(100 * explained, 100 * LEAST_EXPLAINED)
         raise ConfigError(
-            f"calibrate: the colours explain {100 * explained:.0f} % of the slopes that a ball would "
-            f"have ({100 * LEAST_EXPLAINED:.0f} % required): the object is not a ball, nothing "
+            f"calibrate: the colours explain {share} % of the slopes that a ball would "
+            f"have ({required} % required): the object is not a ball, nothing "
             "touches the gel, or its colour does not depend on the slope"
         )
 
@@ -82,10 +84,10 @@ def check_explained(explained: float) -> None:
 def check_error(found: PhotometricEntry) -> None:
     """Raise ConfigError if the error of the depth is too large, with possible causes."""
     if found.depth_stderr > LARGEST_ERROR:
+        error, limit = distinct(100 * found.depth_stderr, 100 * LARGEST_ERROR)
         raise ConfigError(
-            f"calibrate: the error of the depth would be {100 * found.depth_stderr:.0f} % "
-            f"({100 * LARGEST_ERROR:.0f} % at most); press all over the gel, with nothing but the ball, and "
-            "see whether its outline is found (`--view`)"
+            f"calibrate: the error of the depth would be {error} % ({limit} % at most); press all over the "
+            "gel, with nothing but the ball, and see whether its outline is found (`--view`)"
         )
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
+from tactflow.system.spelling import distinct
 from tactflow.vision.geometry import PixelMapping
 
 logger = logging.getLogger("tactflow")
@@ -115,10 +116,9 @@ class PressFinder:
         differs = difference(self.untouched, before)
         if differs > SAME:
             logger.warning(
-                "calibrate: the new reference differs by %.0f %% of its brightness from the one before "
-                "(%.0f %% at most); the presses before it, %d, are left out: press there again",
-                100 * differs,
-                100 * SAME,
+                "calibrate: the new reference differs by %s %% of its brightness from the one before "
+                "(%s %% at most); the presses before it, %d, are left out: press there again",
+                *distinct(100 * differs, 100 * SAME),
                 len(self.presses),
             )
             self.presses.clear()

@@ -11,7 +11,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from tactflow.cli.options import add_overwrite, refuse_output, writing
+from tactflow.cli.options import add_overwrite, add_source, refuse_output, writing
 from tactflow.drawing.dots import draw_detection
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.sources import open_source
@@ -28,7 +28,7 @@ SHOWN: Final = 0.25
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `detect`."""
-    parser.add_argument("source", metavar="SRC", help="as in 'tactflow run', of the untouched gel")
+    add_source(parser, "as in 'tactflow run', of the untouched gel")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the dots, and why they were found")
     add_overwrite(parser)
     parser.add_argument(
@@ -46,6 +46,8 @@ def run(args: argparse.Namespace) -> int:
     ConfigError, SourceError, StageError
         If the options are wrong, the frame cannot be read, or the picture cannot be written.
     """
+    if args.source is None:
+        args.parser.error("the following arguments are required: SRC")
     if args.picture is not None:
         refuse_output("--picture", args.picture, overwrite=args.overwrite, suffixes=(".png", ".jpg"))
     with closing(open_source(args.source)) as reader:

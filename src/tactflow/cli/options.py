@@ -28,6 +28,37 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
     add_overrides(parser)
 
 
+def add_source(parser: argparse.ArgumentParser, about: str) -> None:
+    """Declare SRC of a command without PIPELINE, which may be given as it is or as `--source SRC`.
+
+    `args.source` is None without it. about : its help.
+    """
+    parser.add_argument("--source", metavar="SRC", help="the same as SRC, as in 'tactflow run'")
+    # Without a default, a missing positional argument does not overwrite the option.
+    parser.add_argument("source", nargs="?", default=argparse.SUPPRESS, metavar="SRC", help=about)
+
+
+def add_sources(parser: argparse.ArgumentParser, name: str, metavar: str, about: str) -> None:
+    """Declare SRC ... of a command that takes several; each may be given as it is or as `--source SRC`.
+
+    name : of the positional arguments. `listed_sources` adds those of the option. about : help.
+    """
+    # Not "*", of which argparse would take none where an option precedes them.
+    words = parser.add_argument(name, nargs="+", default=[], metavar=metavar, help=about)
+    words.required = False
+    parser.add_argument(
+        "--source", action="append", default=[], metavar="SRC", help="the same as SRC, as in 'tactflow run'"
+    )
+
+
+def listed_sources(args: argparse.Namespace, name: str) -> list[str]:
+    """What the positional arguments and `--source` name. Ends with the usage if there is nothing."""
+    words = [*getattr(args, name), *args.source]
+    if not words:
+        args.parser.error("the following arguments are required: SRC")
+    return words
+
+
 def add_overrides(parser: argparse.ArgumentParser) -> None:
     """Declare `--set`."""
     parser.add_argument(

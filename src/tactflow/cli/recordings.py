@@ -8,7 +8,14 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from tactflow.cli.options import add_overwrite, add_quiet, refuse_output, writing
+from tactflow.cli.options import (
+    add_overwrite,
+    add_quiet,
+    add_sources,
+    listed_sources,
+    refuse_output,
+    writing,
+)
 from tactflow.engine.errors import ConfigError, SourceError, StageError
 from tactflow.outputs import locked_folder
 from tactflow.recording import missing_packages
@@ -35,11 +42,11 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
         help="hdf5 (all frames and numbers as plain arrays), lerobot (a dataset of layout v3.0), "
         "or that of a plug-in",
     )
-    parser.add_argument(
+    add_sources(
+        parser,
         "recordings",
-        nargs="+",
-        metavar="RECORDING",
-        help="each becomes an episode: whatever `tactflow run --source` takes, except live sources",
+        "SRC",
+        "each becomes an episode: whatever `tactflow run --source` takes, except live sources",
     )
     parser.add_argument(
         "--out", required=True, type=Path, metavar="DATASET", help="folder; must not exist yet"
@@ -73,20 +80,20 @@ def run_export(args: argparse.Namespace) -> int:
     ConfigError : there is no such format, or the folder is there already. Nothing was written.
     TactflowError : as `tactflow run`, or another run is writing to the folder; nothing is left behind.
     """
-    exporter = _exporter(args.format)
+    exporter, recordings = _exporter(args.format), listed_sources(args, "recordings")
     if args.out.is_file() or (args.out.is_dir() and any(args.out.iterdir())):
         raise ConfigError(f"--out: {args.out} already exists; give another folder")
     rate = signature(exporter).parameters.get("fps")
     keeps_every_frame = rate is not None and rate.default is None
-    fps = args.fps if args.fps or keeps_every_frame else _rate(args.recordings[0])
+    fps = args.fps if args.fps or keeps_every_frame else _rate(recordings[0])
     started: list[str] = []
     try:
         with notes(), writing(args.out), locked_folder(args.out), completed(args.out.resolve()) as folder:
-            episodes = _episodes(args.recordings, args.pipeline, started)
+            episodes = _episodes(recordings, args.pipeline, started)
             exporter(folder, episodes, fps=fps, task=args.task, pictures=args.pictures)
     except StageError as error:
         raise StageError(f"{started[-1]}: {error}" if started else str(error)) from error
-    count = len(args.recordings)
+    count = len(recordings)
     say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'}{f' at {fps} fps' if fps else ''}")
     return 0
 

@@ -5,6 +5,7 @@ Any ZeroMQ library in any language can do the same: a message is a topic, a spac
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Iterator, Mapping
@@ -19,6 +20,8 @@ from tactflow.network.address import Address
 from tactflow.network.keys import use_keys
 from tactflow.system.files import expanded
 
+log = logging.getLogger("tactflow")
+
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Default address of the sink `zmq`."""
 LONGEST_WAIT = 1e6
@@ -31,6 +34,8 @@ OPTIONS: dict[int, int | bytes] = {
 BACKLOG = 10_000
 """Length of the receive queue, messages: nearly three minutes at 60 Hz, some 140 MB. Further ones are lost
 and counted. Chosen by hand."""
+BEHIND_SECONDS = 1.0
+"""Delay of a subscriber that is reported, s: a control loop would act on a contact long gone."""
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """The server rejected our keys; ZeroMQ does not retry."""
 HUNG_UP = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
@@ -160,6 +165,10 @@ class Subscriber(Connection):
         self.malformed = 0
         self._sensor = sensor
         self._last_seq: dict[str, int] = {}
+        self._is_latest = latest
+        self._was_queued = False
+        self._was_behind = False
+        self._current_age: dict[str, float] = {}
         # With zmq.CONFLATE, a multipart message would abort the process.
         self._skipped_at_most = BACKLOG if latest else 0
         options: dict[int, int | bytes] = {
@@ -184,6 +193,7 @@ class Subscriber(Connection):
             except ValueError:
                 self.malformed += 1
                 continue
+            self._watch_delay(result)
             # A smaller number than before means that tactflow was restarted.
             expected = self._last_seq.get(result.sensor, result.seq) + 1
             self.lost += max(result.seq - expected, 0)
@@ -193,6 +203,7 @@ class Subscriber(Connection):
     def receive_json(self) -> bytes:
         """Wait for the next message, JSON in UTF-8; not counted in `lost`. Raises as `receive`."""
         deadline = math.inf if self.timeout is None else time.monotonic() + self.timeout
+        self._was_queued = bool(self._socket.poll(0))
         while self._wait(deadline):
             body = self._read()
             for _ in range(self._skipped_at_most):
@@ -203,6 +214,24 @@ class Subscriber(Connection):
                 self.received += 1
                 return body
         raise TimeoutError(self._timeout_message())
+
+    def _watch_delay(self, result: Result) -> None:
+        """Say once if the queued messages are older by `BEHIND_SECONDS` than the last one that we waited for.
+
+        This compares neither the clocks of two machines nor the time of a recording with ours.
+        """
+        age = time.monotonic() - result.t
+        current = self._current_age.setdefault(result.sensor, age)
+        has_restarted = result.seq <= self._last_seq.get(result.sensor, -1)
+        if not self._was_queued or has_restarted or age < current:
+            self._current_age[result.sensor] = age
+        elif age - current >= BEHIND_SECONDS and not (self._is_latest or self._was_behind):
+            self._was_behind = True
+            log.warning(
+                "Subscriber: reads more slowly than tactflow publishes, and is %.1f s behind; "
+                "Subscriber(..., latest=True) skips to the newest result",
+                age - current,
+            )
 
     def _read(self) -> bytes:
         """The JSON of the next queued message; empty for one of another kind."""

@@ -1,4 +1,4 @@
-"""Suggestions for misspelled words, and lists of words, in messages."""
+"""Suggestions for misspelled words, lists of words, and comparisons of numbers, in messages."""
 
 from __future__ import annotations
 
@@ -44,3 +44,14 @@ def joined(words: Sequence[str]) -> str:
     ('mcap', 'mcap and av', 'mcap, av and zarr')
     """
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
+
+
+def distinct(value: float, limit: float) -> tuple[str, str]:
+    """Two different numbers, with as many decimals as it takes to tell them apart; six at most.
+
+    >>> distinct(31.2, 22.0), distinct(22.04, 22.0)
+    (('31', '22'), ('22.04', '22.00'))
+    """
+    texts = ((f"{value:.{decimals}f}", f"{limit:.{decimals}f}") for decimals in range(7))
+    first, second = next((pair for pair in texts if pair[0] != pair[1]), (f"{value:.6f}", f"{limit:.6f}"))
+    return first, second

@@ -12,7 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import get_args
 
-from tactflow.cli.options import add_overrides, add_quiet, add_sensor, writing
+from tactflow.cli.options import (
+    add_overrides,
+    add_quiet,
+    add_sensor,
+    add_sources,
+    listed_sources,
+    writing,
+)
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
@@ -32,12 +39,12 @@ LONGEST = 200
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `batch`."""
-    parser.add_argument(
+    add_sources(
+        parser,
         "words",
-        nargs="+",
-        metavar="[PIPELINE] SRC",
-        help="a pipeline (FILE.yaml, or the name of a shipped one; default: ./pipeline.yaml, else the "
-        "packaged one), then recordings: files, folders, or quoted patterns",
+        "[PIPELINE] SRC",
+        "a pipeline (FILE.yaml, or the name of a shipped one; default: ./pipeline.yaml, else the packaged "
+        "one), then recordings: files, folders, or quoted patterns",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument(
@@ -75,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     StageError : the table or the page cannot be written.
     """
     format_, note = chosen_format(args.format)
-    file, words = _pipeline_and_sources(args.words)
+    file, words = _pipeline_and_sources(listed_sources(args, "words"))
     sensors = sensor_names(file, args.overrides)
     if len(sensors) > 1 and args.sensor is None:
         raise ConfigError(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from tactflow.cli.cameras import NO_CAMERA
-from tactflow.cli.options import add_overwrite, refuse_output, writing
+from tactflow.cli.options import add_overwrite, add_source, refuse_output, writing
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import from_settings
 from tactflow.config.shipped import described_pipelines, find_pipeline
@@ -39,9 +39,7 @@ EDGES: Final = {"0": "top", "270": "right", "180": "bottom", "90": "left"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `start`."""
-    parser.add_argument(
-        "source", nargs="?", metavar="SRC", help="as in 'tactflow run'; default: a camera that is plugged in"
-    )
+    add_source(parser, "as in 'tactflow run'; default: a camera that is plugged in")
     parser.add_argument(
         "--yes", action="store_true", help="accept every proposal for a recording, without asking"
     )

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--source",
         required=True,
-        metavar="RECORDING",
+        metavar="SRC",
         help="recording of the sensor, first untouched, then with some presses; as 'tactflow run --source'",
     )
     parser.add_argument(
