@@ -60,7 +60,7 @@ class Bag(FrameReader):
     def __init__(self, spec: str, directory: Path | None = None, _fps: float | None = None) -> None:
         name, settings = split_query(spec, directory, SETTINGS)
         path = find_path(name, directory)
-        self._store = McapFile(path) if path.suffix.lower() == ".mcap" else RosBag(path)
+        self._store = _store(path)
         super().__init__(str(path))
         try:
             self._topic = _choose(spec, settings.get("topic"), self._store.topics)
@@ -73,6 +73,15 @@ class Bag(FrameReader):
         count = "an unknown number of" if self.total is None else self.total
         self.description = f"{spec}, {count} messages"
 
+    @staticmethod
+    def sensors(name: str) -> list[str]:
+        """A source for each topic with pictures; none in a recording of tactflow, which has one sensor."""
+        store = _store(find_path(name, None))
+        try:
+            return [f"{name}?topic={topic}" for topic in _pictures(store.topics)]
+        finally:
+            store.close()
+
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         to_image = _decoder(self._type)
         assert to_image is not None
@@ -81,6 +90,7 @@ class Bag(FrameReader):
             image = to_image(message, self.name)
             taken = _stamp(message) or written
             first = taken if first is None else first
+            self.begins = first / 1e9
             yield image, (taken - first) / 1e9
 
     def close(self) -> None:
@@ -89,9 +99,18 @@ class Bag(FrameReader):
         self._store.close()
 
 
+def _store(path: Path) -> McapFile | RosBag:
+    return McapFile(path) if path.suffix.lower() == ".mcap" else RosBag(path)
+
+
+def _pictures(topics: Topics) -> list[str]:
+    """The topics with pictures."""
+    return [name for name, (kind, _) in sorted(topics.items()) if _decoder(kind) is not None]
+
+
 def _choose(spec: str, topic: str | None, topics: Topics) -> str:
     """The requested topic, if it has pictures; without a request, the only topic with pictures."""
-    pictures = [name for name, (kind, _) in sorted(topics.items()) if _decoder(kind) is not None]
+    pictures = _pictures(topics)
     if topic in pictures:
         return topic
     if topic is None and len(pictures) == 1:

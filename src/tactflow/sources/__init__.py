@@ -34,6 +34,7 @@ __all__ = [
     "Watched",
     "open_source",
     "recording_suffixes",
+    "sensors_in",
 ]
 
 KINDS = (
@@ -49,7 +50,8 @@ GROUP = "tactflow.sources"
 
 The name of an entry point is the suffix of a file or folder (`.h5`), the prefix of a path without its colon
 (`lerobot`), or a file in a folder (`metadata.yaml`). Its value is a function or class that is called with
-`(spec, directory, fps)` of `open_source` and returns a `FrameReader`.
+`(spec, directory, fps)` of `open_source` and returns a `FrameReader`. A function `sensors` of it, if any, is
+called with the path of a file, and returns the sources in it.
 """
 
 _STREAMS = frozenset(["http", "https", "rtsp", "udp"])
@@ -146,17 +148,34 @@ def _open_recording(spec: str, directory: Path | None, fps: float | None) -> Fra
         except SourceError as error:
             if query or not isinstance(error.__cause__, ForeignRecordingError):
                 raise
+    opener = _plugin(name, directory, is_pattern)
+    return open_file(spec, directory, fps) if opener is None else opener(spec, directory, fps)
+
+
+def sensors_in(spec: str) -> list[str]:
+    """The sources in a file with pictures of several sensors, such as the topics of a bag; else itself.
+
+    >>> sensors_in("sim:press")
+    ['sim:press']
+    """
+    if locate(spec, None) is None or Path(spec).suffix.lower() in _BUILT_IN:
+        return [spec]
+    sensors = getattr(_plugin(spec, None, False), "sensors", None)
+    return [spec] if sensors is None else list(sensors(spec)) or [spec]
+
+
+def _plugin(name: str, directory: Path | None, is_pattern: bool) -> Callable[..., FrameReader] | None:
+    """What opens a file of this name, if it is a plug-in."""
     for key in _keys(name, directory, is_pattern):
         for point in plugins(GROUP):
             if point.name == key:
                 try:
-                    opener = cast(Callable[..., FrameReader], point.load())
+                    return cast(Callable[..., FrameReader], point.load())
                 except Exception as error:
                     raise SourceError(
                         f"{name}: the plug-in {point.value} cannot be loaded: {error}"
                     ) from error
-                return opener(spec, directory, fps)
-    return open_file(spec, directory, fps)
+    return None
 
 
 def _keys(name: str, directory: Path | None, is_pattern: bool) -> Iterator[str]:

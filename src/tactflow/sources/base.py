@@ -62,6 +62,9 @@ class FrameReader:
     description : one line for messages.
     state : of a live source: `running`, `waiting since ...` or `reconnecting since ...`.
     missed : frames of a live source that a newer one replaced before they were read.
+    begins : Unix time of t = 0, s; None if unknown.
+    remark : what is wrong with a file that can be read all the same, or "".
+    lacking : frames that the file states but does not have; known at its end.
     stamped : whether the frames already passed through `capture`, which then uses their seq, reference,
     epoch and paced, as in `Arrival`, unchanged; `_frames` yields these too.
 
@@ -75,6 +78,9 @@ class FrameReader:
     description = ""
     state = "running"
     missed = 0
+    begins: float | None = None
+    remark = ""
+    lacking = 0
     stamped = False
     parser_errors: tuple[type[Exception], ...] = (OSError,)
     """Exceptions of `_frames` on damaged data, which are converted to SourceError."""

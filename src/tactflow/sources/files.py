@@ -279,6 +279,7 @@ class VideoFile(CaptureReader):
         if count == 0:
             raise SourceError(f"{self.name}: the video holds no frame that can be decoded; is it damaged?")
         if self.total is not None and count < self.total:
+            self.lacking = self.total - count
             log.warning(
                 "%s: ended after %d of %d frames; the file may be damaged", self.name, count, self.total
             )

@@ -14,6 +14,8 @@ from tactflow.sources.base import BgrImage, FrameReader, damaged, log
 from tactflow.sources.paths import describe_settings, find_path, split_query
 
 SETTINGS = {"start": "SECONDS (from the beginning)"}
+FIRST_UNIX_TIME = 1e9
+"""Times of this and more are Unix times, s: those of a recording of a recording begin at 0."""
 LATEST_START = 1e9
 """Maximum start, s: 30 years, longer than any recording."""
 
@@ -45,12 +47,15 @@ class Recording(FrameReader):
         self._start = None if not start or contents.start is None else contents.start + round(start * 1e9)
         length = "" if contents.end is None else f"; it is {seconds:g} s long"
         self._read_first(f"there is no frame {f'after {start:g} s{length}' if start else 'in it'}")
+        first = self.peek()
+        self.begins = 0.0 if first is not None and first[1] >= FIRST_UNIX_TIME else None
         if contents.frames is not None:
             self.fps = (contents.frames - 1) / seconds if seconds > 0 else None
             self.total = contents.frames if self._start is None else None
         frames = "an unknown number of" if contents.frames is None else str(contents.frames)
         self.description = f"{spec}, {frames} frames, {'{} x {}'.format(*self.size or (0, 0))}"
         if not contents.finished:
+            self.remark = "the file was not finished (killed?); tactflow repair adds its index"
             log.warning(
                 "%s: was not finished (killed?); it is played up to where it ends; "
                 "tactflow repair makes it whole for other programs too",

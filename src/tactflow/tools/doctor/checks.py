@@ -8,41 +8,18 @@ measured: they double, or increase fivefold, an error of the default pipeline on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from collections.abc import Callable, Sequence
+from typing import Final
 
 import numpy as np
 
+from tactflow.recording.verdict import Finding, Grade, examine_recording
 from tactflow.tools.doctor import measures
 from tactflow.tools.doctor.observation import Observation
 
-Verdict = Literal["good", "warning", "fault", "unknown"]
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Result of a check; a check function fills in all but the last three fields.
-
-    number : measured value, in the unit of the check; None if the source cannot be checked. says : its
-    description, or why it is unknown. effect : consequence of a fault for the errors, advice : remedy; both
-    empty if good. limits : for warning and fault; by default those of the check. verdict : `unknown` if the
-    source cannot be checked.
-    """
-
-    number: float | None
-    says: str
-    effect: str = ""
-    advice: str = ""
-    limits: tuple[float, float] | None = None
-    name: str = ""
-    unit: str = ""
-    verdict: Verdict = "unknown"
-
-
 Measure = Callable[[Observation], Finding | str]
 CHECKS: list[Callable[[Observation], Finding]] = []
-"""All checks, in the order of the table."""
+"""All checks of the sensor, in the order of the table."""
 
 
 def check(name: str, unit: str, *, warning: float, fault: float) -> Callable[[Measure], Measure]:
@@ -51,15 +28,9 @@ def check(name: str, unit: str, *, warning: float, fault: float) -> Callable[[Me
     def register(measure: Measure) -> Measure:
         def run(observed: Observation) -> Finding:
             found = measure(observed)
-            if isinstance(found, str) or found.number is None:
-                return Finding(None, str(found), name=name, unit=unit)
-            low, high = limits = found.limits or (warning, fault)
-            sign = -1.0 if high < low else 1.0
-            number = sign * found.number
-            found = replace(found, name=name, unit=unit, limits=limits)
-            if number < sign * low:
-                return replace(found, verdict="good", effect="", advice="")
-            return replace(found, verdict="fault" if number >= sign * high else "warning")
+            if isinstance(found, str):
+                found = Finding(None, found)
+            return found.graded(name, unit, found.limits or (warning, fault))
 
         CHECKS.append(run)
         return measure
@@ -68,16 +39,16 @@ def check(name: str, unit: str, *, warning: float, fault: float) -> Callable[[Me
 
 
 def examine(observed: Observation) -> list[Finding]:
-    """Run all checks.
+    """Run all checks: of how the pictures were recorded, and of the sensor.
 
     >>> from tactflow.tools.doctor import observe
     >>> sorted({finding.verdict for finding in examine(observe("sim:idle?frames=8", 1.0))})
     ['good']
     """
-    return [run(observed) for run in CHECKS]
+    return [*examine_recording(observed.recorded), *(run(observed) for run in CHECKS)]
 
 
-def worst(findings: list[Finding]) -> Verdict:
+def worst(findings: Sequence[Finding]) -> Grade:
     """The worst verdict: fault, warning, or good."""
     verdicts = {finding.verdict for finding in findings}
     return "fault" if "fault" in verdicts else "warning" if "warning" in verdicts else "good"
@@ -85,8 +56,6 @@ def worst(findings: list[Finding]) -> Verdict:
 
 MAX_DOT_RADIUS: Final = 0.15
 """Largest plausible dot radius in pitches: blur makes dots look larger. 0.11 to 0.15 in simulated scenes."""
-CODEC_REPEATS: Final = 10.0
-"""Repeated frames in a good recording, %: codecs produce them in still scenes (measured)."""
 MIN_FRAMES: Final = 3
 """Minimum number of frames for bands."""
 
@@ -97,7 +66,8 @@ def _rate(observed: Observation) -> Finding | str:
     if isinstance(gaps := observed.gaps, str):
         return gaps
     rate = 1.0 / float(gaps.mean())
-    nominal, limits = "", None
+    # A recording with a low rate can be used for what moves slowly.
+    nominal, limits = "", None if observed.live else (20.0, 0.0)
     if observed.live and observed.nominal:
         nominal = f" of nominally {observed.nominal:.3g}"
         limits = max(20.0, 0.9 * observed.nominal), max(12.0, 0.7 * observed.nominal)
@@ -117,45 +87,15 @@ def _rate(observed: Observation) -> Finding | str:
     )
 
 
-# Chosen by hand.
-@check("drop-outs", "%", warning=1.0, fault=10.0)
-def _drop_outs(observed: Observation) -> Finding:
-    late = 0
-    if not isinstance(gaps := observed.gaps, str):
-        usual = max(float(np.median(gaps)), 1e-9)
-        late = int(np.maximum(np.rint(gaps / usual) - 1, 0).sum())
-    missing = max(late, observed.missing)
-    total = observed.frames + missing
-    repeated = 100.0 * observed.repeated / total - (0.0 if observed.live else CODEC_REPEATS)
-    stopped = f"; then: {observed.stopped}" if observed.stopped else ""
-    return Finding(
-        100.0 if stopped else 100.0 * missing / total + max(0.0, repeated),
-        f"{missing} of {total} frames missing, {observed.repeated} repeated{stopped}",
-        "contacts are detected late, and dots move further between frames",
-        "another cable and port (no hub), fewer pixels or MJPG, less load on the processor",
-    )
-
-
 # At 46 grey levels, dots have 1.3 times the error; at 23 they are not detected.
 @check("exposure", "grey levels", warning=50.0, fault=30.0)
 def _exposure(observed: Observation) -> Finding:
-    level = float(np.median([level for level, _ in observed.exposures]))
+    level = float(np.median(observed.levels))
     return Finding(
         level,
         f"the brighter gel has {level:.0f} of 255 grey levels",
         "dots and shading disappear in the noise; below 24 grey levels the gel is classified as background",
         "more light, or a longer exposure as far as the rate allows it",
-    )
-
-
-@check("clipping", "%", warning=1.5, fault=10.0)
-def _clipping(observed: Observation) -> Finding:
-    share = 100.0 * float(np.mean([clipped for _, clipped in observed.exposures]))
-    return Finding(
-        share,
-        f"{round(share, 2):.2g} % of the gel is clipped",
-        "a contact there has no shading, and a wrong centre",
-        "less exposure or gain, fixed instead of automatic; lamps that do not shine into the camera",
     )
 
 
@@ -175,7 +115,9 @@ def _focus(observed: Observation) -> Finding | str:
 
 
 @check("noise", "grey levels", warning=7.0, fault=16.0)
-def _noise(observed: Observation) -> Finding:
+def _noise(observed: Observation) -> Finding | str:
+    if observed.black_and_white:
+        return "the pictures are black and white"
     noise = measures.noise_of(observed.pairs)
     return Finding(
         noise,

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.recording.course import BLACK_LEVEL
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.markers import Detection
 from tactflow.vision.markers.lattice import corners
@@ -17,8 +18,6 @@ Gray = NDArray[np.float32]
 
 TILE: Final = 16
 """Side of the tiles for noise estimates, px: 256 samples each."""
-BLACK: Final = 4
-"""Highest grey level of the black surround of the gel."""
 DIM: Final = 25
 """Minimum grey level for relative changes of light: noise of 2 grey levels would be 8 %."""
 STRIPS: Final = 4
@@ -100,20 +99,18 @@ def _calm_deviation(values: NDArray[np.float32]) -> float:
     return float(np.sqrt(np.percentile(variance, 25.0)))
 
 
-def exposure(image: ColorImage) -> tuple[float, float]:
-    """Level and clipped share of a frame (H, W, 3) uint8, without the black surround.
+def exposure(image: ColorImage) -> float:
+    """Level of a frame (H, W, 3) uint8, without the black surround, grey levels.
 
-    The level is the 95th percentile of the gel's brightest channel, grey levels, because a dark gel with
-    bright pins is well exposed. The share, 0 to 1, is that of the gel with a saturated channel.
+    It is the 95th percentile of the gel's brightest channel, because a dark gel with bright pins is well
+    exposed.
 
     >>> exposure(np.full((4, 4, 3), 255, np.uint8))
-    (255.0, 1.0)
+    255.0
     """
     brightest = image.max(axis=2)
-    gel = brightest[brightest > BLACK]
-    if not gel.size:
-        return 0.0, 0.0
-    return float(np.percentile(gel, 95.0)), float(np.mean(gel >= 254))
+    gel = brightest[brightest > BLACK_LEVEL]
+    return float(np.percentile(gel, 95.0)) if gel.size else 0.0
 
 
 def blur(gray: Gray) -> float | None:

@@ -1,7 +1,8 @@
-"""Read a source for a while, keeping what the checks need: all times, and some pairs of frames."""
+"""Read a source, keeping what the checks need: the course of all frames, and some pairs of them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from tactflow.engine.errors import SourceError
+from tactflow.recording.course import Watcher
+from tactflow.recording.verdict import Recorded
 from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.files import ArrayFile, ImageFiles
 from tactflow.tools.doctor.measures import REGULAR, Gray, Pair, exposure, grey
@@ -20,6 +23,12 @@ from tactflow.vision.arrays import ColorImage
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Detection, NoMarkersError, detect_markers
 
+LIVE_SECONDS: Final = 10.0
+"""How long a live source is observed by default, s: time for some presses."""
+BETWEEN: Final = 30
+"""Distance of a level from black and from white, grey levels; compression alone does not reach it."""
+SHARE_BETWEEN: Final = 0.01
+"""Minimum share of such levels in a picture that has not been thresholded: the shade of a single press."""
 KEPT: Final = 24
 """Pairs of frames to keep, up to twice as many while reading: 70 MB at 800 x 600."""
 MIN_DOTS: Final = 20
@@ -29,24 +38,23 @@ without dots."""
 
 @dataclass
 class Observation:
-    """Observation of a source over some seconds.
+    """Observation of a source over some seconds, or of a whole recording.
 
     source : as given by the user. description : of its kind. live : a camera or stream. nominal : frame rate
-    that it reports, 1/s, or None. times : s, or None for single pictures. frames : number of frames.
-    repeated : frames bit-identical to their predecessor. missing : lost frames, by the numbers in a
-    recording. stopped : why it ended early, or "". pairs : kept frames.
+    that it reports, 1/s, or None. begins : Unix time of t = 0, s, or None. recorded : how its frames came.
+    pairs : kept frames.
     """
 
     source: str
     description: str
     live: bool
     nominal: float | None = None
-    times: list[float] | None = None
-    frames: int = 0
-    repeated: int = 0
-    missing: int = 0
-    stopped: str = ""
+    begins: float | None = None
+    recorded: Recorded = field(init=False)
     pairs: list[Pair] = field(default_factory=list[Pair])
+
+    def __post_init__(self) -> None:
+        self.recorded = Recorded(live=self.live)
 
     def check(self) -> None:
         """Raise SourceError if there are no frames."""
@@ -54,12 +62,22 @@ class Observation:
             raise SourceError(f"{self.source}: {self.stopped or 'it contains no frames'}")
 
     @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return self.recorded.course.frames
+
+    @property
+    def stopped(self) -> str:
+        """Why it ended early, or ""."""
+        return self.recorded.stopped
+
+    @property
     def gaps(self) -> NDArray[np.float64] | str:
         """Intervals between frames, s, or why they are unknown."""
-        if self.times is None:
+        if not self.recorded.timed:
             return "single pictures have no times"
-        gaps = np.diff(self.times)
-        return gaps if len(gaps) > 1 and gaps.sum() > 0 else f"{len(self.times)} frames are too few"
+        gaps = np.diff(self.recorded.course.times)
+        return gaps if len(gaps) > 1 and gaps.sum() > 0 else f"{self.frames} frames are too few"
 
     @cached_property
     def grays(self) -> list[Gray]:
@@ -67,9 +85,15 @@ class Observation:
         return [grey(pair.image) for pair in self.pairs]
 
     @cached_property
-    def exposures(self) -> list[tuple[float, float]]:
-        """Level, grey levels, and clipped share of the kept frames (`measures.exposure`)."""
+    def levels(self) -> list[float]:
+        """Brightness of the kept frames, grey levels (`measures.exposure`)."""
         return [exposure(pair.image) for pair in self.pairs]
+
+    @cached_property
+    def black_and_white(self) -> bool:
+        """Whether the pictures have been thresholded: they have no levels between."""
+        between = [np.mean((gray > BETWEEN) & (gray < 255 - BETWEEN)) for gray in self.grays]
+        return bool(np.mean(between) < SHARE_BETWEEN)
 
     @cached_property
     def typical(self) -> Gray:
@@ -109,10 +133,13 @@ def _recur(dots: Detection, again: Detection | None) -> bool:
     return bool(np.median(distances) < dots.pitch / 2)
 
 
-def observe(source: str, seconds: float, report: Callable[[int], None] = lambda _: None) -> Observation:
-    """Observe a source for some seconds of its own time, or to its end. Ctrl-C ends the observation.
+def observe(
+    source: str, seconds: float | None = None, report: Callable[[int], None] = lambda _: None
+) -> Observation:
+    """Observe a source. Ctrl-C ends the observation.
 
-    source : as `open_source` takes it. report : called with the number of frames so far.
+    source : as `open_source` takes it. seconds : of its own time; None: `LIVE_SECONDS` of a live source, the
+    whole of a recording. report : called with the number of frames so far.
 
     Raises
     ------
@@ -125,8 +152,14 @@ def observe(source: str, seconds: float, report: Callable[[int], None] = lambda 
     """
     with closing(open_source(source)) as reader:
         observation = Observation(source, reader.description, reader.live)
+        usual = LIVE_SECONDS if reader.live else math.inf
         with suppress(KeyboardInterrupt):
-            watch(reader, seconds, observation, lambda _: report(observation.frames))
+            watch(
+                reader,
+                usual if seconds is None else seconds,
+                observation,
+                lambda _: report(observation.frames),
+            )
     observation.check()
     return observation
 
@@ -138,44 +171,41 @@ def watch(
 
     show : called with each frame; the observation ends when it returns False.
     """
+    recorded = observation.recorded
+    observation.nominal, observation.begins = reader.fps, reader.begins
+    # The reader invents the rate of separate pictures.
+    if isinstance(reader, ImageFiles | ArrayFile):
+        observation.nominal, recorded.timed = None, False
     try:
         _read(reader, seconds, observation, show)
     except SourceError as error:
-        observation.stopped = str(error)
+        recorded.stopped = str(error)
+    recorded.remark, recorded.lacking = reader.remark, reader.lacking
 
 
 def _read(
     reader: FrameReader, seconds: float, observation: Observation, show: Callable[[Arrival], object]
 ) -> None:
-    times: list[float] = []
-    # The reader invents the rate of separate pictures.
-    if not isinstance(reader, ImageFiles | ArrayFile):
-        observation.nominal, observation.times = reader.fps, times
-    last: ColorImage | None = None
-    last_seq: int | None = None
+    course, glances = observation.recorded.course, Watcher()
+    begin: float | None = None
     stride = 1
     while (frame := _next(reader)) is not None:
-        image, t, seq = frame.image, frame.t, frame.seq
-        if times and t - times[0] > seconds:
+        begin = frame.t if begin is None else begin
+        if frame.t - begin > seconds:
             return
-        if last_seq is not None:
-            observation.missing += max(seq - last_seq - 1, 0)
-        if last is not None:
-            observation.repeated += bool(np.array_equal(last, image))
-            if observation.pairs and observation.pairs[-1].number == observation.frames - 1:
-                observation.pairs[-1] = observation.pairs[-1]._replace(after=image)
-        if observation.frames % stride == 0:
-            observation.pairs.append(Pair(observation.frames, image, None))
-            if len(observation.pairs) > 2 * KEPT:
+        pairs = observation.pairs
+        if pairs and pairs[-1].number == course.frames - 1:
+            pairs[-1] = pairs[-1]._replace(after=frame.image)
+        if course.frames % stride == 0:
+            pairs.append(Pair(course.frames, frame.image, None))
+            if len(pairs) > 2 * KEPT:
                 stride *= 2
-                observation.pairs[:] = [pair for pair in observation.pairs if pair.number % stride == 0]
-        times.append(t)
-        last, last_seq = image, seq
-        observation.frames += 1
+                pairs[:] = [pair for pair in pairs if pair.number % stride == 0]
+        course.add(glances.look(frame.image, frame.t, frame.seq))
         if show(frame) is False:
             return
-    if reader.live and times:
-        observation.stopped = f"it ended after {times[-1] - times[0]:.1f} s"
+    if reader.live and begin is not None:
+        observation.recorded.stopped = f"it ended after {course.seconds:.1f} s"
 
 
 def _next(reader: FrameReader) -> Arrival | None:

@@ -1,0 +1,280 @@
+"""The course of a recording: what each frame tells about how it was recorded, and their sum, in one pass."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+SAMPLES: Final = (48, 64)
+"""Rows and columns of a picture that are sampled, at least, if it has as many."""
+BLACK_LEVEL: Final = 4
+"""Highest grey level of the black surround of the gel."""
+CLIPPED_LEVEL: Final = 254
+"""Lowest grey level that counts as clipped: compression takes one from 255."""
+LARGEST_DOT_SAMPLES: Final = 5
+"""Diameter of the largest clipped spot that is not counted, samples: a 13th of the picture's width. White
+dots and pins are clipped without harm, as only their positions are used."""
+LOCAL_INTERVALS: Final = 31
+"""Intervals around each one whose median is the local interval, so that a camera that changes its rate in the
+dark loses no frames by that."""
+HALF_AN_INTERVAL: Final = 0.5
+"""Deviation from which an interval is irregular, local intervals: a frame that is further off belongs to
+another one of evenly spaced moments."""
+CONTACT_SECONDS: Final = 0.2
+"""Duration of a short tap, s: a pause of this length may hide a contact."""
+CODEC_REPEATS: Final = 0.1
+"""Share of identical successive frames in a good recording: compression produces them in still scenes
+(measured)."""
+CHANCE: Final = 1e-3
+"""Probability that a run of identical frames which counts as frozen occurs by chance in a recording."""
+
+
+class Glance(NamedTuple):
+    """What a frame tells about the recording.
+
+    t : s. seq : its number at the source. change : mean absolute difference to the frame before, grey levels.
+    repeated : whether it is bit-identical to that. clipped : share of the gel that is clipped, 0 to 1.
+    empty : whether it shows no gel. damaged : whether it is no longer as the camera took it.
+    """
+
+    t: float
+    seq: int
+    change: float
+    repeated: bool
+    clipped: float
+    empty: bool = False
+    damaged: bool = False
+
+
+class Watcher:
+    """Takes a glance at each frame; it keeps the frame before, and some 60 x 50 samples of it.
+
+    >>> watcher = Watcher()
+    >>> image = np.full((48, 64, 3), 100, np.uint8)
+    >>> watcher.look(image, 0.0, 0).repeated, watcher.look(image.copy(), 0.1, 1).repeated
+    (False, True)
+    """
+
+    def __init__(self) -> None:
+        self._last: NDArray[np.uint8] | None = None
+        self._last_samples: NDArray[np.int16] | None = None
+
+    def look(
+        self, image: NDArray[np.uint8], t: float, seq: int, *, empty: bool = False, damaged: bool = False
+    ) -> Glance:
+        """The next frame. image : (H, W, 3) uint8, not modified later. The others are as in `Glance`."""
+        down, across = (max(1, side // most) for side, most in zip(image.shape, SAMPLES, strict=False))
+        picture = image[::down, ::across]
+        samples = picture.astype(np.int16)
+        change, repeated = 0.0, False
+        if self._last_samples is not None and self._last is not None:
+            difference = np.subtract(samples, self._last_samples)
+            change = float(np.abs(difference, out=difference).mean())
+            repeated = change == 0 and np.array_equal(image, self._last)
+        self._last, self._last_samples = image, samples
+        return Glance(t, seq, change, repeated, clipped_share(picture), empty, damaged)
+
+
+def clipped_share(picture: NDArray[np.uint8]) -> float:
+    """Share of the gel with a saturated channel, 0 to 1, without spots of the size of dots.
+
+    picture : (H, W, 3) uint8, about `SAMPLES`.
+
+    >>> white_pin = np.full((48, 64, 3), 20, np.uint8)
+    >>> white_pin[20:24, 30:34] = 255
+    >>> clipped_share(white_pin), clipped_share(np.full((48, 64, 3), 255, np.uint8))
+    (0.0, 1.0)
+    """
+    brightest = np.maximum(np.maximum(picture[..., 0], picture[..., 1]), picture[..., 2])
+    clipped = (brightest >= CLIPPED_LEVEL).astype(np.uint8)
+    if not clipped.any():
+        return 0.0
+    spot = np.ones((LARGEST_DOT_SAMPLES,) * 2, np.uint8)
+    # Beyond its border a picture goes on as it is there.
+    padded = cv2.copyMakeBorder(clipped, *(LARGEST_DOT_SAMPLES,) * 4, cv2.BORDER_REPLICATE)
+    inner = slice(LARGEST_DOT_SAMPLES, -LARGEST_DOT_SAMPLES)
+    large = cv2.morphologyEx(padded, cv2.MORPH_OPEN, spot)[inner, inner]
+    return float(np.count_nonzero(large) / np.count_nonzero(brightest > BLACK_LEVEL))
+
+
+class Pause(NamedTuple):
+    """A time without a new frame. start : from the first frame, s. seconds : its length."""
+
+    start: float
+    seconds: float
+
+
+class Timing(NamedTuple):
+    """How evenly the frames come.
+
+    interval : median time between two frames, s. lost : frames that are missing by the times. pauses : of
+    `CONTACT_SECONDS` and more. irregular : share of the intervals that are irregular though no frame is
+    missing. slowest, fastest : local intervals, s. backwards : number of times that the clock went back.
+    """
+
+    interval: float
+    lost: int
+    pauses: list[Pause]
+    irregular: float
+    slowest: float
+    fastest: float
+    backwards: int
+
+
+class Run(NamedTuple):
+    """Successive identical frames. first : index of the one that they repeat. repeats : their number."""
+
+    first: int
+    repeats: int
+
+
+class Course:
+    """The course of a recording, with 12 bytes of memory for each frame.
+
+    frames : their number. missing : frames that are missing by their numbers. repeated : frames that are
+    identical to the one before. empty, damaged : indices of the first frames without a gel or damaged, and
+    their numbers. clipped : mean share of the gel that is clipped, 0 to 1.
+
+    >>> course = Course()
+    >>> for seq in (0, 1, 2, 5, 6):
+    ...     course.add(Glance(seq / 10, seq, 1.0, False, 0.0))
+    >>> course.frames, course.missing, course.timing().lost
+    (5, 2, 2)
+    """
+
+    def __init__(self) -> None:
+        self.frames = self.missing = self.repeated = 0
+        self.empty = Tally()
+        self.damaged = Tally()
+        self._times = array("d")
+        self._changes = array("f")
+        self._clipped = 0.0
+        self._last_seq: int | None = None
+        self._run = self._longest = Run(0, 0)
+
+    def add(self, glance: Glance) -> None:
+        """The next frame."""
+        if self._last_seq is not None:
+            self.missing += max(glance.seq - self._last_seq - 1, 0)
+        self._last_seq = glance.seq
+        self._run = Run(self._run.first, self._run.repeats + 1) if glance.repeated else Run(self.frames, 0)
+        self._longest = max(self._longest, self._run, key=lambda run: run.repeats)
+        self.repeated += glance.repeated
+        self.empty.add(self.frames, glance.empty)
+        self.damaged.add(self.frames, glance.damaged)
+        self._clipped += glance.clipped
+        self._times.append(glance.t)
+        self._changes.append(glance.change)
+        self.frames += 1
+
+    @property
+    def clipped(self) -> float:
+        """Mean share of the gel that is clipped, 0 to 1."""
+        return self._clipped / max(self.frames, 1)
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(N,) s."""
+        return np.array(self._times)
+
+    @property
+    def changes(self) -> NDArray[np.float64]:
+        """(N,) mean absolute difference of each frame to the one before, grey levels."""
+        return np.array(self._changes, np.float64)
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first frame to the last, s."""
+        return self._times[-1] - self._times[0] if self.frames else 0.0
+
+    def timing(self) -> Timing | None:
+        """How evenly the frames come; None if there are too few, or all have the same time."""
+        return timing_of(self.times)
+
+    @property
+    def frozen(self) -> Run | None:
+        """The longest run of identical frames, if it is not by chance or by compression.
+
+        If a frame repeats the one before by chance with probability p, which the other frames tell, n frames
+        contain a run of k repeats with a probability of n p^k at most. If frames repeat often, compression
+        removes what differs between frames of a still scene, and a run tells nothing unless it is half of the
+        recording.
+        """
+        longest, others = self._longest, self.frames - self._longest.repeats
+        chance = (self.repeated - longest.repeats + 1) / (others + 1)
+        if longest.repeats < 2:
+            return None
+        if longest.repeats > self.frames / 2:
+            return longest
+        if chance > CODEC_REPEATS or self.frames * chance**longest.repeats > CHANCE:
+            return None
+        return longest
+
+
+class Tally:
+    """Counts frames. count : their number. first : index of the first one."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first = -1
+
+    def add(self, index: int, counts: bool) -> None:
+        """The next frame."""
+        if counts:
+            self.first = index if self.count == 0 else self.first
+            self.count += 1
+
+
+def timing_of(times: NDArray[np.float64]) -> Timing | None:
+    """How evenly frames come. times : (N,) s. None if there are too few, or all have the same time.
+
+    >>> times = np.delete(np.arange(100) / 25, [40, 41, 42, 43, 44])
+    >>> timing = timing_of(times)
+    >>> timing.lost, round(timing.pauses[0].start, 2), round(timing.pauses[0].seconds, 2)
+    (5, 1.56, 0.24)
+    """
+    gaps = np.diff(times)
+    if len(gaps) < 2 or not (forwards := gaps[gaps > 0]).size:
+        return None
+    local = _local_intervals(np.where(gaps > 0, gaps, np.median(forwards)))
+    ratio = gaps / local
+    # A late frame and those that were waiting behind it come in short succession: together they take the time
+    # of as many intervals, unless some are lost.
+    begins = np.flatnonzero(np.concatenate([[True], ratio[1:] >= HALF_AN_INTERVAL]))
+    counts = np.diff([*begins, len(gaps)])
+    missing = np.maximum(np.rint(np.add.reduceat(ratio, begins)) - counts, 0)
+    lost = int(missing.sum())
+    irregular = np.abs(ratio - 1) > HALF_AN_INTERVAL
+    irregular[np.repeat(missing > 0, counts)] = False
+    long = np.flatnonzero((gaps >= CONTACT_SECONDS) & (np.rint(ratio) > 1))
+    return Timing(
+        float(np.median(forwards)),
+        lost,
+        [Pause(float(times[index] - times[0]), float(gaps[index])) for index in long],
+        float(irregular.mean()),
+        float(local.max()),
+        float(local.min()),
+        int((gaps < 0).sum()),
+    )
+
+
+def _local_intervals(gaps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The median of the intervals around each one, (N,) s."""
+    if len(gaps) <= LOCAL_INTERVALS:
+        return np.full(len(gaps), np.median(gaps))
+    from scipy.ndimage import median_filter
+
+    return np.asarray(median_filter(gaps, LOCAL_INTERVALS, mode="nearest"), np.float64)
+
+
+def seconds_text(seconds: float) -> str:
+    """A duration for messages: "120 ms", "3.2 s".
+
+    >>> seconds_text(0.12), seconds_text(3.21), seconds_text(0.0)
+    ('120 ms', '3.2 s', '0 ms')
+    """
+    return f"{1000 * seconds:.0f} ms" if abs(seconds) < 1 else f"{seconds:.1f} s"
