@@ -20,6 +20,8 @@ from tactflow.engine.rate import SLACK, RateLimit
 from tactflow.message.result import Result, encode_message
 from tactflow.outputs import OutputParams, OutputSink
 from tactflow.recording import missing_packages
+from tactflow.recording.course import Watcher
+from tactflow.recording.verdict import Recorded, examine_recording, extent, verdict_of
 from tactflow.system.files import expanded, next_name
 
 if TYPE_CHECKING:
@@ -108,6 +110,8 @@ class Record(OutputSink, Recorder):
         self._ring_bytes = 0
         self._warned = False
         self._touching = False
+        self._watcher = Watcher()
+        self._recorded = Recorded()
 
     def open(self) -> None:
         """Create the file, if recording starts with the run.
@@ -196,15 +200,23 @@ class Record(OutputSink, Recorder):
         frame = result.frame
         time = nanoseconds(frame.t)
         data = {"frames": encode_frame(frame)}
+        glance = None
         # A reference image that is not part of the source has no results.
         if frame.seq >= 0:
+            glance = self._watcher.look(
+                frame.image,
+                frame.t,
+                frame.seq,
+                reference=frame.reference,
+                damaged="damaged" in result.skipped.values(),
+            )
             data["results"] = encode_message(result, detail=True)
             if self._previews is not None and self._previews.due(frame.t):
                 image = frame.image if result.image is None else result.image
                 jpeg = encode_jpeg(image, self.params.quality)
                 data["image"] = encode_picture(jpeg, self._sensor, time)
                 data["annotations"] = encode_annotations(result, time)
-        return Entry(time, frame.seq, frame.reference, frame.epoch, data)
+        return Entry(time, frame.seq, frame.reference, frame.epoch, data, glance)
 
     def _follow(self, touching: bool, time: int) -> None:
         """Start a file when a contact begins; it ends some time after the contact."""
@@ -279,6 +291,8 @@ class Record(OutputSink, Recorder):
             self._backlog.clear()
             raise
         self._counts["frames"] += 1
+        if entry.glance is not None:
+            self._recorded.course.add(entry.glance)
 
     def _is_full(self, file: RecordingWriter, entry: Entry) -> bool:
         after = self.params.rotate_after
@@ -290,6 +304,14 @@ class Record(OutputSink, Recorder):
         self._ends = None
         if file is not None:
             self._finish_file(file)
+            self._judge(file.path)
+
+    def _judge(self, path: Path) -> None:
+        """Give the verdict on a recording that is finished, and begin anew."""
+        recorded, self._recorded = self._recorded, Recorded()
+        self.verdict = str(verdict_of(examine_recording(recorded), extent(recorded)))
+        if self.params.begins != "start":
+            log.info("record: %s is %s", path, self.verdict)
 
     def _finish_file(self, file: RecordingWriter) -> None:
         file.finish()

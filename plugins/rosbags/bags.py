@@ -75,12 +75,11 @@ class Bag(FrameReader):
 
     @staticmethod
     def sensors(name: str) -> list[str]:
-        """A source for each topic with pictures; none in a recording of tactflow, which has one sensor."""
+        """A source for each topic with pictures, if there are several."""
         store = _store(find_path(name, None))
-        try:
-            return [f"{name}?topic={topic}" for topic in _pictures(store.topics)]
-        finally:
-            store.close()
+        store.close()
+        topics = _pictures(store.topics)
+        return [f"{name}?topic={topic}" for topic in topics] if len(topics) > 1 else []
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         to_image = _decoder(self._type)

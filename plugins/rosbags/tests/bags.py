@@ -44,9 +44,15 @@ def message(store: Any, image: NDArray[Any], taken: int, encoding: str, *, one: 
 
 
 def write_bag(
-    path: Path, images: Sequence[NDArray[Any]], kind: str, encoding: str = "bgr8", others: Sequence[str] = ()
+    path: Path,
+    images: Sequence[NDArray[Any]],
+    kind: str,
+    encoding: str = "bgr8",
+    others: Sequence[str] = (),
+    late: int = 0,
 ) -> Path:
-    """A recording of some pictures and one text. kind : "ros1", "sqlite3" or "mcap". others : more topics."""
+    """A recording of some pictures and one text. kind : "ros1", "sqlite3" or "mcap". others : more topics;
+    with `late`, they have the same pictures, so many frames later."""
     one = kind == "ros1"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
     encode = store.serialize_ros1 if one else store.serialize_cdr
@@ -56,14 +62,16 @@ def write_bag(
         chatter = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
         type_name = "CompressedImage" if encoding in ("jpeg", "png") else "Image"
         camera = writer.add_connection(TOPIC, f"sensor_msgs/msg/{type_name}", typestore=store)
-        for topic in others:
-            writer.add_connection(topic, camera.msgtype, typestore=store)
+        more = [writer.add_connection(topic, camera.msgtype, typestore=store) for topic in others]
         writer.write(chatter, BEGIN - 1, encode(text, "std_msgs/msg/String"))
         for index, image in enumerate(images):
             taken = BEGIN + index * PERIOD
             one_message = message(store, image, taken, encoding, one=one)
             # Written later than taken, and not evenly.
             writer.write(camera, taken + 1000 * index**2, encode(one_message, camera.msgtype))
+            for connection in more if late else []:
+                shown = message(store, images[max(index - late, 0)], taken, encoding, one=one)
+                writer.write(connection, taken + 1000 * index**2, encode(shown, camera.msgtype))
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sources import open_source
+from tests.terminal import Terminal
 
 pytest.importorskip("rosbags", reason="the extra bags is not installed")
 
@@ -102,3 +104,14 @@ def test_pictures_of_foxglove_are_read(tmp_path: Path) -> None:
     found = played(str(write_foxglove(tmp_path / "press.mcap", messages)))
     assert [t for _, t in found] == [0.0, 0.04, 0.08]
     assert all(np.array_equal(image, one) for (image, _), one in zip(found, images, strict=True))
+
+
+def test_doctor_finds_that_the_topics_of_a_bag_are_out_of_step(tmp_path: Path, terminal: Terminal) -> None:
+    rng = np.random.default_rng(5)
+    steps = np.stack([rng.normal(0, strength, (24, 32, 3)) for strength in rng.exponential(1.0, 160)])
+    images = list(np.clip(120 + np.cumsum(steps, axis=0), 0, 255).astype(np.uint8))
+    bag = write_bag(tmp_path / "session", images, "mcap", others=["/right"], late=3)
+    assert terminal("doctor", str(bag)) == 0
+    assert re.fullmatch(r"usable: /right is 1[12]. ms behind /gel/image", terminal.out.splitlines()[-1])
+    assert terminal("doctor", f"{bag}?topic=/right") == 0
+    assert terminal.out.splitlines()[-1] == "good: 160 frames in 6.4 s"

@@ -21,6 +21,7 @@ from tactflow.config.load import load_pipeline, sensor_names
 from tactflow.config.overrides import Override, added
 from tactflow.config.sensors import with_name
 from tactflow.config.shipped import find_pipeline
+from tactflow.engine.contract import Recorder
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Pipeline
 from tactflow.engine.run import Runner
@@ -161,7 +162,16 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
         written = args.stats is None or _write_statistics(args.stats, result.stats)
         if not args.quiet:
             say(summary(result, runner))
+        for verdict in _verdicts(runner):
+            if not (args.quiet and verdict.startswith("good")):
+                say(verdict)
         return code or (0 if written else StageError.exit_code)
+
+
+def _verdicts(runner: Runner) -> list[str]:
+    """The verdict on each recording that lasted as long as the run."""
+    sinks = (node.sink for node in runner.nodes.values())
+    return [sink.verdict for sink in sinks if isinstance(sink, Recorder) and sink.verdict]
 
 
 def _statistics_problem(path: str) -> str | None:

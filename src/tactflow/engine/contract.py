@@ -218,6 +218,9 @@ class Sink(Part):
 class Recorder(Sink):
     """A sink whose recording can be started and stopped, from any thread."""
 
+    verdict = ""
+    """Whether the last finished recording is good, in one line; "" before."""
+
     @property
     def recording(self) -> bool:
         """Whether it is recording."""

@@ -15,15 +15,17 @@ BLACK_LEVEL: Final = 4
 """Highest grey level of the black surround of the gel."""
 CLIPPED_LEVEL: Final = 254
 """Lowest grey level that counts as clipped: compression takes one from 255."""
-LARGEST_DOT_SAMPLES: Final = 5
-"""Diameter of the largest clipped spot that is not counted, samples: a 13th of the picture's width. White
-dots and pins are clipped without harm, as only their positions are used."""
+LARGEST_DOT_SAMPLES: Final = 20
+"""Area of the largest clipped spot that is not counted, samples: of a disc a 13th of the picture's width
+across. White dots and pins are clipped without harm, as only their positions are used."""
 LOCAL_INTERVALS: Final = 31
 """Intervals around each one whose median is the local interval, so that a camera that changes its rate in the
 dark loses no frames by that."""
 HALF_AN_INTERVAL: Final = 0.5
 """Deviation from which an interval is irregular, local intervals: a frame that is further off belongs to
 another one of evenly spaced moments."""
+NEIGHBOURS: Final = 4
+"""Frames on each side of a wide interval that tell whether one is missing in it, or was only late."""
 CONTACT_SECONDS: Final = 0.2
 """Duration of a short tap, s: a pause of this length may hide a contact."""
 CODEC_REPEATS: Final = 0.1
@@ -38,7 +40,8 @@ class Glance(NamedTuple):
 
     t : s. seq : its number at the source. change : mean absolute difference to the frame before, grey levels.
     repeated : whether it is bit-identical to that. clipped : share of the gel that is clipped, 0 to 1.
-    empty : whether it shows no gel. damaged : whether it is no longer as the camera took it.
+    reference : whether it is a reference. empty : whether it shows no gel. damaged : whether it is no longer
+    as the camera took it.
     """
 
     t: float
@@ -46,6 +49,7 @@ class Glance(NamedTuple):
     change: float
     repeated: bool
     clipped: float
+    reference: bool = False
     empty: bool = False
     damaged: bool = False
 
@@ -64,7 +68,14 @@ class Watcher:
         self._last_samples: NDArray[np.int16] | None = None
 
     def look(
-        self, image: NDArray[np.uint8], t: float, seq: int, *, empty: bool = False, damaged: bool = False
+        self,
+        image: NDArray[np.uint8],
+        t: float,
+        seq: int,
+        *,
+        reference: bool = False,
+        empty: bool = False,
+        damaged: bool = False,
     ) -> Glance:
         """The next frame. image : (H, W, 3) uint8, not modified later. The others are as in `Glance`."""
         down, across = (max(1, side // most) for side, most in zip(image.shape, SAMPLES, strict=False))
@@ -76,7 +87,7 @@ class Watcher:
             change = float(np.abs(difference, out=difference).mean())
             repeated = change == 0 and np.array_equal(image, self._last)
         self._last, self._last_samples = image, samples
-        return Glance(t, seq, change, repeated, clipped_share(picture), empty, damaged)
+        return Glance(t, seq, change, repeated, clipped_share(picture), reference, empty, damaged)
 
 
 def clipped_share(picture: NDArray[np.uint8]) -> float:
@@ -93,12 +104,9 @@ def clipped_share(picture: NDArray[np.uint8]) -> float:
     clipped = (brightest >= CLIPPED_LEVEL).astype(np.uint8)
     if not clipped.any():
         return 0.0
-    spot = np.ones((LARGEST_DOT_SAMPLES,) * 2, np.uint8)
-    # Beyond its border a picture goes on as it is there.
-    padded = cv2.copyMakeBorder(clipped, *(LARGEST_DOT_SAMPLES,) * 4, cv2.BORDER_REPLICATE)
-    inner = slice(LARGEST_DOT_SAMPLES, -LARGEST_DOT_SAMPLES)
-    large = cv2.morphologyEx(padded, cv2.MORPH_OPEN, spot)[inner, inner]
-    return float(np.count_nonzero(large) / np.count_nonzero(brightest > BLACK_LEVEL))
+    areas = cv2.connectedComponentsWithStats(clipped, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
+    large = areas[areas > LARGEST_DOT_SAMPLES]
+    return float(large.sum() / np.count_nonzero(brightest > BLACK_LEVEL))
 
 
 class Pause(NamedTuple):
@@ -112,8 +120,8 @@ class Timing(NamedTuple):
     """How evenly the frames come.
 
     interval : median time between two frames, s. lost : frames that are missing by the times. pauses : of
-    `CONTACT_SECONDS` and more. irregular : share of the intervals that are irregular though no frame is
-    missing. slowest, fastest : local intervals, s. backwards : number of times that the clock went back.
+    `CONTACT_SECONDS` and more. irregular : share of the frames that are late or early, though none is missing
+    before them. slowest, fastest : local intervals, s. backwards : number of times that the clock went back.
     """
 
     interval: float
@@ -147,17 +155,25 @@ class Course:
     """
 
     def __init__(self) -> None:
+        self._reset()
+
+    def _reset(self) -> None:
         self.frames = self.missing = self.repeated = 0
         self.empty = Tally()
         self.damaged = Tally()
         self._times = array("d")
         self._changes = array("f")
         self._clipped = 0.0
+        self._only_references = True
         self._last_seq: int | None = None
         self._run = self._longest = Run(0, 0)
 
     def add(self, glance: Glance) -> None:
         """The next frame."""
+        # The frames between a camera's first references and its next frame were only examined.
+        if self._only_references and self._last_seq is not None and glance.seq > self._last_seq + 1:
+            self._reset()
+        self._only_references = self._only_references and glance.reference
         if self._last_seq is not None:
             self.missing += max(glance.seq - self._last_seq - 1, 0)
         self._last_seq = glance.seq
@@ -242,24 +258,42 @@ def timing_of(times: NDArray[np.float64]) -> Timing | None:
         return None
     local = _local_intervals(np.where(gaps > 0, gaps, np.median(forwards)))
     ratio = gaps / local
-    # A late frame and those that were waiting behind it come in short succession: together they take the time
-    # of as many intervals, unless some are lost.
-    begins = np.flatnonzero(np.concatenate([[True], ratio[1:] >= HALF_AN_INTERVAL]))
-    counts = np.diff([*begins, len(gaps)])
-    missing = np.maximum(np.rint(np.add.reduceat(ratio, begins)) - counts, 0)
+    wide = np.flatnonzero(ratio - 1 > HALF_AN_INTERVAL)
+    missing = _missing(times, local, wide)
     lost = int(missing.sum())
-    irregular = np.abs(ratio - 1) > HALF_AN_INTERVAL
-    irregular[np.repeat(missing > 0, counts)] = False
+    # A late frame has a wide interval before it and a narrow one behind it.
+    narrow = np.count_nonzero(1 - ratio > HALF_AN_INTERVAL)
+    irregular = max(np.count_nonzero(missing == 0), narrow) / len(gaps)
     long = np.flatnonzero((gaps >= CONTACT_SECONDS) & (np.rint(ratio) > 1))
     return Timing(
         float(np.median(forwards)),
         lost,
         [Pause(float(times[index] - times[0]), float(gaps[index])) for index in long],
-        float(irregular.mean()),
+        irregular,
         float(local.max()),
         float(local.min()),
         int((gaps < 0).sum()),
     )
+
+
+def _missing(
+    times: NDArray[np.float64], local: NDArray[np.float64], wide: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Number of frames that are missing in each wide interval.
+
+    A frame may also be late, and those behind it are not. Because a frame is never early, the earliest of the
+    frames beside the interval, less their intervals, tells when its ends were due.
+    """
+    missing = np.zeros(len(wide), np.int64)
+    borders = np.concatenate([[-1], wide, [len(times) - 1]])
+    for index, gap in enumerate(wide):
+        interval = float(local[gap])
+        before = times[max(borders[index] + 1, gap + 1 - NEIGHBOURS) : gap + 1][::-1]
+        after = times[gap + 1 : min(borders[index + 2], gap + NEIGHBOURS) + 1]
+        start = (before + interval * np.arange(len(before))).min()
+        end = (after - interval * np.arange(len(after))).min()
+        missing[index] = max(round((end - start) / interval) - 1, 0)
+    return missing
 
 
 def _local_intervals(gaps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -268,7 +302,7 @@ def _local_intervals(gaps: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.full(len(gaps), np.median(gaps))
     from scipy.ndimage import median_filter
 
-    return np.asarray(median_filter(gaps, LOCAL_INTERVALS, mode="nearest"), np.float64)
+    return np.asarray(median_filter(gaps, LOCAL_INTERVALS, mode="reflect"), np.float64)
 
 
 def seconds_text(seconds: float) -> str:

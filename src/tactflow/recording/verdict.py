@@ -145,7 +145,9 @@ def _drop_outs(recorded: Recorded, timing: Timing | None) -> Finding:
     late, pauses = (timing.lost, timing.pauses) if timing else (0, [])
     missing = max(late, course.missing)
     total = course.frames + missing
-    repeated = 100.0 * course.repeated / max(total, 1) - (0.0 if recorded.live else 100.0 * CODEC_REPEATS)
+    # A picture that stands still is a finding of its own.
+    stutters = course.repeated - (course.frozen.repeats if course.frozen else 0)
+    repeated = 100.0 * stutters / max(total, 1) - (0.0 if recorded.live else 100.0 * CODEC_REPEATS)
     says = f"{missing} of {total} frames missing, {course.repeated} repeated{_pauses_text(pauses)}"
     found = Finding(
         100.0 * (missing if recorded.live else late) / max(total, 1) + max(0.0, repeated),

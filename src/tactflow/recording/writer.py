@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from tactflow.message.schema import message_schema
 from tactflow.outputs import cannot_write, open_output, refuse_interference
+from tactflow.recording.course import Glance
 from tactflow.recording.schemas import channel_types
 
 MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".npz": "application/octet-stream"}
@@ -25,7 +26,7 @@ class Entry:
     """The encoded messages of a frame.
 
     time : of the frame, ns. seq, reference, epoch : as in `Frame`. data : channel -> message; "frames" is the
-    frame itself.
+    frame itself. glance : for the verdict; None for a reference image that is not part of the source.
     """
 
     time: int
@@ -33,6 +34,7 @@ class Entry:
     reference: bool
     epoch: int
     data: Mapping[str, bytes]
+    glance: Glance | None = None
 
 
 class RecordingWriter:

@@ -76,8 +76,21 @@ class Scene:
 
     def frame(self, index: int) -> NDArray[np.uint8]:
         """Render raw frame `index`, a new (600, 800, 3) uint8 BGR array."""
+        index = self._shown(index)
         pressed, cycle = self._contact(index)
         return self._painter.frame(index, pressed, ~self._hidden(cycle))
+
+    @property
+    def delivered(self) -> list[int]:
+        """Indices of the frames that the camera does not lose; among them the first and the last one."""
+        lost = np.random.default_rng([self.settings.seed, 0x6C6F]).random(len(self)) < self.settings.lost
+        return [index for index in range(len(self)) if index in (0, len(self) - 1) or not lost[index]]
+
+    def _shown(self, index: int) -> int:
+        """The moment that a picture shows, which is earlier where the camera is late or stands still."""
+        middle, frozen = len(self) // 2, self.settings.frozen
+        moment = middle - 1 if middle <= index < middle + frozen else index
+        return max(moment - self.settings.lag, 0) if 0 <= index < len(self) else index
 
     def clean(self, index: int) -> NDArray[np.uint8]:
         """Render raw frame `index` without markers, dirt and noise, a new (600, 800, 3) uint8 BGR array."""
@@ -85,6 +98,8 @@ class Scene:
 
     def truth(self, index: int, mapping: PixelMapping | Preprocessor | None = None) -> Truth:
         """Ground truth of frame `index`.
+
+        It is of the moment of the frame, also where the camera is late.
 
         mapping : gives the truth in coordinates of the processed frame, with the contact evaluated at its
             pixel centres. None: raw coordinates.

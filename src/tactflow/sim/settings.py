@@ -77,6 +77,9 @@ class Settings(BaseModel):
     aperture: float = _number(
         0, 0, 2, "radius of the round picture in a black frame, in half heights of the frame; 0 for none"
     )
+    lost: float = _number(0, 0, 0.9, "fraction of frames that the camera loses")
+    frozen: int = _number(0, 0, 10_000_000, "frames in the middle that all show the picture before them")
+    lag: int = _number(0, 0, 1000, "frames by which pictures are late, as behind a long queue")
     depth: float = _number(1, 0, 1.5, "factor on the depth of all contacts")
     shear: float = _number(0.12, 0, 1.5, "largest drag of the gel by a contact, pitches")
     twist: float = _number(0, -60, 60, "largest turn of the gel by a contact, degrees")

@@ -126,8 +126,9 @@ def _open_scene(spec: str) -> FrameReader:
         scene = open_scene(spec.removeprefix("sim:"))
     except ValueError as error:
         raise SourceError(f"{spec}: {error}") from error
-    reader = MemoryFrames(map(scene.frame, range(len(scene))), scene.fps)
-    reader.name, reader.size, reader.total = spec, scene.size, len(scene)
+    delivered = scene.delivered
+    reader = MemoryFrames(map(scene.frame, delivered), scene.fps, delivered)
+    reader.name, reader.size, reader.total = spec, scene.size, len(delivered)
     reader.description = f"{spec}, {reader.total} frames at {scene.fps:g} fps"
     return reader
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sized
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ class MemoryFrames(FrameReader):
     frames : (N, H, W, 3) BGR or (N, H, W) gray array of uint8 or uint16, or an iterable of pictures
         (H, W, 3) or (H, W), all of one size. They are not copied: do not modify them afterwards.
     fps : frames per second; 30 by default.
+    numbers : index of each picture, if some are missing; 0, 1, 2, ... by default.
 
     Raises
     ------
@@ -37,7 +39,12 @@ class MemoryFrames(FrameReader):
     (2, [((48, 64, 3), 0.0), ((48, 64, 3), 0.1)])
     """
 
-    def __init__(self, frames: Iterable[NDArray[Any]], fps: float | None = None) -> None:
+    def __init__(
+        self,
+        frames: Iterable[NDArray[Any]],
+        fps: float | None = None,
+        numbers: Iterable[int] | None = None,
+    ) -> None:
         super().__init__("frames in memory")
         if isinstance(frames, np.ndarray):
             check_array(frames, "an array")
@@ -45,10 +52,11 @@ class MemoryFrames(FrameReader):
         self.total = len(frames) if isinstance(frames, Sized) else None
         self.description = f"{'' if self.total is None else f'{self.total} '}frames in memory"
         self._pictures = frames
+        self._numbers = count() if numbers is None else numbers
 
-    def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        for index, image in enumerate(self._pictures):
+    def _frames(self) -> Iterator[tuple[NDArray[Any], float, int]]:
+        for index, image in zip(self._numbers, self._pictures, strict=False):
             self._picture = f"picture {index}"
             if not isinstance(image, np.ndarray):
                 raise SourceError(f"picture {index}: required an array, got {type(image)}")
-            yield image, index / (self.fps or DEFAULT_FPS)
+            yield image, index / (self.fps or DEFAULT_FPS), index

@@ -201,7 +201,7 @@ def _read(
             if len(pairs) > 2 * KEPT:
                 stride *= 2
                 pairs[:] = [pair for pair in pairs if pair.number % stride == 0]
-        course.add(glances.look(frame.image, frame.t, frame.seq))
+        course.add(glances.look(frame.image, frame.t, frame.seq, reference=frame.reference))
         if show(frame) is False:
             return
     if reader.live and begin is not None:

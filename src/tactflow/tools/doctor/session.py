@@ -129,7 +129,8 @@ def names_of(sources: Sequence[str]) -> list[str]:
     (['left.mcap', 'right.mcap'], ['/l', '/r'])
     """
     short = [
-        source.rpartition("=")[2] if "?" in source else Path(source).name or source for source in sources
+        source.partition("?topic=")[2] or (source if "?" in source else Path(source).name or source)
+        for source in sources
     ]
     distinct = len(set(short)) == len(short)
     return [public_address(name) for name in (short if distinct else sources)]
