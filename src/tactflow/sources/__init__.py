@@ -159,7 +159,7 @@ def sensors_in(spec: str) -> list[str]:
     >>> sensors_in("sim:press")
     ['sim:press']
     """
-    if locate(spec, None) is None or Path(spec).suffix.lower() in _BUILT_IN:
+    if locate(spec, None) is None:
         return [spec]
     sensors = getattr(_plugin(spec, None, False), "sensors", None)
     return [spec] if sensors is None else list(sensors(spec)) or [spec]
