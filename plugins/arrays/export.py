@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 
 from tactflow.engine.errors import StageError
 from tactflow.message.columns import frame_columns
-from tactflow.message.encoding import SCHEMA, STATUS_NAMES
 from tactflow.message.episodes import at_rate
+from tactflow.message.fields import SCHEMA, STATUS_NAMES
 from tactflow.recording.provenance import facts
 from tactflow.system.extras import missing
 from tactflow.vision.types import Markers

@@ -16,7 +16,7 @@ from pydantic import Field
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
 from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
-from tactflow.message.encoding import SCHEMA
+from tactflow.message.fields import SCHEMA
 from tactflow.message.result import Result, encode_message
 from tactflow.outputs import AppendParams, OutputSink, cannot_write, locked_folder
 from tactflow.recording.provenance import facts, kept_files

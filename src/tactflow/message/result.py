@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Self, get_type_hints
 
 import numpy as np
 import orjson
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from tactflow.engine.contract import StageParams
-from tactflow.engine.frame import NO_PICTURE, Frame, Tick, read_only
-from tactflow.message.decoding import decode_values
-from tactflow.message.encoding import SCHEMA, encode
+from tactflow.engine.frame import NO_PICTURE, Absent, Frame, Tick, read_only
+from tactflow.message.encoding import encode
+from tactflow.message.fields import SCHEMA, Message
 from tactflow.ports import ContactMask, Image, Normals
 from tactflow.vision.types import Contact, Depth, Features, Flow, Force, Markers, Pose, Scale, Slip
 
@@ -74,10 +74,12 @@ class Result(Tick):
 
     @classmethod
     def port_types(cls) -> dict[str, Any]:
-        """The types of the ports. (Importing this module alone does not import OpenCV.)"""
+        """The types of the ports: those above, and further ones of the message. (Importing this module alone
+        does not import OpenCV.)"""
         from tactflow.vision.flow.displacement_field import DisplacementField
 
-        return get_type_hints(cls, localns={"DisplacementField": DisplacementField}, include_extras=True)
+        hints = get_type_hints(cls, localns={"DisplacementField": DisplacementField}, include_extras=True)
+        return hints | {port: Any | None for port in Message.ports() if port not in hints}
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -144,16 +146,20 @@ class Result(Tick):
         """
         try:
             parsed: Any = message if isinstance(message, Mapping) else orjson.loads(message)
-            if not (isinstance(parsed["sensor"], str) and isinstance(parsed["seq"], int)):
-                raise TypeError("required a text as sensor and a whole number as seq")
-            frame = Frame(parsed["sensor"], parsed["seq"], float(parsed["t"]), NO_PICTURE)
-            values, skipped = decode_values(parsed)
-            result = cls(frame, values, skipped)
-            width, height = parsed.get("size", (0, 0))
-            result._size = int(width), int(height)
-            result._message = parsed
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            read = Message.model_validate(parsed)
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            place = ".".join(map(str, problem["loc"]))
+            raise ValueError(f"required a message {SCHEMA}: {place}: {problem['msg']}") from None
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"required a message {SCHEMA}: {type(error).__name__}: {error}") from None
+        values = {
+            port: Absent(read.skipped.get(port, "none")) if value is None else value
+            for port, value in read.decoded_ports().items()
+        }
+        result = cls(Frame(read.sensor, read.seq, read.t, NO_PICTURE), values, read.skipped)
+        result._size = read.size
+        result._message = parsed
         return result
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.drawing.results import dimmed, field_arrows
-from tactflow.message.encoding import STATUS_NAMES
+from tactflow.message.fields import STATUS_NAMES
 from tactflow.message.result import Result, encode_message
 from tactflow.ports import Image, Valid
 from tactflow.vision.types import Depth, Markers
