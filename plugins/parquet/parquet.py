@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from pydantic import Field
 
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.message.columns import MARKER_COLUMNS, Column, contact_columns, frame_columns
+from tactflow.message.columns import Column, contact_columns, frame_columns, marker_columns, marker_rows
 from tactflow.message.fields import SCHEMA
 from tactflow.message.result import Result, encode_message
 from tactflow.outputs import AppendParams, OutputSink, cannot_write, locked_folder
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 SEQ = Column("seq", ("seq",), "integer", "the frame's seq in the table frames")
 CONTACT = Column("contact", (), "integer", "0 is the contact with the most pixels")
 TABLES = {
-    "markers": (SEQ, *MARKER_COLUMNS),
+    "markers": (SEQ, *marker_columns()),
     "contacts": (SEQ, CONTACT, *contact_columns()),
     "frames": tuple(frame_columns()),
 }
@@ -210,16 +209,11 @@ def _make_schemas(metadata: Mapping[str, str]) -> dict[str, pa.Schema]:
 
 def _rows(message: Mapping[str, Any]) -> Rows:
     """The rows of each table for one parsed result message."""
-    seq, markers = message["seq"], message["markers"] or {"position": (), "origin": (), "status": ()}
+    seq = message["seq"]
     contacts = [
         (seq, index, *(column.value(contact) for column in contact_columns()))
         for index, contact in enumerate(message["contacts"])
     ]
-    errors = markers.get("stderr") or repeat(None)
-    dots = zip(markers["position"], markers["origin"], markers["status"], errors, strict=False)
-    moved = [
-        (seq, index, x, y, x - origin_x, y - origin_y, origin_x, origin_y, status, error)
-        for index, ((x, y), (origin_x, origin_y), status, error) in enumerate(dots)
-    ]
+    markers = [(seq, *row) for row in marker_rows(message["markers"])]
     frame = tuple(column.value(message) for column in frame_columns())
-    return {"markers": moved, "contacts": contacts, "frames": [frame]}
+    return {"markers": markers, "contacts": contacts, "frames": [frame]}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import runpy
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 from typing import Any
 
 import jsonschema
@@ -12,6 +14,9 @@ import numpy as np
 import pytest
 
 from tactflow.engine.frame import Frame, Tick
+from tactflow.message import encoding
+from tactflow.message import fields as fields_module
+from tactflow.message import result as result_module
 from tactflow.message.result import Result, encode_message
 from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
@@ -20,6 +25,7 @@ from tests.messages import CONTACT, FLOW, MARKERS, PROCESSED, SHEAR, Results, bu
 
 VALIDATOR = jsonschema.Draft202012Validator(message_schema())
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 RAW = np.zeros((600, 800, 3), np.uint8)
 TICK = Tick(Frame("main", 36, 1.2, RAW))
 
@@ -297,6 +303,37 @@ def test_a_message_is_read_back_as_the_result_it_was_made_of() -> None:
     assert (read.flow, read.force, read.skipped) == (sent.flow, sent.force, sent.skipped)
     assert read.depth is not None
     assert (read.depth.greatest, read.depth.volume, read.depth.volume_stderr) == (0.75, 4.5, None)
+
+
+def test_a_new_output_of_a_stage_is_sent_and_read_by_one_line_of_the_description(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class More(fields_module.Message):
+        brightness: fields_module.Finite | None = fields_module.sent("mean of the image", "grey levels")
+
+    for module in (encoding, result_module):
+        monkeypatch.setattr(module, "Message", More)
+    assert "brightness" in Result.port_types()
+    message = Result(TICK.frame, {"brightness": 31.5}).to_dict()
+    assert message["brightness"] == 31.5
+    assert Result.from_message(message)["brightness"] == 31.5
+    assert Result(TICK.frame, {}).to_dict()["brightness"] is None
+    assert More.model_json_schema()["properties"]["brightness"]["unit"] == "grey levels"
+
+
+def test_the_tables_of_the_page_are_those_of_the_description() -> None:
+    page = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    updated = runpy.run_path(str(REPOSITORY / "docs" / "fields.py"))["updated"]
+    assert updated(page) == page, "run `python docs/fields.py`"
+
+
+def test_keys_of_a_later_version_are_ignored_and_an_error_names_the_place() -> None:
+    message = build_message(TICK, Results(PROCESSED, CONTACT, FLOW, MARKERS))
+    message["contact"]["colour"] = "red"
+    assert Result.from_message(message).contact is not None
+    message["contact"]["ellipse"]["axes"] = [3.0]
+    with pytest.raises(ValueError, match=r"frame/1: contact\.ellipse\.axes\.1: Field required"):
+        Result.from_message(message)
 
 
 @pytest.mark.parametrize("change", [{"size": [math.inf, 1]}, {"seq": "1"}, {"skipped": []}, {"contact": {}}])

@@ -30,6 +30,7 @@ SECOND = replace(CONTACT, area=12.0, angle=None, ellipse=None, hull=CONTACT.hull
 TWO = replace(CONTACT, separate=(CONTACT, SECOND))
 SLIP = Slip(True, 0.25, 0.9, (3.0, -4.0), 2.5, 60.0, 7, (0.5, 0.6), 1.5, 3.0)
 FORCE = Force((0.1, None, 2.5), (0.01, None, 0.2), True)
+MARKERS = replace(MARKERS, probability=np.array([0.999, 0.25, np.nan]))
 FOUND = [
     Results(PROCESSED),
     Results(PROCESSED, CONTACT, FLOW, MARKERS),
@@ -96,9 +97,9 @@ def test_the_tables_hold_what_the_messages_say_and_nothing_else(tmp_path: Path) 
     ]
     assert [{name: one for name, one in row.items() if one is not None} for row in contacts] == expected
     expected = [
-        (message["seq"], index, *now, *(np.array(now) - origin), *origin, status, stderr)
+        (message["seq"], index, *now, *(np.array(now) - origin), *origin, status, share, stderr)
         for message in messages
-        for index, (origin, now, status, stderr) in enumerate(
+        for index, (origin, now, status, share, stderr) in enumerate(
             zip(*(message["markers"] or {}).values(), strict=True)
         )
     ]

@@ -1,4 +1,4 @@
-"""Result messages as rows of tables, with columns derived from the JSON Schema of the message.
+"""Result messages as rows of tables, with columns derived from the description of the message.
 
 All tables have the same columns, whatever the pipeline computes, so that tables of several runs can be
 concatenated; values missing in a message are null.
@@ -6,21 +6,19 @@ concatenated; values missing in a message are null.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import repeat
 from typing import Any, NamedTuple
 
+from tactflow.message.fields import Markers, Message, Part, SeparateContact
 from tactflow.message.schema import message_schema, resolved
 
 LEFT_OUT = ("schema", "contacts", "markers", "field")
 """Keys without a column in `frames`: the first is constant, two have their own tables, and a displacement
 field has thousands of numbers per frame."""
-PAIRS = {"size": ("width", "height"), "axes": ("major", "minor"), "shear": ("1", "2"), "shear_mm": ("1", "2")}
-"""Pair -> names of its parts, if not x and y."""
 XYZ = ("x", "y", "z")
-UNIT = re.compile(r"(?:^|, )(px(?:\^2|/s)?|mm(?:\^[23]|/s| per px)?|degrees|s|N)(?=[;:, ]|$)")
-"""Unit in a description, which is its first words or stands behind a comma."""
+"""Names of the elements of a tuple that the description does not name."""
 
 
 class Column(NamedTuple):
@@ -28,13 +26,16 @@ class Column(NamedTuple):
 
     name : such as `contact_center_x`. path : keys and indices of the value in a message.
     kind : number, integer, string, boolean, numbers, points (a list of pairs) or words (name -> text).
-    description : with unit.
+    description : with unit. unit : of the numbers; empty without one. detail : whether only detailed messages
+    have it.
     """
 
     name: str
     path: tuple[str | int, ...]
     kind: str
     description: str
+    unit: str = ""
+    detail: bool = False
 
     def value(self, message: Mapping[str, Any]) -> Any:
         """The value in a message, or None."""
@@ -46,36 +47,12 @@ class Column(NamedTuple):
         return list(value.items()) if self.kind == "words" else value
 
     @property
-    def unit(self) -> str:
-        """The unit that the description names; empty without one, or where parts of it differ.
-
-        >>> Column("t", ("t",), "number", "capture time, s: from the start").unit
-        's'
-        """
-        units = set(UNIT.findall(self.description))
-        return units.pop() if len(units) == 1 else ""
-
-    @property
     def heading(self) -> str:
         """The name as in the message, with the unit, such as `contact.center.x [px]`."""
         words = [key for key in self.path if isinstance(key, str)]
         if len(words) < len(self.path):
             words.append(self.name.removeprefix("_".join(words) + "_"))
         return ".".join(words) + (f" [{self.unit}]" if self.unit else "")
-
-
-MARKER_COLUMNS = (
-    Column("marker", (), "integer", "the same physical marker for the whole run"),
-    Column("x", (), "number", "position now, px"),
-    Column("y", (), "number", "position now, px"),
-    Column("dx", (), "number", "displacement since the reference, px"),
-    Column("dy", (), "number", "displacement since the reference, px"),
-    Column("origin_x", (), "number", "position in the reference frame, px"),
-    Column("origin_y", (), "number", "position in the reference frame, px"),
-    Column("status", (), "string", "tracked, inferred or lost"),
-    Column("stderr", (), "number", "standard error of the position, px; null when unknown"),
-)
-"""Columns of the table `markers`, after `seq`."""
 
 
 @cache
@@ -85,9 +62,7 @@ def frame_columns() -> Sequence[Column]:
     >>> [column.name for column in frame_columns()][:6]
     ['sensor', 'seq', 't', 'size_width', 'size_height', 'contact_area']
     """
-    schema = message_schema()
-    kept = {key: part for key, part in schema["properties"].items() if key not in LEFT_OUT}
-    return tuple(_columns({"properties": kept, "type": "object"}, schema["$defs"], (), ()))
+    return tuple(column for column in _columns(Message) if column.path[0] not in LEFT_OUT)
 
 
 @cache
@@ -97,8 +72,45 @@ def contact_columns() -> Sequence[Column]:
     >>> [column.name for column in contact_columns()][:3]
     ['area', 'center_x', 'center_y']
     """
-    schema = message_schema()
-    return tuple(_columns(schema["properties"]["contacts"]["items"], schema["$defs"], (), ()))
+    return tuple(_columns(SeparateContact))
+
+
+@cache
+def marker_columns() -> Sequence[Column]:
+    """The columns of `markers`: index, position, displacement and origin of a marker, then its other keys.
+
+    >>> [column.name for column in marker_columns()][-4:]
+    ['origin_y', 'status', 'probability', 'stderr']
+    """
+    places = (("", "position now"), ("d", "displacement"), ("origin_", "position in the reference frame"))
+    return (
+        Column("marker", (), "integer", "the same physical marker for the whole run"),
+        *(
+            Column(f"{name}{axis}", (), "number", f"{about}, px", "px")
+            for name, about in places
+            for axis in "xy"
+        ),
+        *(
+            column._replace(kind="number" if column.kind == "numbers" else "string")
+            for column in _columns(Markers)
+            if column.name not in ("origin", "position")
+        ),
+    )
+
+
+def marker_rows(markers: Mapping[str, Any] | None) -> Iterator[tuple[Any, ...]]:
+    """The row of each marker. markers : of a message.
+
+    >>> next(marker_rows({"origin": [[1.0, 2.0]], "position": [[1.5, 2.0]], "status": ["tracked"]}))
+    (0, 1.5, 2.0, 0.5, 0.0, 1.0, 2.0, 'tracked', None, None)
+    """
+    if markers is None:
+        return
+    lists = (markers.get(column.name) or repeat(None) for column in marker_columns()[7:])
+    for index, ((x, y), (origin_x, origin_y), *others) in enumerate(
+        zip(markers["position"], markers["origin"], *lists, strict=False)
+    ):
+        yield index, x, y, x - origin_x, y - origin_y, origin_x, origin_y, *others
 
 
 def scalar_columns(ports: Collection[str] | None = None, *, detail: bool = True) -> Sequence[Column]:
@@ -116,27 +128,32 @@ def scalar_columns(ports: Collection[str] | None = None, *, detail: bool = True)
         for column in frame_columns()
         if column.kind not in ("numbers", "points")
         and (ports is None or column.path[0] in ports or column.path[0] in always)
-        and (detail or not column.description.endswith("detail)"))
+        and (detail or not column.detail)
     ]
 
 
-def _columns(
-    part: Mapping[str, Any], defs: Mapping[str, Any], names: tuple[str, ...], path: tuple[str | int, ...]
-) -> Iterator[Column]:
-    """The columns of a part of the schema; names, path : its location, as words and as keys."""
-    part = resolved(part, defs)
-    description = part.get("description", "")
-    name, kind = "_".join(names), part.get("type", "string")
-    if "properties" in part:
-        for key, inner in part["properties"].items():
-            yield from _columns(inner, defs, (*names, key), (*path, key))
-    elif "prefixItems" in part:
-        suffixes = PAIRS.get(names[-1], XYZ)
-        for index, inner in enumerate(part["prefixItems"]):
-            suffix = suffixes[index] if index < len(suffixes) else str(index + 1)
-            yield Column(f"{name}_{suffix}", (*path, index), inner.get("type", "number"), description)
-    else:
-        kind = {"array": "points", "object": "words"}.get(kind, kind)
-        if part.get("items", {}).get("type") == "number":
-            kind = "numbers"
-        yield Column(name, path, kind, description)
+def _columns(part: type[Part], path: tuple[str, ...] = ()) -> Iterator[Column]:
+    """The columns of a part of the message. path : its keys."""
+    schema = message_schema()
+    properties = (schema if part is Message else schema["$defs"][part.__name__])["properties"]
+    for key in part.all_keys():
+        place = (*path, key.name)
+        form = resolved(properties[key.name], schema["$defs"])
+        about = form["description"], key.sending.unit, "detail" in key.sending.needs
+        if key.part is not None:
+            yield from _columns(key.part, place)
+        elif "prefixItems" in form:
+            names = (*key.sending.elements, *XYZ[len(key.sending.elements) :])
+            for index, element in enumerate(form["prefixItems"]):
+                suffix = names[index] if index < len(names) else str(index + 1)
+                kind = element.get("type", "number")
+                yield Column("_".join((*place, suffix)), (*place, index), kind, *about)
+        else:
+            yield Column("_".join(place), place, _kind(form), *about)
+
+
+def _kind(form: Mapping[str, Any]) -> str:
+    """The kind of a column for values with this JSON Schema."""
+    if form["type"] == "array":
+        return "numbers" if resolved(form["items"], {}).get("type") == "number" else "points"
+    return "words" if form["type"] == "object" else str(form["type"])

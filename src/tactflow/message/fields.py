@@ -83,18 +83,22 @@ Statuses = Annotated[NDArray[np.uint8], PlainValidator(_statuses, json_schema_in
 class Sending:
     """When a key is sent, and with which value.
 
-    needs : keys of `CONDITIONS` that must all be given. if_known : whether it is left out instead of null.
-    value : function of the value that the part is made of, and of the whole result; None: the attribute, or
-    the port, of the key's name. elements : names of the elements of a tuple that are not x, y and z.
+    unit : of the numbers; empty without one. needs : keys of `CONDITIONS` that must all be given. if_known :
+    whether it is left out instead of null. value : function of the value that the part is made of, and of the
+    whole result; None: the attribute, or the port, of the key's name. elements : names of the elements of a
+    tuple that are not x, y and z.
     """
 
+    unit: str = ""
     needs: tuple[str, ...] = ()
     if_known: bool = False
     value: Callable[[Any, Any], Any] | None = None
     elements: tuple[str, ...] = ()
 
     def __call__(self, schema: dict[str, Any]) -> None:
-        """Complete the JSON Schema of the key: the names of the elements, which are titles."""
+        """Complete the JSON Schema of the key: its unit, and the names of the elements."""
+        if self.unit:
+            schema["unit"] = self.unit
         for choice in (schema, *schema.get("anyOf", ())):
             for element, name in zip(choice.get("prefixItems", ()), self.elements, strict=False):
                 element["title"] = name
@@ -108,15 +112,27 @@ class Key(NamedTuple):
     part: "type[Part] | None" = None
 
 
-def sent(meaning: str, *needs: str, alias: str | None = None, **sending: Any) -> Any:
-    """A key of the message. meaning : with its unit. alias : the key, if it is not the attribute's name.
-    needs, sending : see `Sending`."""
+def sent(
+    meaning: str,
+    unit: str = "",
+    *,
+    null: str = "",
+    needs: tuple[str, ...] = (),
+    alias: str | None = None,
+    **sending: Any,
+) -> Any:
+    """A key of the message.
+
+    meaning : of its value. null : when it is null. alias : the key, if it is not the attribute's name. For
+    the others, see `Sending`.
+    """
     conditions = ", ".join(dict.fromkeys(CONDITIONS[need] for need in needs))
+    texts = (meaning, unit and f", {unit}", null and f"; null {null}", conditions and f" ({conditions})")
     return pydantic.Field(
         default=None if needs or sending.get("if_known") else ...,
         alias=alias,
-        description=f"{meaning} ({conditions})" if needs else meaning,
-        json_schema_extra=Sending(needs, **sending),
+        description="".join(texts),
+        json_schema_extra=Sending(unit, needs, **sending),
     )
 
 
@@ -166,23 +182,25 @@ class Ellipse(Part):
     """Ellipse fitted to the contact."""
 
     of = types.Ellipse
-    center: Point = sent("(x, y), px")
-    axes: tuple[Positive, Positive] = sent("full lengths (major, minor), px", elements=("major", "minor"))
-    angle: Angle | None = sent("of the major axis, degrees; null for a circle")
+    center: Point = sent("(x, y)", "px")
+    axes: tuple[Positive, Positive] = sent("full lengths (major, minor)", "px", elements=("major", "minor"))
+    angle: Angle | None = sent("of the major axis", "degrees", null="for a circle")
 
 
 class SeparateContact(Part):
     """Geometry of a contact."""
 
     of = types.Contact
-    area: NotNegative = sent("of the convex hull, px^2")
-    center: Point = sent("centroid of the contact region, px")
-    angle: Angle | None = sent("principal axis, degrees, counter-clockwise as seen; null without a direction")
-    slope: Finite | None = sent(
-        "dy/dx of that axis, y down; null where it is vertical or there is no direction"
+    area: NotNegative = sent("of the convex hull", "px^2")
+    center: Point = sent("centroid of the contact region", "px")
+    angle: Angle | None = sent(
+        "principal axis, counter-clockwise as seen", "degrees", null="without a direction"
     )
-    hull: Points = sent("vertices of the convex hull in order, px")
-    ellipse: Ellipse | None = sent("null where none can be fitted")
+    slope: Finite | None = sent(
+        "dy/dx of that axis, y down", null="where it is vertical or there is no direction"
+    )
+    hull: Points = sent("vertices of the convex hull in order", "px")
+    ellipse: Ellipse | None = sent("fitted to the region", null="where none can be fitted")
     evidence: types.Evidence = sent(
         "what shows it: a change of the light, motion of the markers (dots), or both"
     )
@@ -190,22 +208,25 @@ class SeparateContact(Part):
         "of being a contact; below 0.5 it is unsure (absent if not known)", if_known=True
     )
     center_mm: Point | None = sent(
-        "center from the scale's origin, mm",
-        "scale",
+        "center from the scale's origin",
+        "mm",
+        needs=("scale",),
         value=lambda contact, result: result.scale.point(contact.center),
     )
     area_mm2: NotNegative | None = sent(
-        "area, mm^2", "scale", value=lambda contact, result: result.scale.area(contact.area)
+        "area", "mm^2", needs=("scale",), value=lambda contact, result: result.scale.area(contact.area)
     )
-    confidence: Share = sent("of the direction: 0 a disc, towards 1 a line", "detail")
+    confidence: Share = sent("of the direction: 0 a disc, towards 1 a line", needs=("detail",))
     center_mm_stderr: Point | None = sent(
-        "error due to the scale, mm",
-        *("scale", "detail"),
+        "error due to the scale",
+        "mm",
+        needs=("scale", "detail"),
         value=lambda contact, result: result.scale.point_stderr(contact.center),
     )
     area_mm2_stderr: NotNegative | None = sent(
-        "error due to the scale, mm^2",
-        *("scale", "detail"),
+        "error due to the scale",
+        "mm^2",
+        needs=("scale", "detail"),
         value=lambda contact, result: result.scale.area_stderr(contact.area),
     )
 
@@ -221,22 +242,34 @@ class Contact(SeparateContact):
     """Geometry of the contact region."""
 
     depth_mm: NotNegative | None = sent(
-        "greatest indentation of the surface, mm", "depth", value=lambda _, result: result.depth.greatest
+        "greatest indentation of the surface",
+        "mm",
+        needs=("depth",),
+        value=lambda _, result: result.depth.greatest,
     )
     volume_mm3: NotNegative | None = sent(
-        "between untouched and pressed surface, mm^3", "depth", value=lambda _, result: result.depth.volume
+        "between untouched and pressed surface",
+        "mm^3",
+        needs=("depth",),
+        value=lambda _, result: result.depth.volume,
     )
     depth_mm_stderr: NotNegative | None = sent(
-        "mm; null when unknown",
-        *("depth", "detail"),
+        "standard error of depth_mm",
+        "mm",
+        null="when unknown",
+        needs=("depth", "detail"),
         value=lambda _, result: result.depth.greatest_stderr,
     )
     volume_mm3_stderr: NotNegative | None = sent(
-        "mm^3; null when unknown", *("depth", "detail"), value=lambda _, result: result.depth.volume_stderr
+        "standard error of volume_mm3",
+        "mm^3",
+        null="when unknown",
+        needs=("depth", "detail"),
+        value=lambda _, result: result.depth.volume_stderr,
     )
     normal: Vector | None = sent(
         "mean unit normal of the gel's surface, out of the gel: x right, y down",
-        *("normals", "contact_mask"),
+        needs=("normals", "contact_mask"),
         value=_mean_normal,
     )
 
@@ -257,26 +290,41 @@ class Flow(Part):
     """How the gel inside the contact has moved."""
 
     of = types.Flow
-    mean: Point | None = sent("mean displacement (dx, dy), px; null when not known")
+    mean: Point | None = sent("mean displacement (dx, dy)", "px", null="when not known")
     count: Count = sent("number of markers inside the contact")
     mean_mm: Point | None = sent(
-        "mean, mm; null when not known",
-        "scale",
+        "mean",
+        "mm",
+        null="when not known",
+        needs=("scale",),
         value=lambda flow, result: None if flow.mean is None else result.scale.vector(flow.mean),
     )
     mean_mm_stderr: Point | None = sent(
-        "standard error of mean_mm, mm", *("scale", "detail"), if_known=True, value=_mean_mm_stderr
+        "standard error of mean_mm", "mm", needs=("scale", "detail"), if_known=True, value=_mean_mm_stderr
     )
-    stderr: Point | None = sent("standard error of mean, px; null when unknown", "detail")
-    rotation: Finite | None = sent("twist, degrees, counter-clockwise as seen; null when unknown", "detail")
-    divergence: Finite | None = sent("relative growth in area of the gel; null when unknown", "detail")
-    residual: Finite | None = sent("RMS of what these leave unexplained, px; null when unknown", "detail")
-    rotation_stderr: Positive | None = sent("degrees; null when unknown", "detail")
-    divergence_stderr: Positive | None = sent("null when unknown", "detail")
-    shear_stderr: Positive | None = sent("of each part; null when unknown", "detail")
+    stderr: Point | None = sent("standard error of mean", "px", null="when unknown", needs=("detail",))
+    rotation: Finite | None = sent(
+        "twist, counter-clockwise as seen", "degrees", null="when unknown", needs=("detail",)
+    )
+    divergence: Finite | None = sent(
+        "relative growth in area of the gel", null="when unknown", needs=("detail",)
+    )
+    residual: Finite | None = sent(
+        "RMS of what these leave unexplained", "px", null="when unknown", needs=("detail",)
+    )
+    rotation_stderr: Positive | None = sent(
+        "standard error of rotation", "degrees", null="when unknown", needs=("detail",)
+    )
+    divergence_stderr: Positive | None = sent(
+        "standard error of divergence", null="when unknown", needs=("detail",)
+    )
+    shear_stderr: Positive | None = sent(
+        "standard error of each part of shear", null="when unknown", needs=("detail",)
+    )
     shear: Point | None = sent(
-        "(du/dx - dv/dy, du/dy + dv/dx), displacement (u, v); null when unknown",
-        "detail",
+        "(du/dx - dv/dy, du/dy + dv/dx), displacement (u, v)",
+        null="when unknown",
+        needs=("detail",),
         elements=("1", "2"),
     )
 
@@ -285,16 +333,16 @@ class Markers(Part):
     """The markers; index i is the same physical marker for the whole run. Ones found later come last."""
 
     of = types.Markers
-    origin: Points = sent("positions in the reference frame, px")
-    position: Points = sent("positions now, px; repeated while none can have moved by more than 0.05")
+    origin: Points = sent("positions in the reference frame", "px")
+    position: Points = sent("positions now; repeated while none can have moved by more than 0.05 px", "px")
     status: Statuses = sent(
         "how each position is known",
         value=lambda markers, _: [STATUS_NAMES[value] for value in markers.status.tolist()],
     )
     probability: KnownShares = sent(
-        "of each being a marker at all; null when unknown", "detail", if_known=True
+        "of each being a marker at all", null="when unknown", needs=("detail",), if_known=True
     )
-    stderr: KnownErrors = sent("standard error of each, px; null when unknown", "detail")
+    stderr: KnownErrors = sent("standard error of each", "px", null="when unknown", needs=("detail",))
 
     def decoded(self, **_: Any) -> Any:
         """The markers; without errors in the message, they are NaN."""
@@ -307,14 +355,18 @@ class Scale(Part):
 
     of = types.Scale
     mm_per_px: tuple[Positive, Positive] = sent(
-        "along (x, y), mm per px", value=lambda scale, _: (scale.x, scale.y)
+        "along (x, y)", "mm per px", value=lambda scale, _: (scale.x, scale.y)
     )
-    origin: Point = sent("(x, y) where the mm coordinates are 0, px")
+    origin: Point = sent("(x, y) where the mm coordinates are 0", "px")
 
     def decoded(self, **_: Any) -> Any:
         """The scale, with unknown errors."""
         x, y = self.mm_per_px
         return super().decoded(x=x, y=y, stderr=(math.nan, math.nan))
+
+
+def _translation_mm(slip: types.Slip, result: Any) -> tuple[float, float] | None:
+    return None if slip.translation is None else result.scale.vector(slip.translation)
 
 
 def _speed_mm(slip: types.Slip, result: Any) -> float | None:
@@ -327,22 +379,22 @@ class Slip(Part):
     of = types.Slip
     slipping: bool = sent("whether it slides over the gel")
     stick_ratio: Share = sent("share of the contact on which the gel moves with it; 0 while it slides")
-    probability: Share | None = sent("that it slides; null when unknown")
-    translation: Point | None = sent("(x, y), how far the middle of the contact has moved over the gel, px")
-    rotation: Finite | None = sent("how far it has turned on the gel, degrees, counter-clockwise as seen")
-    speed: NotNegative | None = sent("RMS over the contact, px/s; null in the first frame")
+    probability: Share | None = sent("that it slides", null="when unknown")
+    translation: Point | None = sent("(x, y), how far the middle of the contact has moved over the gel", "px")
+    rotation: Finite | None = sent("how far it has turned on the gel, counter-clockwise as seen", "degrees")
+    speed: NotNegative | None = sent("RMS over the contact", "px/s", null="in the first frame")
     since: Count | None = sent("seq of the frame from which translation and rotation are measured")
-    translation_mm: Point | None = sent(
-        "translation, mm",
-        "scale",
-        value=lambda slip, result: (
-            None if slip.translation is None else result.scale.vector(slip.translation)
-        ),
+    translation_mm: Point | None = sent("translation", "mm", needs=("scale",), value=_translation_mm)
+    speed_mm: NotNegative | None = sent("speed", "mm/s", needs=("scale",), value=_speed_mm)
+    translation_stderr: tuple[NotNegative, NotNegative] | None = sent(
+        "standard error of translation", "px", null="when unknown", needs=("detail",)
     )
-    speed_mm: NotNegative | None = sent("speed, mm/s", "scale", value=_speed_mm)
-    translation_stderr: tuple[NotNegative, NotNegative] | None = sent("px", "detail")
-    rotation_stderr: NotNegative | None = sent("degrees", "detail")
-    speed_stderr: NotNegative | None = sent("px/s", "detail")
+    rotation_stderr: NotNegative | None = sent(
+        "standard error of rotation", "degrees", null="when unknown", needs=("detail",)
+    )
+    speed_stderr: NotNegative | None = sent(
+        "standard error of speed", "px/s", null="when unknown", needs=("detail",)
+    )
 
 
 class Force(Part):
@@ -350,27 +402,27 @@ class Force(Part):
 
     of = types.Force
     value: tuple[Finite | None, Finite | None, NotNegative] = sent(
-        "(x, y, z), N: z presses on the gel, x and y drag it; null when unknown"
+        "(x, y, z): z presses on the gel, x and y drag it", "N", null="when unknown"
     )
-    stderr: tuple[Error, Error, Error] = sent("standard errors, N; null when unknown")
+    stderr: tuple[Error, Error, Error] = sent("standard errors", "N", null="when unknown")
     in_range: bool = sent("whether the calibration was fitted to such contacts; stderr only holds there")
 
 
 class Pose(Part):
-    """How what touches the gel has moved since it was touched."""
+    """Motion of the object since it was touched."""
 
     of = types.Pose
     status: Literal["tracked", "lost"] = sent(
         "lost: no match; repeats the frame before, starts anew in the next"
     )
     since: Count = sent("seq of the frame in which it was touched, or tracked anew")
-    center: Vector = sent("(x, y, z), middle of the contact then, mm: x right, y down, z out of the gel")
-    translation: Vector = sent("(x, y, z) of this point of the object since then, mm")
-    rotation: Vector = sent("rotation vector of the object about this point, degrees")
+    center: Vector = sent("(x, y, z), middle of the contact then: x right, y down, z out of the gel", "mm")
+    translation: Vector = sent("(x, y, z) of this point of the object since then", "mm")
+    rotation: Vector = sent("rotation vector of the object about this point", "degrees")
     stderr: Errors = sent("standard errors of translation, mm, and rotation, degrees")
     covariance: Numbers = sent(
         "of these six, (6, 6) row by row, mm and degrees",
-        "detail",
+        needs=("detail",),
         value=lambda pose, _: pose.covariance.ravel(),
     )
 
@@ -392,45 +444,53 @@ class Field(Part):
     """Displacement of the gel on a regular grid."""
 
     first: Point = sent(
-        "(x, y) of row 0, column 0, in the reference frame, px", value=lambda field, _: field.grid.first
+        "(x, y) of row 0, column 0, in the reference frame", "px", value=lambda field, _: field.grid.first
     )
     spacing: Positive = sent(
-        "from one point to the next along both axes, px", value=lambda field, _: field.grid.spacing
+        "from one point to the next along both axes", "px", value=lambda field, _: field.grid.spacing
     )
-    displacement: SkipValidation[list[list[Point]]] = sent("rows of (dx, dy), px")
-    stderr: SkipValidation[list[list[NotNegative]]] = sent("standard error of each component, rows, px")
+    displacement: SkipValidation[list[list[Point]]] = sent("rows of (dx, dy)", "px")
+    stderr: SkipValidation[list[list[NotNegative]]] = sent("standard error of each component, rows", "px")
+
+
+def _explained(result: Any, _: Any) -> dict[str, str]:
+    return {port: reason for port, reason in result.skipped.items() if port in EXPLAINED_PORTS}
 
 
 class Message(Part):
     """The results of one processed frame."""
 
     model_config = ConfigDict(title=SCHEMA)
-    schema_: Literal["tactflow.frame/1"] = sent("of the message", alias="schema", value=lambda *_: SCHEMA)
+    schema_: Literal["tactflow.frame/1"] = sent(
+        "the kind of message", alias="schema", value=lambda *_: SCHEMA
+    )
     sensor: str = sent("name of the sensor", value=lambda result, _: result.sensor)
     seq: Count = sent(
         "index of the frame at the source; a dropped frame leaves a gap", value=lambda result, _: result.seq
     )
     t: Finite = sent(
-        "capture time, s: from the start of a recording, or Unix time if live",
+        "capture time: from the start of a recording, or Unix time if live",
+        "s",
         value=lambda result, _: result.t,
     )
     size: tuple[Pixels, Pixels] = sent(
-        "(width, height) of the processed frame, px",
+        "(width, height) of the processed frame",
+        "px",
         value=lambda result, _: result.size,
         elements=("width", "height"),
     )
-    contact: Contact | None = sent("null when nothing touches the gel")
+    contact: Contact | None = sent("the contact region", null="when nothing touches the gel")
     contacts: list[SeparateContact] = sent(
         "every separate contact, the one with the most pixels first", value=lambda result, _: result.contacts
     )
-    flow: Flow | None = sent("null when there is no contact")
-    markers: Markers | None = sent("null when markers were not computed")
+    flow: Flow | None = sent("how the gel in contact has moved", null="when there is no contact")
+    markers: Markers | None = sent(
+        "the dots, always in the same order", null="when markers were not computed"
+    )
     skipped: dict[str, str] = sent(
         "port -> why this frame did not need it: unchanged and at_rest repeat the last value, by which a "
         "contact begins and ends at most one frame late; reference -> why this frame became a new one",
-        value=lambda result, _: {
-            port: reason for port, reason in result.skipped.items() if port in EXPLAINED_PORTS
-        },
+        value=_explained,
     )
     scale: Scale | None = sent("makes mm of px (calibrated)", if_known=True)
     slip: Slip | None = sent("of the contact (only where the pipeline has the stage slip)", if_known=True)
@@ -441,7 +501,7 @@ class Message(Part):
     features: Features | None = sent(
         "of a network (only where a stage network gives features)", if_known=True
     )
-    field: Field | None = sent("null without contact", "field")
+    field: Field | None = sent("displacement on a grid", null="without contact", needs=("field",))
 
     @classmethod
     @cache
