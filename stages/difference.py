@@ -40,10 +40,13 @@ class Difference(Stage):
             1e-6, gt=0, lt=1, description="false contacts on the untouched gel, per frame"
         )
         repeatability: float = Field(
-            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative"
+            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
         )
         tint: float = Field(
-            0.01, ge=0, le=1, description="variation of the colour of that light, relative to its brightness"
+            0.01,
+            ge=0,
+            le=1,
+            description="variation of the colour of that light, relative to its brightness; see gel",
         )
         shift: float = Field(
             1.0, ge=0, le=100, description="movement of the untouched gel against the camera, px"

@@ -31,9 +31,14 @@ class Probe(Stage):
         """How careful to be."""
 
         repeatability: float = Field(
-            0.025, ge=0, le=1, description="same as in difference; keep the two equal"
+            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
         )
-        tint: float = Field(0.01, ge=0, le=1, description="same as in difference; keep the two equal")
+        tint: float = Field(
+            0.01,
+            ge=0,
+            le=1,
+            description="variation of the colour of that light, relative to its brightness; see gel",
+        )
         false_alarms: float = Field(
             0.01, gt=0, le=0.5, description="share of still frames in which dots are looked at all the same"
         )

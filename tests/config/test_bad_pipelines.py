@@ -51,6 +51,7 @@ CASES = [
         "  prepare: {use: @Prepare, queue: {§when_full: lates}}",
         "when_full: should be 'block', 'latest' or 'drop_oldest' .. did you mean latest?",
     ),
+    ("source", "  prepare: {use: @Prepare, queue: {§capcity: 2}}", "unknown key; did you mean capacity?"),
     ("source", "  prepare: {use: @Prepare, §max_rate: 5}", "stages.prepare.max_rate: unknown parameter"),
     ("source", "  §teleport:", "stages.teleport: there is no stage called teleport .. ./file.py:Class"),
     ("source", "  §jsonl:", "jsonl is under stages: but belongs under sinks:"),

@@ -47,6 +47,8 @@ def test_every_shipped_pipeline_fits_the_schema(path: Path, validator: Draft2020
         ("stages: {hull: {queue: {when_full: lates}}}", "$.stages.hull.queue.when_full"),
         ("stages: {hull: {max_rate: 5}}", "$.stages.hull"),
         ("stages: {hull: {when: {signal: touching}}}", "$.stages.hull.when"),
+        ("{stages: {capture: }, gel: {tnt: 1}}", "$.gel"),
+        ("{stages: {capture: }, gel: {tint: 2}}", "$.gel.tint"),
         ("{stages: {capture: }, sensors: {}}", "$.sensors"),
         ("{stages: {capture: }, sensors: {a b: }}", "$.sensors"),
         ("{stages: {capture: }, sensors: {a: {stage: }}}", "$.sensors.a"),

@@ -172,7 +172,15 @@ def _params(draft: Draft, document: Document) -> StageParams | None:
         return None
     reserved = {key for key in RESERVED if key != "max_rate" or draft.section == "sinks"}
     try:
-        return validate(draft.component.params, document, draft.keys, without=reserved, noun="parameter")
+        defaults = ("gel",) if draft.section == "stages" else ()
+        return validate(
+            draft.component.params,
+            document,
+            draft.keys,
+            without=reserved,
+            defaults=defaults,
+            noun="parameter",
+        )
     except Exception as error:
         reason = f"{type(error).__name__}: {error} ({code_place(error.__traceback__)})"
         document.report(draft.keys, f"the parameters fail: {reason}")

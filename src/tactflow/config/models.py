@@ -7,7 +7,7 @@ are checked elsewhere in this package.
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
@@ -101,6 +101,26 @@ class SinkEntry(Entry):
     )
 
 
+class Gel(Part):
+    """Properties of the gel, for every stage that has a parameter of the same name and does not set it."""
+
+    repeatability: float | None = Field(
+        None, ge=0, le=1, description="variation of the light on the untouched gel, relative; null: 0.025"
+    )
+    tint: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="variation of the colour of that light, relative to its brightness; null: 0.01",
+    )
+    dot: float | None = Field(
+        None, ge=1, le=100, description="radius of a dot, processed px; null finds it in the first frame"
+    )
+    polarity: Literal["auto", "dark", "bright"] | None = Field(
+        None, description="dots against the gel; null: auto"
+    )
+
+
 class Changes(Part):
     """Changes of the file for a sensor: the keys of `PipelineFile` that may differ between sensors.
 
@@ -108,6 +128,7 @@ class Changes(Part):
     """
 
     calibration: Any = None
+    gel: Any = None
     skipping: Any = None
     opencv_threads: Any = None
     stages: Any = None
@@ -126,6 +147,9 @@ class PipelineFile(Part):
         min_length=1,
         description="the sensor's calibration file, from the folder of this file or the current one, or the "
         "default of a kind of sensor, mini or digit; null: results in pixels only",
+    )
+    gel: Annotated[Gel, _EMPTY] = Field(
+        {}, validate_default=True, description="properties of the gel that several stages use"
     )
     skipping: bool = Field(True, description="false runs every stage in every frame")
     opencv_threads: int | None = Field(

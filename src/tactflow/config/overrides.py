@@ -32,7 +32,7 @@ class Override:
 def from_settings(settings: Mapping[str, Any]) -> list[Override]:
     """Overrides from `{"stages.hull.min_area": 50}` or `{"stages": {"hull": {"min_area": 50}}}`.
 
-    Settings of stages are merged with those of the file; other values are replaced.
+    Settings of stages and of the gel are merged with those of the file; other values are replaced.
 
     >>> from_settings({"sinks.zmq": None})
     [Override(key='sinks.zmq', value=None, origin='settings')]
@@ -40,7 +40,7 @@ def from_settings(settings: Mapping[str, Any]) -> list[Override]:
     ['stages.hull.min_area']
     """
     flat = dict(settings)
-    for key in ("stages", *(f"stages.{id_}" for id_ in _part(settings, "stages"))):
+    for key in ("gel", "stages", *(f"stages.{id_}" for id_ in _part(settings, "stages"))):
         if part := _part(flat, key):
             del flat[key]
             flat |= {f"{key}.{name}": value for name, value in part.items()}

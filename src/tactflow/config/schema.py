@@ -20,7 +20,7 @@ def pipeline_schema(components: Sequence[Component]) -> dict[str, Any]:
     """
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
-    for entry in ("StageEntry", "SinkEntry"):
+    for entry in ("StageEntry", "SinkEntry", "Gel"):
         definitions[entry]["type"] = ["object", "null"]
     for component in components:
         section, entry = ("sinks", "SinkEntry") if component.kind == "sink" else ("stages", "StageEntry")

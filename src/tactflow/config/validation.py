@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from tactflow.config.document import Document, Keys, described, dotted, shown
@@ -35,19 +37,23 @@ def validate(
     keys: Keys = (),
     *,
     without: Collection[str] = (),
+    defaults: Keys = (),
     noun: str = "key",
 ) -> Model | None:
     """The mapping at `keys` as its model; None if it has errors, which are recorded.
 
-    without : keys of the mapping that do not belong to the model. noun : for its keys, in messages.
+    without : keys of the mapping that do not belong to the model. defaults : path of a mapping whose values
+    are used for keys of the model that are not given. noun : for its keys, in messages.
     """
-    values = {key: value for key, value in document.mapping(*keys).items() if key not in without}
+    shared = document.mapping(*defaults) if defaults else {}
+    values = {key: shared[key] for key in model.model_fields.keys() & shared if shared[key] is not None}
+    values |= {key: value for key, value in document.mapping(*keys).items() if key not in without}
     try:
         # Pydantic's strict rules for JSON suit YAML: a list may become a tuple, but text and booleans never
         # become numbers.
         return model.model_validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
-        report(error, model, document, keys, also=without, noun=noun)
+        report(error, model, document, keys, also=without, defaults=defaults, noun=noun)
         return None
 
 
@@ -76,24 +82,28 @@ def report(
     keys: Keys,
     *,
     also: Collection[str] = (),
+    defaults: Keys = (),
     noun: str = "key",
 ) -> None:
     """Record each error at its value; those of a union together.
 
-    keys : path of the validated mapping. also : its valid keys besides those of the model.
+    keys : path of the validated mapping. also : its valid keys besides those of the model. defaults : path of
+    the mapping with values that are not in it.
     """
-    named = {field.alias or name: field for name, field in model.model_fields.items()}
     groups: dict[Keys, list[ErrorDetails]] = {}
     for detail in error.errors(include_url=False):
-        place, rest = _place(document, keys, detail)
+        name = detail["loc"][0] if detail["loc"] else None
+        is_default = name in document.mapping(*defaults) and name not in document.mapping(*keys)
+        place, rest = _place(document, defaults if defaults and is_default else keys, detail)
         kind, name = detail["type"], str(place[-1]) if place else ""
-        is_own = len(place) == len(keys) + 1
+        named = _fields(model, place[len(keys) : -1])
         if kind == "missing" and not rest:
-            about = named[name].description if is_own and name in named else None
+            about = named[name].description if name in named else None
             message = _message(detail) + (f" ({about})" if about else "")
             document.report_at(document.mark(*place[:-1]), f"{dotted(place)}: {message}")
         elif kind == "extra_forbidden" and not rest:
-            hint = did_you_mean(name, [*named, *sorted(also)], "there are ") if is_own else ""
+            known = [*named, *sorted(also)] if len(place) == len(keys) + 1 else [*named]
+            hint = did_you_mean(name, known, "there are ") if known else ""
             document.report(place, f"unknown {noun}{hint}")
         elif rest == ("[key]",):
             document.report(place, f"{_message(detail)}, got {shown(name)}")
@@ -101,6 +111,21 @@ def report(
             groups.setdefault(place, []).append(detail)
     for place, details in groups.items():
         document.report(place, _words(details, document.get(*place)))
+
+
+def _fields(model: type[BaseModel], path: Keys) -> dict[str, FieldInfo]:
+    """The fields of the model at a path within a model; empty where there is none."""
+    kind: Any = model
+    for key in path:
+        if get_origin(kind) is dict:
+            kind = get_args(kind)[1]
+        else:
+            field = _fields(kind, ()).get(str(key))
+            kind = None if field is None else field.annotation
+        if get_origin(kind) is Annotated:
+            kind = get_args(kind)[0]
+    is_model = inspect.isclass(kind) and issubclass(kind, BaseModel)
+    return {field.alias or name: field for name, field in kind.model_fields.items()} if is_model else {}
 
 
 def _place(document: Document, keys: Keys, detail: ErrorDetails) -> tuple[Keys, Keys]:
