@@ -70,7 +70,7 @@ def test_damage_in_the_middle_is_reported(tmp_path: Path, finished: bool) -> Non
     path = tmp_path / "a.mcap"
     data = bytearray(record(path, 40))
     # Behind the schemas, which the first chunk holds, and before the last frames.
-    data[50_000] ^= 0xFF
+    data[60_000] ^= 0xFF
     path.write_bytes(data if finished else data[:-300])
     with pytest.raises(SourceError, match=r"is damaged .*tactflow repair keeps all that is intact"):
         seqs_in(path)
