@@ -16,6 +16,7 @@ from tactflow.engine.contract import Source, StageParams
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame, read_only
 from tactflow.sources import KINDS, Arrival, CameraRequest, FrameReader, Watch, open_source
+from tactflow.sources.base import log
 from tactflow.sources.files import ImageFiles, load_image
 from tactflow.sources.pace import paced
 from tactflow.sources.references import References
@@ -85,6 +86,12 @@ class Capture(Source):
             description="black pictures of a camera or stream for this time are a fault, s; null: never",
         )
 
+        skip_damaged: bool = Field(
+            True,
+            description="repeat the results of the frame before for pictures that show no gel or were "
+            "damaged on their way from the camera; if false, they are processed like all others",
+        )
+
         @field_validator("source", mode="before")
         @classmethod
         def _index_is_text(cls, value: object) -> object:
@@ -115,6 +122,7 @@ class Capture(Source):
             params.source,
             params.reference if isinstance(params.reference, int) else 1,
             params.settle,
+            skip_damaged=params.skip_damaged,
         )
 
     def open(self) -> None:
@@ -180,9 +188,10 @@ class Capture(Source):
         for arrival in paced(arrivals, p.source, p.realtime and not source.live, self._stop):
             image = read_only(arrival.image)
             captured = arrival.captured or time.perf_counter()
-            yield Frame(
-                self._sensor, arrival.seq, arrival.t, image, captured, arrival.reference, arrival.epoch
-            )
+            reference, epoch, damaged = arrival.reference, arrival.epoch, arrival.damaged
+            yield Frame(self._sensor, arrival.seq, arrival.t, image, captured, reference, epoch, damaged)
+        if not source.live and (count := self._references.repeated) > 1:
+            log.warning("%s: all %d pictures are the same: a camera that stood still?", p.source, count)
 
     def _unskipped(self, source: FrameReader) -> Iterator[Arrival]:
         """The frames without the first ones of the source."""

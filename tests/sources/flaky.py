@@ -47,7 +47,8 @@ class Flaky:
         self.does = does
 
     def noisy(self, level: int = 90) -> NDArray[np.uint8]:
-        return self.rng.integers(level, level + 20, (48, 64, 3), np.uint8)
+        light = np.arange(64, dtype=np.uint8)[:, None] if level else np.uint8(0)
+        return self.rng.integers(level, level + 20, (48, 64, 3), np.uint8) + light
 
     def open(self, *_: object, **__: object) -> Connection:
         if self._heals_in > 0:

@@ -30,7 +30,7 @@ def test_no_later_frame_changes_the_results_of_an_earlier_one(
 ) -> None:
     sensor, path = open_scene(f"{scene}?frames=300"), tmp_path / "frames.npy"
     # Untouched, and from the first touch on.
-    order = [*[0] * 5, *range(FRAMES, 2 * FRAMES)]
+    order = [*range(5), *range(FRAMES, 2 * FRAMES)]
     np.save(path, np.stack([sensor.frame(index) for index in order]))
     run = LockstepPipeline(on_recording(load_pipeline(find_pipeline(pipeline)), path))
     outcomes, copies = [], []

@@ -12,7 +12,7 @@ from tactflow.engine.ending import Ending
 from tactflow.engine.errors import SourceError, TactflowError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Node
-from tactflow.engine.node import UNCONNECTED, RunningNode, Slots, TickState
+from tactflow.engine.node import DAMAGED, UNCONNECTED, RunningNode, Slots, TickState
 from tactflow.engine.segment import NodeFailedError, Segment
 from tactflow.engine.stats import NodeStats
 
@@ -77,6 +77,7 @@ class Capturing:
         frames = iter(source.frames())
         stopping = self._ending.stopping
         index = 0
+        whole: Frame | None = None
         while not stopping.is_set():
             segment.current = self._node.id
             began = time.perf_counter()
@@ -95,7 +96,13 @@ class Capturing:
             self.frames += frame.seq >= 0
             demand = frozenset([node.id for node in sinks if _wants(node, frame)])
             tick = TickState(index, frame, demand, self._table_size)
-            tick.values[self.slot] = frame
+            if frame.damaged:
+                # Stages without memory repeat their results on the frame before it.
+                self.stats.skips[DAMAGED.reason] += 1
+                tick.reasons[self.slot] = DAMAGED.reason
+            else:
+                whole = frame
+            tick.values[self.slot] = whole or DAMAGED
             index += 1
             segment.handle(tick)
             if self._max_frames is not None and self.frames >= self._max_frames:

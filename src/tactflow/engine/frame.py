@@ -28,6 +28,8 @@ class Frame:
         run sets the time at which it received the frame.
     reference : True if this frame shows the untouched gel that later frames are compared with.
     epoch : incremented with each new reference; stages are reset between epochs.
+    damaged : True if the image is not what the camera took, or shows no gel. No stage processes it: the
+        results of the previous frame are repeated. Never a reference.
 
     >>> Frame("main", 36, 1.2, np.zeros((600, 800, 3), np.uint8)).seq
     36
@@ -40,6 +42,7 @@ class Frame:
     captured: float = 0.0
     reference: bool = False
     epoch: int = 0
+    damaged: bool = False
 
 
 NO_PICTURE = np.zeros((0, 0, 3), np.uint8)

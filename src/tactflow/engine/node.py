@@ -20,6 +20,9 @@ Slots = Mapping[tuple[str, str], int]
 UNCONNECTED = 0
 """The slot that always holds None, for unconnected optional inputs."""
 
+DAMAGED = Absent("damaged")
+"""The value of the source's frame if it is damaged and none came before."""
+
 _NONE = Absent("none")
 _NO_DEMAND = Absent("no_demand")
 
@@ -129,6 +132,8 @@ class RunningNode:
         """Its inputs, None for absent optional ones; or the `Absent` of a required input."""
         table = tick.values
         values = [table[slot] for slot in self._input_slots]
+        if self.sink is not None and tick.frame.damaged:
+            values = [tick.frame if isinstance(value, Frame) else value for value in values]
         if tick.reasons:
             for number, value in enumerate(values):
                 if isinstance(value, Absent):
@@ -167,7 +172,8 @@ class RunningNode:
 
     def publish(self, tick: TickState, outputs: Sequence[Any]) -> None:
         """Enter its outputs into the tick's table."""
-        inherited = self._inherited_reason(tick) if tick.reasons and self._is_pure else None
+        inherits = tick.reasons and (self._is_pure or tick.frame.damaged)
+        inherited = self._inherited_reason(tick) if inherits else None
         for number, slot in enumerate(self.slots):
             tick.values[slot] = value = outputs[number]
             if isinstance(value, Absent):

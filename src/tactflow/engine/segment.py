@@ -22,8 +22,8 @@ from tactflow.engine.errors import StageError, TactflowError
 from tactflow.engine.frame import Absent, Frame
 from tactflow.engine.graph import Node
 from tactflow.engine.link import Link
-from tactflow.engine.node import RunningNode, TickState
-from tactflow.engine.plan import Plan
+from tactflow.engine.node import DAMAGED, RunningNode, TickState
+from tactflow.engine.plan import Plan, remembers
 from tactflow.engine.stats import Durations
 
 logger = logging.getLogger("tactflow")
@@ -55,16 +55,19 @@ class NewReferences:
 
     def enter(self, tick: TickState) -> None:
         """Set the epoch of a tick's frame, and turn it into a reference if requested."""
-        frame, reason = tick.frame, self._reason
+        frame = tick.frame
+        # A damaged frame cannot be a reference; the next one can.
+        reason, self._reason = (None, self._reason) if frame.damaged else (self._reason, None)
         if reason is not None and frame.epoch == self._epoch:
             self._taken += 1
             tick.renewed = reason
             tick.demand |= self._sinks
-        self._reason, self._epoch = None, frame.epoch
+        self._epoch = frame.epoch
         if self._taken:
             reference = frame.reference or tick.renewed is not None
             tick.frame = replace(frame, reference=reference, epoch=frame.epoch + self._taken)
-            tick.values[self._slot] = tick.frame
+            if not frame.damaged:
+                tick.values[self._slot] = tick.frame
 
 
 class Segment:
@@ -100,6 +103,7 @@ class Segment:
             node.makers = _existing(by_id, [ref.node for ref in node.node.inputs.values() if ref])
             if node.gates:
                 node.signal_makers = _existing(by_id, [gate.signal.node for gate in node.node.gates])
+        self._remembering = [node for node in self.nodes if remembers(node.node, plan.pipeline)]
         roots = plan.roots(name)
         self._roots = [(by_id[id_], sinks) for id_, sinks in roots.items() if id_ in by_id]
         self._watchers = [
@@ -134,6 +138,8 @@ class Segment:
             self.epoch = tick.frame.epoch
             for node in self.nodes:
                 node.reset()
+        if tick.frame.damaged:
+            self._hold(tick)
         for node, sinks in self._roots:
             if node.pulled != tick.index and (sinks is None or not sinks.isdisjoint(tick.demand)):
                 self._pull(node, tick)
@@ -146,6 +152,14 @@ class Segment:
         self.current = None
         if tick.demand and self._data_sinks:
             self._latency.add(perf_counter() - tick.frame.captured)
+
+    def _hold(self, tick: TickState) -> None:
+        """Repeat the outputs of all stages with a memory, for a damaged frame. The others get the same inputs
+        as before, and so give the same outputs."""
+        for node in self._remembering:
+            if not node.disabled:
+                node.pulled = tick.index
+                node.skip(tick, DAMAGED, repeat=True)
 
     def _pull(self, node: RunningNode, tick: TickState) -> None:
         """Evaluate a node and what it needs, unless a gate, an absent or unchanged inputs make it skip."""
@@ -162,7 +176,8 @@ class Segment:
                     # Earlier outputs must not be repeated after absent ones.
                     node.forget()
                 signal = tick.values[slot]
-                node.skip(tick, signal if isinstance(signal, Absent) else Absent(gate.reason), repeat=repeat)
+                absent = signal if isinstance(signal, Absent) else Absent(gate.reason)
+                node.skip(tick, DAMAGED if tick.frame.damaged else absent, repeat=repeat)
                 return
         if node.disabled:
             node.skip(tick, _DISABLED)

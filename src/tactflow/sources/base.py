@@ -37,7 +37,8 @@ class Arrival(NamedTuple):
 
     image, t : as from `FrameReader.read`. seq, reference, epoch : as in `Frame`; for a live source, seq also
     counts frames that were never read. paced : False for a reference that is delivered ahead of its time.
-    captured : monotonic time (`time.perf_counter`) of its arrival, s; 0 for a recording.
+    captured : monotonic time (`time.perf_counter`) of its arrival, s; 0 for a recording. damaged : as in
+    `Frame`.
     """
 
     image: BgrImage
@@ -47,6 +48,7 @@ class Arrival(NamedTuple):
     epoch: int = 0
     paced: bool = True
     captured: float = 0.0
+    damaged: bool = False
 
 
 class FrameReader:

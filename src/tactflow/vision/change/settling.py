@@ -43,6 +43,9 @@ LOCAL: Final = 0.06
 over 3 x 3 cells. Chosen on franka_mini: key frames of its compression stay below."""
 MOVED: Final = 0.01
 """Minimum share of cells that moved. Chosen by hand."""
+ELSEWHERE: Final = 0.5
+"""Share of cells that moved above which two pictures show different gels: a touch leaves some of a gel as it
+was."""
 SMOOTH: Final = 3
 """Degree of the polynomial in x and y that models the light of an untouched gel. Chosen by hand."""
 MEDIAN: Final = 5
@@ -93,14 +96,19 @@ def change_between(before: Look, after: Look) -> tuple[Floats32, bool]:
     Returns the logarithm of each channel's gain, (channels,) float32, the median over the picture, which is
     robust against an object that covers less than half of it; and whether cells changed relative to it.
     """
+    gain, moved = _moved(before, after)
+    return gain, bool(moved.mean() > MOVED)
+
+
+def _moved(before: Look, after: Look) -> tuple[Floats32, NDArray[np.bool_]]:
+    """The gain as in `change_between`, and which cells changed relative to it, (h, w) bool."""
     both = before.seen & after.seen
     change = np.where(both, after.light - before.light, np.float32(np.nan))
     gain = np.zeros(change.shape[2], np.float32)
     visible = both.any(axis=(0, 1))
     gain[visible] = np.nanmedian(change[..., visible], axis=(0, 1))
     left = cv2.blur(np.where(both, change - gain, np.float32(0)), (3, 3))
-    moved = np.abs(np.atleast_3d(left)).max(axis=2) > LOCAL
-    return gain, bool(moved.mean() > MOVED)
+    return gain, np.abs(np.atleast_3d(left)).max(axis=2) > LOCAL
 
 
 def unevenness(look: Look) -> float:
@@ -210,6 +218,17 @@ class Settling:
         return change_between(self._looks[self.best()], self._looks[-1])[1]
 
     @property
+    def outlived(self) -> bool:
+        """Whether the first state is a leftover in the camera's buffers: it is brief, undecided, and the last
+        state either shows something else nearly everywhere, or is about as even, so that no touch caused it.
+        """
+        first, last = self._states[0], self._states[-1]
+        if len(first) >= self._calm / 2 or not self.undecided:
+            return False
+        moved = _moved(self._looks[first[0]], self._looks[-1])[1]
+        return bool(moved.mean() > ELSEWHERE) or self._unevenness(last) < AS_EVEN * self._unevenness(first)
+
+    @property
     def begins(self) -> int:
         """Index of the frame with which the last state of the gel began."""
         return self._states[-1][0]
@@ -242,7 +261,14 @@ class Settling:
     def best(self) -> int:
         """Index of the most typical frame of the untouched gel in steady light; 0 if the first is one of
         them."""
-        calm = self.alike()
+        return self._typical(self.alike())
+
+    def latest(self) -> tuple[int, list[int]]:
+        """Like `best` and `alike`, of the last state of the gel."""
+        calm = self._calm_frames(self._states[-1])
+        return self._typical(calm), calm
+
+    def _typical(self, calm: list[int]) -> int:
         if calm[0] == 0:
             return 0
         lights = np.array([self._looks[i].light - self._gains[i] for i in calm])
