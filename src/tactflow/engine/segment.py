@@ -103,7 +103,9 @@ class Segment:
             node.makers = _existing(by_id, [ref.node for ref in node.node.inputs.values() if ref])
             if node.gates:
                 node.signal_makers = _existing(by_id, [gate.signal.node for gate in node.node.gates])
-        self._remembering = [node for node in self.nodes if remembers(node.node, plan.pipeline)]
+        self._remembering = [
+            node for node in self.nodes if node.sink is None and remembers(node.node, plan.pipeline)
+        ]
         roots = plan.roots(name)
         self._roots = [(by_id[id_], sinks) for id_, sinks in roots.items() if id_ in by_id]
         self._watchers = [
