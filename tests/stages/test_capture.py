@@ -54,11 +54,12 @@ def test_the_first_frames_are_the_reference(count: int, recording: str) -> None:
 
 
 def test_a_reference_image_comes_before_the_first_frame(recording: str, tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "gel.png"), np.full((4, 6), 99, np.uint8))
+    gel = np.repeat(np.arange(90, 96, dtype=np.uint8)[None], 4, axis=0)
+    cv2.imwrite(str(tmp_path / "gel.png"), gel)
     frames = list(capture(recording, directory=tmp_path, reference="gel.png").frames())
     assert [frame.seq for frame in frames] == [-1, 0, 1, 2, 3, 4, 5]
     assert [frame.reference for frame in frames] == [True] + [False] * 6
-    np.testing.assert_array_equal(frames[0].image, np.full((4, 6, 3), 99, np.uint8))
+    np.testing.assert_array_equal(frames[0].image, np.dstack([gel] * 3))
     assert not frames[0].image.flags.writeable
     assert frames[0].t == frames[1].t
 
@@ -66,7 +67,7 @@ def test_a_reference_image_comes_before_the_first_frame(recording: str, tmp_path
 def test_a_reference_image_of_another_size_is_an_error_that_names_both(
     recording: str, tmp_path: Path
 ) -> None:
-    cv2.imwrite(str(tmp_path / "gel.png"), np.full((5, 6), 99, np.uint8))
+    cv2.imwrite(str(tmp_path / "gel.png"), np.repeat(np.arange(90, 96, dtype=np.uint8)[None], 5, axis=0))
     stage = capture(recording, reference=str(tmp_path / "gel.png"))
     with pytest.raises(SourceError, match=r"reference .* 6 x 5 pixels.*recording\.npy have 6 x 4"):
         next(stage.frames())
