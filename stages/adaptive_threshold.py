@@ -22,6 +22,12 @@ class AdaptiveThreshold(Stage):
         marker_mask: {use: adaptive_threshold, contrast: 12}
 
     P. D. Wellner, "Adaptive thresholding for the DigitalDesk", Xerox EuroPARC, 1993.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> mask = tactflow.stage("adaptive_threshold").process(scene.frame(0))
+    >>> bool(0.02 < (mask > 0).mean() < 0.3)
+    True
     """
 
     memory = "stateful"

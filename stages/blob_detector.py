@@ -24,6 +24,12 @@ class BlobDetector(Stage):
 
     OpenCV, class SimpleBlobDetector; S. Suzuki, K. Abe, "Topological structural analysis of digitized binary
     images by border following", Computer Vision, Graphics, and Image Processing 30 (1985), for its outlines.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> mask = tactflow.stage("blob_detector").process(scene.frame(0))
+    >>> bool(0.02 < (mask > 0).mean() < 0.3)
+    True
     """
 
     memory = "stateful"

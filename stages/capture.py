@@ -29,6 +29,11 @@ class Capture(Source):
     camera. Its first frames are examined ahead: a better reference than the first frame is delivered before
     all others, with number -1. Frames of a live source are omitted until it is steady. A recording of
     tactflow has its own references, seq and epochs.
+
+    >>> capture = Capture(Capture.Params(source="sim:press?frames=3"))
+    >>> capture.open()
+    >>> [frame.reference for frame in capture.frames()]
+    [True, False, False]
     """
 
     class Params(StageParams):

@@ -19,6 +19,12 @@ class ClassicDifference(Stage):
         difference: {use: classic_difference}
 
     The script's `difference`.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("bright")
+    >>> difference = tactflow.stage("classic_difference")
+    >>> [difference.process(scene.frame(index)).touching for index in (0, 60)]
+    [False, True]
     """
 
     memory = "stateful"

@@ -18,6 +18,13 @@ class ClassicFlow(Stage):
         flow_in_mask: {use: classic_flow, dilate: 8, when: touching}
 
     The numbers of the script's `draw_flow_mask`.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> origin = np.array([[10.0, 20.0], [30.0, 20.0]])
+    >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(2, np.uint8), np.full(2, 0.02))
+    >>> tactflow.stage("classic_flow").process(markers, np.full((40, 40), 255, np.uint8)).count
+    2
     """
 
     memory = "pure"

@@ -17,6 +17,13 @@ class ClassicHull(Stage):
         hull: {use: classic_hull, when: touching}
 
     The script's `get_all_contour`, `get_convex_hull_area` and `regress_line`.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:30, 10:50] = 255
+    >>> tactflow.stage("classic_hull").process(mask).area
+    351.0
     """
 
     memory = "pure"

@@ -16,6 +16,12 @@ class ClassicMask(Stage):
 
     The script's `mask_marker`; D. Marr, E. Hildreth, "Theory of edge detection", Proceedings of the Royal
     Society B 207 (1980), for differences of Gaussians.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> mask = tactflow.stage("classic_mask").process(scene.frame(0))
+    >>> bool(0.02 < (mask > 0).mean() < 0.3)
+    True
     """
 
     memory = "pure"

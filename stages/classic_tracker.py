@@ -17,6 +17,12 @@ class ClassicTracker(Stage):
         tracker: {use: classic_tracker}
 
     The script's `marker_center` and its search `m`.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> tracker = tactflow.stage("classic_tracker")
+    >>> [len(tracker.process(scene.frame(index)).position) for index in (0, 1)]
+    [80, 80]
     """
 
     memory = "stateful"

@@ -19,6 +19,13 @@ class Depth(Stage):
     gradients of a network.
 
     Absent without a calibration, or with one that knows the scale alone and no network.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> image, mask = np.zeros((60, 80, 3), np.uint8), np.full((60, 80), 255, np.uint8)
+    >>> scale = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
+    >>> tactflow.stage("depth").process(image, image, mask, scale)
+    Absent(reason='no_calibration')
     """
 
     memory = "pure"

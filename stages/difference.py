@@ -29,6 +29,12 @@ class Difference(Stage):
     It learns from all frames marked as reference, or else from the first frame. If the gel is smoother than
     in the reference, the reference was touched: nothing is reported as contact, and after `patience` frames
     the stage requests a new reference.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> difference = tactflow.stage("difference")
+    >>> [difference.process(scene.frame(index)).touching for index in (0, 60)]
+    [False, True]
     """
 
     memory = "stateful"

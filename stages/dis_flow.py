@@ -33,6 +33,12 @@ class DisFlow(Stage):
         tracker: {use: dis_flow, preset: medium}
 
     T. Kroeger et al., "Fast optical flow using dense inverse search", ECCV 2016.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> tracker = tactflow.stage("dis_flow")
+    >>> [len(tracker.process(scene.frame(index)).position) for index in (0, 1)]
+    [80, 80]
     """
 
     memory = "stateful"

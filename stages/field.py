@@ -18,7 +18,16 @@ class FieldPorts(NamedTuple):
 
 
 class Field(Stage):
-    """Displacement field of the gel from the displacements of its markers, with standard errors."""
+    """Displacement field of the gel from the displacements of its markers, with standard errors.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> origin = np.mgrid[10:90:20, 10:90:20].reshape(2, -1).T.astype(float)
+    >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(16, np.uint8), np.full(16, 0.02))
+    >>> field = tactflow.stage("field").process(markers, np.zeros((90, 90, 3), np.uint8)).field
+    >>> field.displacement[8, 8].round(2).tolist()
+    [0.97, 0.49]
+    """
 
     memory = "pure"
 

@@ -25,6 +25,12 @@ class FitLine(Stage):
         hull: {use: fit_line, distance: huber, when: touching}
 
     P. J. Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964).
+
+    >>> import tactflow
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:30, 10:50] = 255
+    >>> tactflow.stage("fit_line").process(mask).area
+    400.0
     """
 
     memory = "pure"

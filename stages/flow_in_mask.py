@@ -13,7 +13,15 @@ from tactflow.vision.types import Evidence, Flow, Markers
 
 
 class FlowInMask(Stage):
-    """Mean displacement, rotation and divergence of the gel inside the contact."""
+    """Mean displacement, rotation and divergence of the gel inside the contact.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> origin = np.array([[10.0, 20.0], [30.0, 20.0]])
+    >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(2, np.uint8), np.full(2, 0.02))
+    >>> tactflow.stage("flow_in_mask").process(markers, np.full((40, 40), 255, np.uint8)).mean
+    (1.0, 0.5)
+    """
 
     memory = "pure"
 

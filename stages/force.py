@@ -20,6 +20,14 @@ class Force(Stage):
     """Force in N, by the force part of the sensor's calibration; nothing without it.
 
     A contact larger than those that the calibration was fitted to is a warning, once.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> image, hull = np.zeros((60, 80, 3), np.uint8), np.zeros((0, 2))
+    >>> contact = Contact(50.0, (13.0, 13.0), None, None, hull, None)
+    >>> scale = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
+    >>> tactflow.stage("force").process(contact, scale, image, image)
+    Absent(reason='no_calibration')
     """
 
     memory = "pure"

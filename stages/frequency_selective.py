@@ -25,6 +25,13 @@ class FrequencySelective(Stage):
     concealment", IWSSIP 2018; J. Seiler et al., "Resampling images to a regular grid from a non-regular
     subset of pixel positions using frequency selective reconstruction", IEEE Transactions on Image
     Processing 24 (2015).
+
+    >>> import tactflow
+    >>> image = np.full((20, 20, 3), 128, np.uint8)
+    >>> mask = np.zeros((20, 20), np.uint8)
+    >>> image[8:12, 8:12], mask[8:12, 8:12] = 0, 255
+    >>> tactflow.stage("frequency_selective").process(image, mask)[10, 10].tolist()
+    [128, 128, 128]
     """
 
     memory = "pure"

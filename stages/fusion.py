@@ -26,6 +26,12 @@ class Fusion(Stage):
 
     A change of the light that covers markers of which none moves is no contact. While it lasts, a new
     reference is asked for.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> mask = np.full((60, 80), 255, np.uint8)
+    >>> tactflow.stage("fusion").process(mask, True).evidence
+    'light'
     """
 
     memory = "stateful"

@@ -16,7 +16,15 @@ from tactflow.vision.types import Contact, Evidence
 
 
 class Hull(Stage):
-    """Hull, area, centroid, direction and ellipse of the contact, and of each separate one."""
+    """Hull, area, centroid, direction and ellipse of the contact, and of each separate one.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:30, 10:50] = 255
+    >>> tactflow.stage("hull").process(mask).area
+    400.0
+    """
 
     memory = "pure"
 

@@ -12,7 +12,16 @@ from tactflow.vision.markers.inpaint import RADIUS_PX, remove_markers
 
 
 class Inpaint(Stage):
-    """Fill the markers from their surroundings."""
+    """Fill the markers from their surroundings.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> image = np.full((20, 20, 3), 128, np.uint8)
+    >>> mask = np.zeros((20, 20), np.uint8)
+    >>> image[8:12, 8:12], mask[8:12, 8:12] = 0, 255
+    >>> tactflow.stage("inpaint").process(image, mask)[10, 10].tolist()
+    [128, 128, 128]
+    """
 
     memory = "pure"
 

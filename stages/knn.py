@@ -27,6 +27,12 @@ class Knn(Stage):
 
     Z. Zivkovic, F. van der Heijden, "Efficient adaptive density estimation per image pixel for the task of
     background subtraction", Pattern Recognition Letters 27 (2006).
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> difference = tactflow.stage("knn")
+    >>> [difference.process(scene.frame(index)).touching for index in (0, 60)]
+    [False, True]
     """
 
     memory = "stateful"

@@ -25,6 +25,12 @@ class LucasKanade(Stage):
         tracker: {use: lucas_kanade, max_error: 0.5}
 
     J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel, 2000.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> tracker = tactflow.stage("lucas_kanade")
+    >>> [len(tracker.process(scene.frame(index)).position) for index in (0, 1)]
+    [80, 80]
     """
 
     memory = "stateful"

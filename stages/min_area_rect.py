@@ -24,6 +24,12 @@ class MinAreaRect(Stage):
         hull: {use: min_area_rect, when: touching}
 
     G. Toussaint, "Solving geometric problems with the rotating calipers", IEEE MELECON 1983.
+
+    >>> import tactflow
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> mask[20:30, 10:50] = 255
+    >>> tactflow.stage("min_area_rect").process(mask).area
+    400.0
     """
 
     memory = "pure"

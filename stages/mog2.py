@@ -23,6 +23,12 @@ class Mog2(Stage):
 
     Z. Zivkovic, F. van der Heijden, "Efficient adaptive density estimation per image pixel for the task of
     background subtraction", Pattern Recognition Letters 27 (2006).
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> difference = tactflow.stage("mog2")
+    >>> [difference.process(scene.frame(index)).touching for index in (0, 60)]
+    [False, True]
     """
 
     memory = "stateful"

@@ -24,6 +24,12 @@ class NearestDots(Stage):
 
     J. C. Crocker, D. G. Grier, "Methods of digital video microscopy for colloidal studies", Journal of
     Colloid and Interface Science 179 (1996), for the linking of detections.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> tracker = tactflow.stage("nearest_dots")
+    >>> [len(tracker.process(scene.frame(index)).position) for index in (0, 1)]
+    [80, 80]
     """
 
     memory = "stateful"

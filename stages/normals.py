@@ -16,6 +16,15 @@ class SurfaceNormals(Stage):
     """Unit normals of the gel's surface, from its colour or from the gradients of a network, as in `depth`.
 
     Absent without a calibration of slopes and without a network.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> image, mask = np.zeros((60, 80, 3), np.uint8), np.full((60, 80), 255, np.uint8)
+    >>> gradients = np.zeros((60, 80, 2), np.float32)
+    >>> scale = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
+    >>> normals = tactflow.stage("normals").process(image, image, mask, scale, gradients)
+    >>> float(normals[30, 40, 2])
+    1.0
     """
 
     memory = "pure"

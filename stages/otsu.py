@@ -23,6 +23,12 @@ class Otsu(Stage):
 
     N. Otsu, "A threshold selection method from gray-level histograms", IEEE Transactions on Systems, Man, and
     Cybernetics 9 (1979).
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> difference = tactflow.stage("otsu")
+    >>> [difference.process(scene.frame(index)).touching for index in (0, 60)]
+    [False, True]
     """
 
     memory = "stateful"

@@ -17,6 +17,13 @@ class Pose(Stage):
     It needs the stage `depth` above and its calibration. The stage `field` adds how the gel below the object
     has moved, which tells how smooth objects turn; the stage `slip` tells when the gel does not follow. Two
     objects at once are tracked as one. This stage needs no gate: without a contact it does nothing.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> frame = Frame("main", 0, 0.0, np.zeros((60, 80, 3), np.uint8))
+    >>> mask = np.zeros((60, 80), np.uint8)
+    >>> tactflow.stage("pose").process(frame=frame, touching=False, contact_mask=mask)
+    Absent(reason='no_contact')
     """
 
     memory = "stateful"

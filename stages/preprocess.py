@@ -66,7 +66,13 @@ class Preprocessed(NamedTuple):
 
 
 class Preprocess(Stage):
-    """Straighten, cut, turn and shrink the frame in one pass."""
+    """Straighten, cut, turn and shrink the frame in one pass.
+
+    >>> import tactflow
+    >>> preprocess = tactflow.stage("preprocess", rotate=90, downsample=2)
+    >>> preprocess.process(tactflow.open_scene("press").frame(0)).image.shape
+    (400, 300, 3)
+    """
 
     memory = "pure"
 

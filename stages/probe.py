@@ -22,7 +22,14 @@ class ProbePorts(NamedTuple):
 
 class Probe(Stage):
     """Looks at samples of the raw frame. With `when: changed`, stages repeat their results while nothing can
-    have changed; with `when: suspect`, also while only the dots may have moved."""
+    have changed; with `when: suspect`, also while only the dots may have moved.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> probe = tactflow.stage("probe")
+    >>> [probe.process(scene.frame(index)).suspect for index in (0, 1, 60)]
+    [True, False, True]
+    """
 
     memory = "stateful"
     watches = "touching"

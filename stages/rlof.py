@@ -27,6 +27,12 @@ class Rlof(Stage):
 
     T. Senst, V. Eiselein, T. Sikora, "Robust local optical flow for feature tracking", IEEE Transactions on
     Circuits and Systems for Video Technology 22 (2012).
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> tracker = tactflow.stage("rlof")
+    >>> [len(tracker.process(scene.frame(index)).position) for index in (0, 1)]
+    [80, 80]
     """
 
     memory = "stateful"

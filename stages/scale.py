@@ -23,6 +23,11 @@ class Scale(Stage):
     A calibration made with frames of another size or another preprocess ends the run; a gel that looks
     different from the calibrated one is a warning. The default of a kind of sensor, or the calibration in a
     recording, is not used, with a warning, where it does not fit.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> tactflow.stage("scale").process(np.zeros((60, 80, 3), np.uint8))
+    Absent(reason='no_calibration')
     """
 
     memory = "pure"

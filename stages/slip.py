@@ -24,6 +24,12 @@ class SlipStage(Stage):
     """Motion of the object, by its picture on the gel, against the motion of the gel, by its markers.
 
     `when: slipping` gates other stages. This stage needs no gate: without a contact it does next to nothing.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> image, mask = np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), np.uint8)
+    >>> tactflow.stage("slip").process(False, mask, image, image)
+    SlipPorts(slipping=False, slip=None)
     """
 
     memory = "stateful"

@@ -24,6 +24,12 @@ class Ssim(Stage):
 
     Z. Wang et al., "Image quality assessment: from error visibility to structural similarity", IEEE
     Transactions on Image Processing 13 (2004).
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> difference = tactflow.stage("ssim")
+    >>> [difference.process(scene.frame(index)).touching for index in (0, 60)]
+    [False, True]
     """
 
     memory = "stateful"

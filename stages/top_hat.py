@@ -24,6 +24,12 @@ class TopHat(Stage):
         marker_mask: {use: top_hat, contrast: 12}
 
     F. Meyer, "Contrast feature extraction", Special Issues of Practical Metallography, 1977.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> mask = tactflow.stage("top_hat").process(scene.frame(0))
+    >>> bool(0.02 < (mask > 0).mean() < 0.3)
+    True
     """
 
     memory = "stateful"

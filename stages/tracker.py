@@ -16,7 +16,14 @@ from tactflow.vision.types import Markers
 
 
 class Tracker(Stage):
-    """Follow the marker dots of the reference frame."""
+    """Follow the marker dots of the reference frame.
+
+    >>> import tactflow
+    >>> scene = tactflow.open_scene("press")
+    >>> tracker = tactflow.stage("tracker")
+    >>> [len(tracker.process(scene.frame(index)).position) for index in (0, 1)]
+    [80, 80]
+    """
 
     memory = "stateful"
 

@@ -11,7 +11,12 @@ from tactflow.ports import Unmarked, Untouched
 
 
 class UntouchedGel(Stage):
-    """Keep the mean of the reference frames, without their markers."""
+    """Keep the mean of the reference frames, without their markers.
+
+    >>> import tactflow
+    >>> tactflow.stage("untouched").process(np.full((60, 80, 3), 128, np.uint8))[0, 0].tolist()
+    [128, 128, 128]
+    """
 
     memory = "stateful"
 

@@ -17,7 +17,15 @@ Polygon = Annotated[list[Point], Field(min_length=3)]
 
 
 class ValidArea(Stage):
-    """Find the gel in the reference frame; a black or saturated surround is excluded."""
+    """Find the gel in the reference frame; a black or saturated surround is excluded.
+
+    >>> import tactflow
+    >>> image = np.zeros((60, 80, 3), np.uint8)
+    >>> image[:, 20:] = 128
+    >>> valid = tactflow.stage("valid_area").process(image)
+    >>> valid[30, [10, 50]].tolist()
+    [0, 255]
+    """
 
     memory = "stateful"
 

@@ -18,7 +18,14 @@ _SHOWN = {"depth": ("depth", "scale"), "normals": ("normals",)}
 
 
 class Visualize(Stage):
-    """Draw contact, markers and flow."""
+    """Draw contact, markers and flow.
+
+    >>> import numpy as np
+    >>> import tactflow
+    >>> image = np.full((60, 80, 3), 128, np.uint8)
+    >>> tactflow.stage("visualize").process(image, None, None, None, None).shape
+    (60, 80, 3)
+    """
 
     memory = "pure"
     on_demand = True

@@ -13,12 +13,16 @@ from pathlib import Path
 import pytest
 
 import tactflow
+from tactflow import sinks, stages
+from tactflow.config.registry import catalogue
 
 
 def modules() -> list[str]:
-    """Every module of the package."""
-    found = pkgutil.walk_packages(tactflow.__path__, "tactflow.")
-    return ["tactflow", *(module.name for module in found if not module.name.endswith("__main__"))]
+    """Every module of the package, whose stages and sinks stand in folders of their own."""
+    found = {module.name for module in pkgutil.walk_packages(tactflow.__path__, "tactflow.")}
+    for package in (stages, sinks):
+        found |= {f"{package.__name__}.{module.name}" for module in pkgutil.iter_modules(package.__path__)}
+    return ["tactflow", *sorted(name for name in found if not name.endswith("__main__"))]
 
 
 @pytest.mark.parametrize("name", modules())
@@ -27,6 +31,12 @@ def test_the_examples_of_a_module_run(name: str, tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     assert doctest.testmod(module, optionflags=flags).failed == 0
+
+
+@pytest.mark.parametrize("name", [module.name for module in pkgutil.iter_modules(stages.__path__)])
+def test_every_stage_has_an_example(name: str) -> None:
+    (component,) = (component for component in catalogue()[0] if component.name == name)
+    assert ">>>" in (component.cls.__doc__ or "")
 
 
 @pytest.mark.parametrize("name", tactflow.__all__)
