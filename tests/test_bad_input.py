@@ -16,8 +16,13 @@ pytest.importorskip("zarr", reason="the extra zarr is not installed")
 pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
 pytest.importorskip("av", reason="the extra lerobot is not installed")
 
-from tests.plugins.test_datasets import KEY, write_hdf5, write_lerobot, write_zarr
-
+from plugins.arrays.tests.test_datasets import (
+    KEY,
+    write_hdf5,
+    write_lerobot,
+    write_replay_buffer,
+    write_zarr,
+)
 from plugins.rosbags.tests.bags import TOPIC, write_bag
 from plugins.rosbags.tests.test_bags import pictures
 from tactflow.cli.main import main
@@ -90,6 +95,21 @@ def without_info(folder: Path) -> Path:
     return root
 
 
+def table(folder: Path, **columns: Sequence[object]) -> Path:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table(columns), folder / "press.parquet")
+    return folder / "press.parquet"
+
+
+def jpeg_bag(folder: Path) -> Path:
+    """A bag whose compressed pictures are not files of images."""
+    path = bag(folder, "mcap", "jpeg")
+    (file,) = path.glob("*.mcap")
+    return overwritten(file, b"\xff\xd8\xff", b"\0\0\1")
+
+
 SOURCES: list[tuple[str, Callable[[Path], str], int, str]] = [
     ("a bag of two cameras", lambda f: str(bag(f, others=["/b"])), 4, "add ?topic= one of: /b ("),
     ("no such topic", lambda f: topic(bag(f), "/x"), 4, "there is no topic /x; required one of:"),
@@ -128,6 +148,25 @@ SOURCES: list[tuple[str, Callable[[Path], str], int, str]] = [
         lambda f: f"{damaged_zarr(f)}?dataset=/gel/frames",
         4,
         "is damaged or cut off",
+    ),
+    (
+        "no such episode of a replay buffer",
+        lambda f: f"{write_replay_buffer(f / 'press.zarr.zip')}?dataset=data/camera0_rgb&episode=2",
+        4,
+        "episode=2: required one of the episodes 0 to 1",
+    ),
+    (
+        "a table without pictures",
+        lambda f: str(table(f, t=[1.0, 2.0])),
+        4,
+        "no column holds pictures (bytes, or bytes and path); there are t (double)",
+    ),
+    ("a table that was cut off", lambda f: str(cut(table(f, image=[b"jpeg"]))), 4, "is damaged or cut off"),
+    (
+        "a film in messages",
+        lambda f: topic(overwritten(jpeg_bag(f), b"\x05\0\0\0jpeg\0", b"\x05\0\0\0h264\0")),
+        4,
+        "the format of its pictures is 'h264'; required JPEG, PNG or another image file",
     ),
     ("not a dataset", lambda f: episode(without_info(f)), 4, "this LeRobot dataset: cannot be read"),
     ("a video that was cut off", lambda f: episode(cut_film(f)), 4, "is damaged or cut off"),

@@ -100,6 +100,17 @@ def bags(folder: Path) -> Parser:
     return [file.read_bytes()], ".bag", lambda path: play(f"{path}?topic={TOPIC}")
 
 
+def tables(folder: Path) -> Parser:
+    """Pictures in a column of Parquet."""
+    pa = pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    import pyarrow.parquet as pq
+
+    file = cv2.imencode(".png", IMAGE)[1].tobytes()
+    for name, column in (("bytes", [file] * 3), ("struct", [{"bytes": file, "path": "0.png"}] * 3)):
+        pq.write_table(pa.table({"image": column}), folder / name)
+    return [(folder / name).read_bytes() for name in ("bytes", "struct")], ".parquet", play
+
+
 def message() -> bytes:
     """A result message."""
     contact = Contact(12.5, (3.0, 4.0), 30.0, -0.577, np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]]), None)
@@ -124,7 +135,7 @@ def damage(data: bytes, rng: random.Random) -> bytes:
     return bytes(damaged[: rng.randrange(len(damaged) + 1)]) if rng.random() < 0.1 else bytes(damaged)
 
 
-@pytest.mark.parametrize("make", [pipelines, recordings, arrays, pictures, bags, messages])
+@pytest.mark.parametrize("make", [pipelines, recordings, arrays, pictures, bags, tables, messages])
 @pytest.mark.parametrize("inputs", [40, pytest.param(3000, marks=pytest.mark.slow)])
 def test_damaged_input_is_refused(make: Callable[[Path], Parser], inputs: int, tmp_path: Path) -> None:
     samples, suffix, read = make(tmp_path)

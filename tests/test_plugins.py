@@ -66,10 +66,12 @@ def test_all_else_works_without_a_plug_in(
     assert not set(lost["tactflow.sinks"]) & set(names("sinks"))
     assert not set(lost["tactflow.stages"]) & set(names("stages"))
     for key in lost["tactflow.sources"]:
-        (tmp_path / f"press{key}").write_bytes(b"a file of this kind")
-        spec = f"press{key}?topic=/gel" if key.startswith(".") else f"{key}:press"
-        with pytest.raises(SourceError):
-            open_source(str(tmp_path / spec) if key.startswith(".") else spec)
+        path = tmp_path / (f"press{key}" if key.startswith(".") else f"{plugin}/{key}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"a file of this kind")
+        for spec in (f"{path}?topic=/gel", str(tmp_path / plugin), f"{key}:press"):
+            with pytest.raises(SourceError):
+                open_source(spec)
     for name in lost["tactflow.exports"]:
         assert main(["export", name, str(tmp_path / "gel.npy"), "--out", str(tmp_path / "out")]) == 2
         assert f"there is no format {name}" in capsys.readouterr().err

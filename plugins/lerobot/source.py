@@ -1,30 +1,46 @@
-"""One camera of one episode of a LeRobot dataset (layout v3), as a source."""
+"""The pictures of one camera of a LeRobot dataset (layout v3), as a source."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_pixel_count, damaged, require
-from tactflow.sources.files import decode_image, refuse_playlist
+from tactflow.sources.base import FrameReader, damaged, log, require
+from tactflow.sources.files import decode_image
 from tactflow.sources.paths import find_path, split_query
+from tactflow.sources.video import decode, refuse_playlist
 
 SCHEME = "lerobot:"
-SETTINGS = {"camera": "key of a camera", "episode": "number of an episode"}
+SETTINGS = {"camera": "key of a camera", "episode": "number of an episode (all if not given)"}
 
 
-class LeRobotEpisode(FrameReader):
-    """The pictures of one camera in one episode; frame i is taken at i / fps.
+class Episode(NamedTuple):
+    """Where an episode is.
 
-    spec : `lerobot:PATH?camera=observation.images.left_tactile&episode=3`. directory : as for `open_source`.
-    Raises SourceError if there is no such dataset, camera or episode (it lists the valid ones), or a package
-    is missing.
+    number : in the dataset. length : number of frames. table, video : its files. begin : its start in the
+    video, s.
+    """
+
+    number: int
+    length: int
+    table: Path
+    video: Path
+    begin: float
+
+
+class LeRobotEpisodes(FrameReader):
+    """The pictures of one camera; frame i is taken at i / fps.
+
+    Each episode is an epoch with a reference of its own.
+
+    spec : `PATH?camera=observation.images.left_tactile&episode=3`, with or without the prefix `lerobot:`; the
+    only camera need not be named. directory : as for `open_source`. Raises SourceError if there is no such
+    dataset, camera or episode (it lists the valid ones), or a package is missing.
     """
 
     # The parsers of JSON, Parquet and video raise all kinds of errors.
@@ -36,84 +52,107 @@ class LeRobotEpisode(FrameReader):
         root = find_path(name, directory)
         try:
             info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
-            self._camera, self._episode, is_video = _choose(spec, info, settings)
-            self._data, video, self._begin, self.total = _find(root, info, self._camera, self._episode)
+            self._camera, number, self._is_video = _choose(spec, info, settings)
+            self._episodes = _find(root, info, self._camera, number)
             self.fps = self._rate = float(info["fps"])
         except SourceError:
             raise
         except Exception as error:
             raise damaged(f"{root}: this LeRobot dataset", error) from error
-        super().__init__(f"{root}, {self._camera}, episode {self._episode}")
-        self._video = video if is_video else None
-        if self._video is not None:
-            refuse_playlist(self._video)
+        episodes = "" if number is None else f", episode {number}"
+        super().__init__(f"{root}, {self._camera}{episodes}")
+        self.total = sum(episode.length for episode in self._episodes)
         self._read_first()
         self.description = f"{spec}, {self.total} frames at {self.fps:g} fps"
+        if len(self._episodes) > 1:
+            text = "%s: %d episodes, each with a reference of its own; ?episode=N plays one of them"
+            log.info(text, self.name, len(self._episodes))
 
-    def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        pictures = self._read_pictures() if self._video is None else self._decode_video(self._video)
-        # The column `timestamp` is the same, rounded to 32 bits.
-        for index, image in enumerate(pictures):
-            yield image, index / self._rate
+    def _frames(self) -> Iterator[tuple[NDArray[Any], float, int, bool, int]]:
+        index = 0
+        for epoch, episode in enumerate(self._episodes):
+            pictures = self._decode_video(episode) if self._is_video else self._read_pictures(episode)
+            # The column `timestamp` is the same, rounded to 32 bits.
+            for image in pictures:
+                yield image, index / self._rate, index, False, epoch
+                index += 1
 
-    def _read_pictures(self) -> Iterator[NDArray[Any]]:
+    def _read_pictures(self, episode: Episode) -> Iterator[NDArray[Any]]:
         import pyarrow.dataset as ds  # type: ignore[import-untyped]
 
-        wanted = ds.field("episode_index") == self._episode
-        for batch in ds.dataset(self._data).to_batches(columns=[self._camera], filter=wanted, batch_size=16):
+        wanted = ds.field("episode_index") == episode.number
+        # By default, a scan reads whole row groups, and several ahead.
+        options = ds.ParquetFragmentScanOptions(pre_buffer=False, use_buffered_stream=True)
+        batches = ds.dataset(episode.table).to_batches(
+            columns=[self._camera],
+            filter=wanted,
+            batch_size=16,
+            batch_readahead=1,
+            fragment_readahead=1,
+            fragment_scan_options=options,
+            use_threads=False,
+        )
+        for batch in batches:
             for row in batch.to_pylist():
                 yield decode_image(row[self._camera]["bytes"], self.name)
 
-    def _decode_video(self, path: Path) -> Iterator[NDArray[np.uint8]]:
-        import av
-
-        left = self.total or 0
-        with av.open(str(path)) as file:
-            (stream, *_) = file.streams.video
-            check_pixel_count(self.name, stream.width, stream.height)
-            # Seeks to the key frame before; pictures from there on are decoded.
-            file.seek(round(self._begin / (stream.time_base or 1)), stream=stream)
-            for frame in file.decode(stream):
-                if frame.time is not None and frame.time < self._begin - 0.5 / self._rate:
-                    continue
-                if left == 0:
-                    return
-                left -= 1
-                yield np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+    def _decode_video(self, episode: Episode) -> Iterator[NDArray[Any]]:
+        refuse_playlist(episode.video)
+        left = episode.length
+        # Half a frame earlier, because times are rounded.
+        for image, _ in decode(episode.video, self.name, episode.begin - 0.5 / self._rate):
+            if left == 0:
+                return
+            left -= 1
+            yield image
         if left:
             raise SourceError(f"{self.name}: is damaged or cut off ({left} pictures are missing)")
 
 
-def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int, bool]:
-    """The camera, the episode, and whether its pictures are a video."""
+def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int | None, bool]:
+    """The camera, the number of the episode or None for all, and whether the pictures are a video."""
     cameras = {
         name: feature["dtype"]
         for name, feature in info["features"].items()
         if feature["dtype"] in ("video", "image")
     }
-    episodes = int(info["total_episodes"])
-    camera, episode = settings.get("camera", ""), settings.get("episode", "")
-    if camera not in cameras or not episode.isdecimal() or int(episode) >= episodes:
+    count = int(info["total_episodes"])
+    camera = settings.get("camera") or (next(iter(cameras)) if len(cameras) == 1 else "")
+    episode = settings.get("episode")
+    valid = episode is None or (episode.isdecimal() and int(episode) < count)
+    if camera not in cameras or not valid:
         raise SourceError(
             f"{spec}: required ?camera=...&episode=...; cameras: {', '.join(sorted(cameras)) or 'none'}; "
-            f"episodes: 0 to {episodes - 1}"
+            f"episodes: 0 to {count - 1} (all if not given)"
         )
-    return camera, int(episode), cameras[camera] == "video"
+    return camera, None if episode is None else int(episode), cameras[camera] == "video"
 
 
-def _find(root: Path, info: Any, camera: str, episode: int) -> tuple[Path, Path, float, int]:
-    """The table and the video of an episode, its start in the video, s, and its number of frames."""
+def _find(root: Path, info: Any, camera: str, number: int | None) -> list[Episode]:
+    """The requested episode, or all of them in order."""
     if str(info["codebase_version"]).startswith("v2"):
         raise SourceError(f"{root}: has layout v2; LeRobot's convert_dataset_v21_to_v30 makes it layout v3")
     import pyarrow.dataset as ds
 
     table = ds.dataset(root / "meta" / "episodes", format="parquet")
-    (row,) = table.to_table(filter=ds.field("episode_index") == episode).to_pylist()
+    video = f"videos/{camera}"
+    columns = [name for name in table.schema.names if name.startswith((f"{video}/", "data/"))]
+    wanted = None if number is None else ds.field("episode_index") == number
+    rows = table.to_table(columns=["episode_index", "length", *columns], filter=wanted).to_pylist()
+    if not rows:
+        raise SourceError(f"{root}: meta/episodes does not hold {'an' if number is None else 'this'} episode")
 
-    def file(key: str, suffix: str) -> Path:
-        chunk, number = int(row.get(f"{key}/chunk_index", 0)), int(row.get(f"{key}/file_index", 0))
-        return root / key / f"chunk-{chunk:03d}" / f"file-{number:03d}{suffix}"
+    def file(row: Any, key: str, suffix: str) -> Path:
+        chunk, part = int(row.get(f"{key}/chunk_index", 0)), int(row.get(f"{key}/file_index", 0))
+        return root / key / f"chunk-{chunk:03d}" / f"file-{part:03d}{suffix}"
 
-    key = f"videos/{camera}"
-    begin = float(row.get(f"{key}/from_timestamp", 0.0))
-    return file("data", ".parquet"), file(key, ".mp4"), begin, int(row["length"])
+    return [
+        Episode(
+            int(row["episode_index"]),
+            int(row["length"]),
+            file(row, "data", ".parquet"),
+            file(row, video, ".mp4"),
+            float(row.get(f"{video}/from_timestamp", 0.0)),
+        )
+        for row in sorted(rows, key=lambda row: int(row["episode_index"]))
+    ]

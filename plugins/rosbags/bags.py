@@ -38,7 +38,15 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 }
 """Encoding -> channels, and the conversion to BGR; named as in `sensor_msgs/image_encodings.hpp` and by
 Foxglove. Those with 16 in their name have 16-bit pixels."""
-
+PLANAR = {
+    "nv12": cv2.COLOR_YUV2BGR_NV12,
+    "nv21": cv2.COLOR_YUV2BGR_NV21,
+    **dict.fromkeys(("i420", "yuv420", "yuv420p"), cv2.COLOR_YUV2BGR_I420),
+    "yv12": cv2.COLOR_YUV2BGR_YV12,
+}
+"""Encoding with a plane of brightness, and then colour at half its resolution -> conversion to BGR."""
+IMAGE_FILES = ("jpeg", "jpg", "png", "webp", "tif", "bmp", "jp2")
+"""Parts of the `format` of a compressed picture that OpenCV can decode."""
 
 Topics = Mapping[str, tuple[str, int | None]]
 """Topic -> type and number of its messages; None if that is unknown."""
@@ -270,9 +278,12 @@ def raw_image(message: Any, name: str) -> NDArray[Any]:
     width, height, step = int(message.width), int(message.height), int(message.step)
     check_pixel_count(name, width, height)
     encoding = message.encoding if message.encoding in ENCODINGS else message.encoding.lower()
+    if encoding in PLANAR:
+        return _planar_image(message, name)
     if encoding not in ENCODINGS:
         raise SourceError(
-            f"{name}: pictures are encoded as {message.encoding!r}; required one of: {', '.join(ENCODINGS)}"
+            f"{name}: pictures are encoded as {message.encoding!r}; required one of: "
+            + ", ".join((*ENCODINGS, *PLANAR))
         )
     channels, conversion = ENCODINGS[encoding]
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
@@ -290,8 +301,40 @@ def raw_image(message: Any, name: str) -> NDArray[Any]:
     return image if conversion is None else cv2.cvtColor(image, conversion)
 
 
+def _planar_image(message: Any, name: str) -> NDArray[Any]:
+    """The pixels of a picture in an encoding of `PLANAR`: (H, W, 3) uint8 BGR. Raises SourceError."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    data, rows = np.frombuffer(message.data, np.uint8), height * 3 // 2
+    if data.size == width * rows:
+        # Some drivers state another step, although the rows are not padded.
+        step = width
+    if width % 2 or height % 2 or not (rows and step >= width and step % 2 == 0 and data.size >= step * rows):
+        raise SourceError(
+            f"{name}: {width} x {height} pixels as {message.encoding} need an even size and {width * rows} "
+            f"bytes in rows of {width}; got {data.size} bytes in rows of {step}"
+        )
+    planes = data[: step * rows].reshape(rows, step)
+    encoding = message.encoding.lower()
+    if encoding.startswith("nv"):
+        planes = planes[:, :width]
+    else:
+        # The rows of both planes of colour are half as long.
+        colour = planes[height:].reshape(height, step // 2)[:, : width // 2]
+        planes = np.concatenate([planes[:height, :width], colour.reshape(height // 2, width)])
+    return cv2.cvtColor(np.ascontiguousarray(planes), PLANAR[encoding])
+
+
 def compressed_image(message: Any, name: str) -> NDArray[Any]:
     """The pixels of a `CompressedImage`, as `decode_image` gives them. Raises SourceError."""
-    if "compressedDepth" in getattr(message, "format", ""):
+    stated = getattr(message, "format", "")
+    if "compressedDepth" in stated:
         raise SourceError(f"{name}: compressed depth, not a picture")
-    return decode_image(bytes(message.data), name)
+    try:
+        return decode_image(bytes(message.data), name)
+    except SourceError:
+        if not stated or any(word in stated.lower() for word in IMAGE_FILES):
+            raise
+        raise SourceError(
+            f"{name}: the format of its pictures is {stated!r}; required JPEG, PNG or another image file in "
+            "each message: decode the topic to sensor_msgs/Image, and record that"
+        ) from None

@@ -32,6 +32,8 @@ def message(store: Any, image: NDArray[Any], taken: int, encoding: str, *, one: 
         data = cv2.imencode(f".{encoding}", image)[1].ravel()
         return types["sensor_msgs/msg/CompressedImage"](header=header, format=encoding, data=data)
     height, width = image.shape[:2]
+    if encoding in ("nv12", "nv21", "i420", "yv12"):
+        height = height * 2 // 3
     return types["sensor_msgs/msg/Image"](
         header=header,
         height=height,

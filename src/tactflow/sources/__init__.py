@@ -40,21 +40,24 @@ __all__ = [
 KINDS = (
     "sim:NAME?query (simulated sensor), a camera index, /dev/videoN or /dev/v4l/by-id/NAME, a video file, "
     "a folder or glob of images, a .npy file, an .mcap recording of tactflow, "
-    "a ROS or Foxglove recording (.mcap, .bag or folder, with ?topic=), .h5 or .zarr with ?dataset=, "
-    "lerobot:PATH?camera=KEY&episode=N, or an http://, rtsp:// or udp:// stream"
+    "a ROS or Foxglove recording (.mcap, .bag or folder, with ?topic=), .h5, .zarr or .zarr.zip with "
+    "?dataset=, .parquet with ?column=, a LeRobot dataset (a folder, with ?camera=KEY&episode=N), "
+    "or an http://, rtsp:// or udp:// stream"
 )
 """Description of valid sources, for messages, `--help` and the parameter `source` of `capture`."""
 
 GROUP = "tactflow.sources"
 """Group of entry points for other kinds of files.
 
-The name of an entry point is the suffix of a file or folder (`.h5`), the prefix of a path without its colon
-(`lerobot`), or a file in a folder (`metadata.yaml`). Its value is a function or class that is called with
-`(spec, directory, fps)` of `open_source` and returns a `FrameReader`. A function `sensors` of it, if any, is
-called with the path of a file, and returns the sources in it.
+The name of an entry point is the suffix of a file or folder (`.h5`, `.zarr.zip`), the prefix of a path
+without its colon (`lerobot`), or a file in a folder (`meta/info.json`). Its value is a function or class that
+is called with `(spec, directory, fps)` of `open_source` and returns a `FrameReader`. A function `sensors` of
+it, if any, is called with the path of a file, and returns the sources in it.
 """
 
 _STREAMS = frozenset(["http", "https", "rtsp", "udp"])
+_TABLES = frozenset([".parquet"])
+"""Suffixes of recordings that tables of results have too."""
 _BUILT_IN = frozenset(["", ".npy", ".npz", *IMAGE_SUFFIXES, *VIDEO_SUFFIXES])
 """Suffixes without a search for plug-ins, which takes some milliseconds."""
 
@@ -185,22 +188,23 @@ def _keys(name: str, directory: Path | None, is_pattern: bool) -> Iterator[str]:
     if prefix:
         yield prefix.removesuffix(":")
         return
-    suffix = Path(name).suffix.lower()
-    if suffix not in _BUILT_IN and not is_pattern:
-        yield suffix
+    suffixes = [suffix.lower() for suffix in Path(name).suffixes]
+    if suffixes and suffixes[-1] not in _BUILT_IN and not is_pattern:
+        yield "".join(suffixes[-2:])
+        yield suffixes[-1]
     path = locate(name, directory)
     if path is not None and path.is_dir():
         with suppress(OSError):
-            files = sorted(path.iterdir())
-            if not any(map(is_image, files)):
-                yield from (file.name for file in files)
+            if not any(map(is_image, path.iterdir())):
+                yield from (point.name for point in plugins(GROUP) if (path / point.name).is_file())
 
 
 def recording_suffixes() -> frozenset[str]:
-    """Suffixes of files and folders that are a recording, including those of plug-ins.
+    """Suffixes of files and folders that are a recording, including those of plug-ins; without `.parquet`.
 
     >>> {".avi", ".npy", ".mcap"} <= recording_suffixes()
     True
     """
     registered = (point.name for point in plugins(GROUP))
-    return VIDEO_SUFFIXES | {".npy", ".mcap"} | {name for name in registered if name.startswith(".")}
+    suffixes = {name for name in registered if name.startswith(".")}
+    return (VIDEO_SUFFIXES | {".npy", ".mcap"} | suffixes) - _TABLES

@@ -24,6 +24,8 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 if "OPENCV_LOG_LEVEL" not in os.environ:
     (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)
 
+DEFAULT_FPS = 30.0
+"""Rate of images, arrays and videos without one, frames per second. Chosen by hand."""
 SPARSE_PEAK = 4096
 """A 16-bit frame with only smaller values is from a sensor with 12 bits or fewer, grey levels."""
 SHORTEST_SIDE = 2

@@ -1,4 +1,4 @@
-"""Recordings: image folders and globs, .npy arrays, video files."""
+"""Recordings: image folders and globs, .npy arrays; other files are opened as videos."""
 
 from __future__ import annotations
 
@@ -16,16 +16,9 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MOST_PIXELS
-from tactflow.sources.base import (
-    BgrImage,
-    CaptureReader,
-    FrameReader,
-    check_array,
-    damaged,
-    log,
-    to_bgr,
-)
+from tactflow.sources.base import DEFAULT_FPS, BgrImage, FrameReader, check_array, damaged, to_bgr
 from tactflow.sources.paths import find_path, locate
+from tactflow.sources.video import open_video
 from tactflow.system.files import expanded
 
 IMAGE_SUFFIXES = frozenset(
@@ -34,15 +27,9 @@ IMAGE_SUFFIXES = frozenset(
 """Suffixes of images."""
 VIDEO_SUFFIXES = frozenset([".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ogv", ".webm", ".wmv"])
 """Suffixes of videos; files with unknown suffixes are also read as videos."""
-DEFAULT_FPS = 30.0
-"""Rate of images, arrays and videos without one, frames per second. Chosen by hand."""
-HIGHEST_FPS = 1e4
-"""Maximum rate of a video file, frames per second; larger ones are ignored. Chosen by hand."""
 
 ZIP_MAGIC = r"got b'PK\x03\x04"
 """Part of NumPy's message for a .npz file, which is a ZIP file."""
-PLAYLISTS = (b"#EXTM3U", b"ffconcat")
-"""First bytes of playlists, whose files FFmpeg would open."""
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 """First bytes of a PNG file, and its last chunk, whose checksum is always the same."""
 
@@ -234,57 +221,6 @@ def _map_array(path: Path) -> np.memmap[Any, Any]:
     return array
 
 
-def refuse_playlist(path: Path) -> None:
-    """Raise SourceError for an empty file and for a playlist: a video must not open other files."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(64)
-    except OSError as error:
-        raise damaged(str(path), error) from error
-    if not head:
-        raise SourceError(f"{path}: the file is empty")
-    if head.lstrip(b"\xef\xbb\xbf \r\n").startswith(PLAYLISTS):
-        raise SourceError(f"{path}: a list of other files, not a video; name one of them")
-
-
-class VideoFile(CaptureReader):
-    """A video file, read by OpenCV's FFmpeg.
-
-    The time of a frame is its time stamp in the file, from 0 at the first frame; if stamps are missing or do
-    not increase, the duration of a frame is added. fps : frames per second if the file does not state it.
-    """
-
-    def __init__(self, path: Path, fps: float | None = None) -> None:
-        refuse_playlist(path)
-        failure = (
-            f"{path}: neither a video that OpenCV can open, nor an image, nor a .npy array; "
-            "an .mp4 or .avi that was not closed properly cannot be opened either"
-        )
-        super().__init__(str(path), failure, str(path), cv2.CAP_FFMPEG)
-        stated = self._property(cv2.CAP_PROP_FPS)
-        self.fps = stated if 0 < stated < HIGHEST_FPS else fps or DEFAULT_FPS
-        self.total = max(int(self._property(cv2.CAP_PROP_FRAME_COUNT)), 0) or None
-        self.description = f"{path}, {self._size_text} at {self.fps:g} fps"
-
-    def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        count, t, first_stamp = 0, 0.0, 0.0
-        while (image := self._grab()) is not None:
-            stamp = self._property(cv2.CAP_PROP_POS_MSEC) / 1000.0
-            if count == 0:
-                first_stamp = stamp
-            else:
-                t = stamp - first_stamp if stamp - first_stamp > t else t + 1.0 / (self.fps or DEFAULT_FPS)
-            count += 1
-            yield image, t
-        if count == 0:
-            raise SourceError(f"{self.name}: the video holds no frame that can be decoded; is it damaged?")
-        if self.total is not None and count < self.total:
-            self.lacking = self.total - count
-            log.warning(
-                "%s: ended after %d of %d frames; the file may be damaged", self.name, count, self.total
-            )
-
-
 def open_file(spec: str, directory: Path | None = None, fps: float | None = None) -> FrameReader:
     """Open images, an array or a video: a file, a folder or a pattern. Raises SourceError."""
     if glob.has_magic(spec) and locate(spec, directory) is None:
@@ -297,4 +233,4 @@ def open_file(spec: str, directory: Path | None = None, fps: float | None = None
         return ArrayFile(path, fps)
     if suffix in IMAGE_SUFFIXES:
         return ImageFiles([path], str(path), fps)
-    return VideoFile(path, fps)
+    return open_video(path, fps)

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import FrameReader, check_array
-from tactflow.sources.files import DEFAULT_FPS
+from tactflow.sources.base import DEFAULT_FPS, FrameReader, check_array
 
 
 class MemoryFrames(FrameReader):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from itertools import groupby
 from typing import Final
 
 import numpy as np
@@ -157,13 +158,22 @@ class References:
     def arranged(
         self, arrivals: Iterator[Arrival], source: FrameReader, image: BgrImage | None
     ) -> Iterator[Arrival]:
-        """Mark the references among the frames of a source, and the damaged ones.
+        """Mark the references among the frames of a source, and the damaged ones; for each episode anew.
 
         The first frames are held back until the reference is chosen. If it is not the first frame, it is also
         delivered before all others, with number -1; for a live source, the others are omitted.
 
         image : (H, W, 3) uint8 BGR, a reference that replaces the first frames; or None.
         """
+        for _, episode in groupby(arrivals, key=lambda arrival: arrival.epoch):
+            self._left, self._blank = 0, False
+            self._test, self._test_epoch = None, -1
+            yield from self._arranged(episode, source, image)
+
+    def _arranged(
+        self, arrivals: Iterator[Arrival], source: FrameReader, image: BgrImage | None
+    ) -> Iterator[Arrival]:
+        """`arranged` for the frames of one episode: of one epoch of the source."""
         if image is not None:
             if not shows_gel(image):
                 raise SourceError("stages.capture.reference is black or uniform; name one that shows the gel")
@@ -267,7 +277,7 @@ class References:
 
     def _report(self, first: _FirstFrames, best: int, source: FrameReader) -> None:
         """Log which frame is the reference and why, unless it is clearly the first one."""
-        settling = first.settling
+        settling, number = first.settling, first.held[best].seq
         if self._blank:
             log.warning("%s: its pictures are black or uniform, so that no gel is seen in them", self._name)
             return
@@ -278,7 +288,7 @@ class References:
             log.warning(
                 "%s: the light is not steady, it changed by %.0f %% within the last frames; the reference is "
                 "frame %d. Fix exposure and white balance of the camera, or raise settle",
-                *(self._name, 100 * settling.drift, best),
+                *(self._name, 100 * settling.drift, number),
             )
             return
         if isinstance(source, ImageFiles) and settling.scattered and best == 0:
@@ -291,7 +301,7 @@ class References:
         if first.outlived:
             why = "; the pictures before are of an earlier time, what they show never came back"
         elif settling.undecided:
-            begins = first.place(settling.begins)
+            begins = first.held[first.place(settling.begins)].seq
             why = (
                 f", although the gel came to rest in another state at frame {begins}; if it was "
                 "touched until then, name a picture of the untouched gel: stages.capture.reference"
@@ -306,7 +316,7 @@ class References:
             why = ""
         else:
             return
-        log.info("%s: the reference is frame %d%s", self._name, best, why)
+        log.info("%s: the reference is frame %d%s", self._name, number, why)
 
     def _shown_before(self, image: BgrImage, first: Arrival) -> Arrival:
         """A reference delivered before the first frame, whose size it must have."""
@@ -316,9 +326,10 @@ class References:
                 f"stages.capture.reference is an image of {width} x {height} pixels, the frames of "
                 f"{self._name} have {wide} x {high}; they must be equally large"
             )
+        epoch = first.epoch + self._epoch
         if self._test_epoch < 0:
-            self._learn(image, 0)
-        return Arrival(image, first.t, -1, reference=True, paced=False)
+            self._learn(image, epoch)
+        return Arrival(image, first.t, -1, reference=True, epoch=epoch, paced=False)
 
 
 def _changed_blocks(before: BgrImage, after: BgrImage) -> float:

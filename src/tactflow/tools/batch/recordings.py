@@ -117,7 +117,7 @@ def _matching(pattern: str) -> Iterator[str]:
 
 def _is_recording(name: str) -> bool:
     """Whether a file or folder found in a folder is a recording; one named explicitly may have any suffix."""
-    return os.path.splitext(name)[1].lower() in recording_suffixes()
+    return not name.startswith(".") and name.lower().endswith(tuple(recording_suffixes()))
 
 
 def _inside(folder: Path) -> Iterator[str]:
