@@ -1,4 +1,4 @@
-"""Stage `depth`: how far the gel is pushed in, as a height map in mm."""
+"""Stage `depth`: indentation of the gel as a height map, mm."""
 
 from __future__ import annotations
 

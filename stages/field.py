@@ -1,4 +1,4 @@
-"""Stage `field`: how the gel has moved between its markers."""
+"""Stage `field`: displacement of the gel between its markers."""
 
 from __future__ import annotations
 

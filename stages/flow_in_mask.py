@@ -1,4 +1,4 @@
-"""Stage `flow_in_mask`: how the gel inside the contact moves."""
+"""Stage `flow_in_mask`: motion of the gel inside the contact."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage `force`: how hard the object presses on the gel, and how it drags it."""
+"""Stage `force`: normal and shear force on the gel, N."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage `fusion`: contact from what the light and what the markers say."""
+"""Stage `fusion`: contact from the light and the motion of the markers."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class FusedPorts(NamedTuple):
 
 
 class Fusion(Stage):
-    """Let the markers vote on the contact that the light shows.
+    """Combine the image's contact mask with the motion of the markers.
 
-    A change of the light that covers markers of which none moves is no contact. While it lasts, a new
-    reference is asked for.
+    A change of light over markers that all rest is rejected as a reflection. If it lasts, the stage requests
+    a new reference.
 
     >>> import numpy as np
     >>> import tactflow
@@ -37,32 +37,32 @@ class Fusion(Stage):
     memory = "stateful"
 
     class Params(StageParams):
-        """When markers have moved."""
+        """Sensitivity of the test for motion."""
 
         false_alarms: float = Field(
             1e-6,
             gt=0,
             lt=1,
-            description="frames of the untouched gel in which markers are said to move, per frame; those of "
-            "difference come on top",
+            description="false contacts by the markers on the untouched gel, per frame, in addition to those "
+            "of difference",
         )
         steadiness: float = Field(
             0.14,
             gt=0,
             le=100,
-            description="how far markers of the untouched gel stray, standard deviation of x and of y, px",
+            description="jitter of markers on the untouched gel, standard deviation of x and of y, px",
         )
         relaxation: float = Field(
             0.1,
             ge=0,
             lt=1,
-            description="what the markers of a released gel still show, relative to the strongest motion",
+            description="motion that the markers of a released gel still show, relative to the strongest",
         )
         patience: int = Field(
             30,
             ge=0,
-            description="frames in a row in which the light has changed but nothing moves, after which a "
-            "new reference is taken; 0: none",
+            description="consecutive frames with a change of light but no motion, after which a new "
+            "reference is taken; 0: never",
         )
 
     def __init__(self, params: Params) -> None:

@@ -26,7 +26,7 @@ class Hold(Stage):
 
         hold: int = Field(0, ge=0, description="frames for which it stays true after the signal fell")
         at_least_every: int | None = Field(
-            None, ge=1, description="after this many frames it is true anyway, for one frame; null: never"
+            None, ge=1, description="maximum number of frames until it is true for one frame; null: no limit"
         )
 
     def __init__(self, params: Params) -> None:

@@ -1,4 +1,4 @@
-"""Stage `marker_mask`: where markers cover the gel."""
+"""Stage `marker_mask`: mask of the markers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 
 class MarkerMaskStage(Stage):
-    """Mask of the marker dots; the first frame shows how they look.
+    """Mask of the marker dots; their size and polarity are found in the first frame.
 
     >>> import tactflow
     >>> scene = tactflow.open_scene("press")

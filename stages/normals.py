@@ -1,4 +1,4 @@
-"""Stage `normals`: which way the gel's surface looks, pixel by pixel."""
+"""Stage `normals`: unit normal of the gel's surface at each pixel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage `pose`: how what touches the gel has moved since it was touched."""
+"""Stage `pose`: motion of the object since it touched the gel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Pose(Stage):
 
     It needs the stage `depth` above and its calibration. The stage `field` adds how the gel below the object
     has moved, which tells how smooth objects turn; the stage `slip` tells when the gel does not follow. Two
-    objects at once are tracked as one. This stage needs no gate: without a contact it does nothing.
+    objects at once are tracked as one. This stage needs no gate: it returns at once without a contact.
 
     >>> import numpy as np
     >>> import tactflow

@@ -79,16 +79,16 @@ class Preprocess(Stage):
     class Params(StageParams):
         """The steps in their order; missing steps are skipped."""
 
-        undistort: Undistort | None = Field(None, description="take out the lens")
-        homography: Homography | None = Field(None, description="rectify: four points go to four points")
+        undistort: Undistort | None = Field(None, description="correct the distortion of the lens")
+        homography: Homography | None = Field(None, description="rectify: map four points to four others")
         crop: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Pixels, Pixels] | None = Field(
             None,
             description="keep [x, y, width, height], px of the rectified frame (without homography: raw px)",
         )
         rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
-        downsample: Literal[1, 2, 4, 8, 16] = Field(1, description="factor by which both sides shrink")
+        downsample: Literal[1, 2, 4, 8, 16] = Field(1, description="shrink factor of both sides")
         method: Literal["area", "pyramid"] = Field(
-            "area", description="how to shrink: area is faster; pyramid (cv2.pyrDown) is the original's"
+            "area", description="method of shrinking: area is faster; pyramid (cv2.pyrDown) is the original's"
         )
 
     def __init__(self, params: Params) -> None:

@@ -1,4 +1,4 @@
-"""Stage `probe`: what does this frame need?"""
+"""Stage `probe`: which stages does a frame need?"""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ class ProbePorts(NamedTuple):
 
 
 class Probe(Stage):
-    """Looks at samples of the raw frame. With `when: changed`, stages repeat their results while nothing can
-    have changed; with `when: suspect`, also while only the dots may have moved.
+    """Compare samples of the raw frame with those of the frames before.
+
+    With `when: changed`, stages repeat their results while nothing can have changed; with `when: suspect`,
+    also while only the dots may have moved.
 
     >>> import tactflow
     >>> scene = tactflow.open_scene("press")
@@ -35,7 +37,7 @@ class Probe(Stage):
     watches = "touching"
 
     class Params(StageParams):
-        """How careful to be."""
+        """Sensitivity, and the minimum rate of full frames."""
 
         repeatability: float = Field(
             0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
@@ -47,14 +49,14 @@ class Probe(Stage):
             description="variation of the colour of that light, relative to its brightness; see gel",
         )
         false_alarms: float = Field(
-            0.01, gt=0, le=0.5, description="share of still frames in which dots are looked at all the same"
+            0.01, gt=0, le=0.5, description="share of still frames in which the dots are measured anyway"
         )
         at_least_every: int = Field(
-            30, ge=1, description="frames after which a still scene is worked on anyway; 1: always"
+            30, ge=1, description="process every n-th frame even if nothing changed; 1: every frame"
         )
 
     def __init__(self, params: Params, skipping: bool = True) -> None:
-        """Prepare. skipping : if not, nothing is looked at."""
+        """Prepare. skipping : if false, every frame is processed."""
         super().__init__(params)
         self._skipping = skipping
         self.reset()
@@ -67,7 +69,7 @@ class Probe(Stage):
 
     def process(self, frame: Frame) -> ProbePorts:
         """Compare with the frames before. Only the smallest rectangle that holds all of the gel is looked at;
-        a reference frame is always worked on."""
+        a reference frame is always processed."""
         if not self._skipping:
             return ProbePorts(True, True)
         if self._test is None:

@@ -1,4 +1,4 @@
-"""Stage `slip`: how what touches the gel moves against it."""
+"""Stage `slip`: motion of the object relative to the gel."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class SlipPorts(NamedTuple):
 
 
 class SlipStage(Stage):
-    """Motion of the object, by its picture on the gel, against the motion of the gel, by its markers.
+    """Motion of the object relative to the gel: its picture on the gel against the markers.
 
-    `when: slipping` gates other stages. This stage needs no gate: without a contact it does next to nothing.
+    `when: slipping` gates other stages. This stage needs no gate: it returns at once without a contact.
 
     >>> import numpy as np
     >>> import tactflow

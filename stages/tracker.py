@@ -1,4 +1,4 @@
-"""Stage `tracker`: where every marker of the reference frame is now."""
+"""Stage `tracker`: current position of every marker of the reference frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Tracker(Stage):
     memory = "stateful"
 
     class Params(MarkParams):
-        """How far marks may go."""
+        """Marks, and the limit of their motion."""
 
         max_displacement: float | None = Field(
             None,

@@ -287,7 +287,7 @@ def _mean_mm_stderr(flow: types.Flow, result: Any) -> tuple[float, float] | None
 
 
 class Flow(Part):
-    """How the gel inside the contact has moved."""
+    """Motion of the gel inside the contact."""
 
     of = types.Flow
     mean: Point | None = sent("mean displacement (dx, dy)", "px", null="when not known")
@@ -374,7 +374,7 @@ def _speed_mm(slip: types.Slip, result: Any) -> float | None:
 
 
 class Slip(Part):
-    """How the object moves against the gel."""
+    """Motion of the object relative to the gel."""
 
     of = types.Slip
     slipping: bool = sent("whether it slides over the gel")
@@ -483,7 +483,7 @@ class Message(Part):
     contacts: list[SeparateContact] = sent(
         "every separate contact, the one with the most pixels first", value=lambda result, _: result.contacts
     )
-    flow: Flow | None = sent("how the gel in contact has moved", null="when there is no contact")
+    flow: Flow | None = sent("motion of the gel in contact", null="when there is no contact")
     markers: Markers | None = sent(
         "the dots, always in the same order", null="when markers were not computed"
     )
