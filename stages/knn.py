@@ -13,7 +13,7 @@ from tactflow.engine.frame import Frame
 from tactflow.ports import ContactPorts, Unmarked, Valid
 from tactflow.vision.contact.specks import without_specks
 
-REPEATS: Final = 20
+REPETITIONS: Final = 20
 """Times that the first frame is learned: OpenCV needs seven or more until its samples are filled."""
 
 
@@ -60,7 +60,7 @@ class Knn(Stage):
     def process(self, unmarked: Unmarked, frame: Frame, valid: Valid | None = None) -> ContactPorts:
         """The contact mask of this frame; nothing outside of `valid` counts."""
         if not self._known or frame.reference:
-            for _ in range(1 if self._known else REPEATS):
+            for _ in range(1 if self._known else REPETITIONS):
                 self._background.apply(unmarked, learningRate=-1)
             self._known = True
         changed = np.asarray(

@@ -2,6 +2,7 @@
 
     python -m lab.judges.judge --data RECORDINGS
     python -m lab.judges.judge --data RECORDINGS --labels mine.json default mine.yaml
+    python -m lab.judges.judge --data RECORDINGS --set stages.difference.use=otsu --set stages.fusion=null
 
 A person outlined the contacts (`python -m lab.judges.label`); `outlines.json` beside this file has
 outlines of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of
@@ -12,18 +13,20 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Final
+from types import MappingProxyType
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lab.judges.label_file import FrameLabel, load_labels
+from tactflow.config.document import parse_value
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.message.result import Result
 from tactflow.sources import open_source
@@ -109,13 +112,17 @@ def compare(label: FrameLabel, result: Result) -> Judged:
 
 
 def judge(
-    pipeline: str, labels: Iterable[FrameLabel], data: Path, report: Callable[[str], None] = say
+    pipeline: str,
+    labels: Iterable[FrameLabel],
+    data: Path,
+    report: Callable[[str], None] = say,
+    settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[Judged]:
     """Run each recording, and compare its labelled frames; arguments and errors as for `labelled`.
 
     Frames that a failing pipeline did not reach count as missed contacts.
     """
-    for label, result in labelled(pipeline, labels, data, report):
+    for label, result in labelled(pipeline, labels, data, report, settings=settings):
         if result is None:
             yield Judged(label.lab, label.recording, bool(label.contact), False, hull=0.0, region=0.0)
         else:
@@ -128,13 +135,14 @@ def labelled(
     data: Path,
     report: Callable[[str], None] = say,
     images: bool = False,
+    settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[tuple[FrameLabel, Result | None]]:
     """Run each recording that exists, and return its labels and the results of these frames.
 
     pipeline : a file or the name of a shipped pipeline; see `PLAIN` for "default". labels : those with
     `contact` None are left out. data : folder that holds the recordings. report : called with what could not
     be judged, and why; frames that a failing pipeline did not reach have no result. images : whether the
-    results hold the pictures.
+    results hold the pictures. settings : of the pipeline, as for `tactflow.stream`.
 
     Raises
     ------
@@ -155,7 +163,7 @@ def labelled(
         else:
             missing = {label.index: label for label in wanted}
         try:
-            for result in _results(chosen, source, max(missing), images):
+            for result in _results(chosen, source, max(missing), images, settings):
                 if result.seq in missing and not result.frame.reference:
                     yield missing.pop(result.seq), result
         except ConfigError:
@@ -236,14 +244,17 @@ def _picture(folder: Path, name: str) -> NDArray[np.uint8]:
     return load_image(str(found))
 
 
-def _results(pipeline: str, source: Path | Pictures, last: int, images: bool) -> Iterator[Result]:
+def _results(
+    pipeline: str, source: Path | Pictures, last: int, images: bool, changed: Mapping[str, Any]
+) -> Iterator[Result]:
     if isinstance(source, Path):
         with closing(open_source(str(source))) as reader:
             first = reader.peek()
         size = max(first[0].shape) if first is not None else 0
     else:
         size = max(source[0].shape)
-    settings = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 2 if size > LARGE else 1}
+    geometry = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 2 if size > LARGE else 1}
+    settings = geometry | dict(changed)
     running = stream(pipeline, source=source, settings=settings, max_frames=last + 1, images=images)
     with closing(running) as results:
         yield from results
@@ -336,6 +347,28 @@ def scatter(labels: Iterable[FrameLabel]) -> list[float]:
     return overlaps
 
 
+def add_set(parser: argparse.ArgumentParser) -> None:
+    """Declare `--set`."""
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="A.B=VALUE", help="as for tactflow run; repeatable"
+    )
+
+
+def settings_of(texts: Sequence[str]) -> dict[str, Any]:
+    """Settings from arguments of `--set`; raises ConfigError for one that is not A.B=VALUE.
+
+    >>> settings_of(["stages.difference.use=otsu", "stages.fusion=null"])
+    {'stages.difference.use': 'otsu', 'stages.fusion': None}
+    """
+    settings = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {text}: required A.B=VALUE, as in stages.hull.min_area=50")
+        settings[key] = parse_value(value)
+    return settings
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m lab.judges.judge", description=__doc__)
@@ -353,14 +386,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--blank", action="store_true", help="leave the frames out of --picture, as their licence may ask for"
     )
+    add_set(parser)
     options = parser.parse_args(arguments)
     try:
+        settings = settings_of(options.set)
         labels = load_labels(options.labels)
         first = [label for label in labels if label.round == 1]
         if options.picture is not None:
             draw_worst(options.pipelines[0], first, options.data, options.picture, options.blank)
             return 0
-        results = {name: list(judge(name, first, options.data)) for name in options.pipelines}
+        results = {
+            name: list(judge(name, first, options.data, settings=settings)) for name in options.pipelines
+        }
         if not any(results.values()):
             raise ConfigError(f"--data {options.data}: has none of the recordings of {options.labels}")
     except TactflowError as error:

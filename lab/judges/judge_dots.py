@@ -1,6 +1,7 @@
 """Compare detected dots with those that a person marked on gels, and count false ones on gels without.
 
     python -m lab.judges.judge_dots --data RECORDINGS
+    python -m lab.judges.judge_dots --data RECORDINGS default --set stages.marker_mask.use=top_hat --mask
 
 Dots were marked by eye in recordings of real sensors (as with `python -m lab.judges.label --dots`);
 `dots.json` beside this file has them, and frames of gels without dots. A dot marked in only one of two rounds
@@ -17,7 +18,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -25,14 +26,18 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
+from lab.judges.judge import add_set, settings_of
 from lab.judges.label_file import FrameLabel, load_labels
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.sources import open_source
 from tactflow.sources.base import to_bgr
+from tactflow.streaming import stream
 from tactflow.system.terminal import say, table
+from tactflow.tools.bench.metrics import mask_centroids
 from tactflow.vision.arrays import Flags, Floats, Indices
 from tactflow.vision.markers import NoMarkersError, detect_markers
 from tactflow.vision.markers.lattice import nearest
+from tactflow.vision.types import MarkerStatus
 
 DOTS: Final = Path(__file__).with_name("dots.json")
 TOLERANCE: Final = 0.3
@@ -66,6 +71,29 @@ def find(picture: Picture) -> Floats:
         return detect_markers(picture).centers
     except NoMarkersError:
         return np.zeros((0, 2))
+
+
+def pipeline_finder(pipeline: str, settings: Mapping[str, Any], mask: bool = False) -> Finder:
+    """Finds what a pipeline finds in a picture, taken as the reference: markers, or spots of its marker mask.
+
+    pipeline, settings : as for `tactflow.stream`. mask : whether to take the mask.
+    """
+    as_it_is = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1, "stages.capture.settle": 0}
+
+    def find_in(picture: Picture) -> Floats:
+        try:
+            (result,) = stream(pipeline, source=[picture], settings={**as_it_is, **settings})
+        except ConfigError:
+            raise
+        except TactflowError:  # no dots, says the tracker
+            return np.zeros((0, 2))
+        if mask:
+            return mask_centroids(result["marker_mask"])
+        markers = result.markers
+        seen = markers is not None and markers.status == MarkerStatus.TRACKED
+        return np.zeros((0, 2)) if markers is None else markers.position[seen]
+
+    return find_in
 
 
 def compare(lab: str, found: Floats, dots: Floats, uncertain: Floats, size: tuple[int, int]) -> FoundDots:
@@ -240,9 +268,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="recordings that the labels name")
     add("--labels", type=Path, default=DOTS, metavar="FILE", help="default: those of the package")
+    add("pipeline", nargs="?", metavar="PIPELINE", help="judge its markers instead of the package's detector")
+    add("--mask", action="store_true", help="judge the spots of its marker mask instead of its markers")
+    add_set(parser)
     options = parser.parse_args(arguments)
     try:
-        judged = list(judge(load_labels(options.labels), options.data))
+        finder = find
+        if options.pipeline is not None or options.set or options.mask:
+            finder = pipeline_finder(options.pipeline or "default", settings_of(options.set), options.mask)
+        judged = list(judge(load_labels(options.labels), options.data, finder))
         if not judged:
             raise ConfigError(f"--data {options.data}: has none of the recordings of {options.labels}")
         print(*summary(judged), sep="\n")

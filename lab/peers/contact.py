@@ -256,9 +256,9 @@ def _peers_or_none(
 
 def on_gels(data: Path, peers: Sequence[str]) -> dict[str, Any]:
     """Outlines drawn on frames of real gels; settings were chosen on the other labs."""
-    labels = _labels(data)
-    answers = {OURS: _summary(list(judge.judge("default", labels, data)))}
-    pairs = [(label, *_pair(label, data)) for label in labels]
+    labels = chosen_labels(data)
+    answers = {OURS: summary(list(judge.judge("default", labels, data)))}
+    pairs = [(label, *pair(label, data)) for label in labels]
     for name in peers:
         candidates = {}
         for settings in combinations(CHOICES.get(name, {})):
@@ -266,11 +266,11 @@ def on_gels(data: Path, peers: Sequence[str]) -> dict[str, Any]:
                 judge.compare(label, _result(name, settings, reference, picture, mapping))
                 for label, reference, picture, mapping in pairs
             ]
-        answers[name] = _summary(_chosen_elsewhere(candidates))
+        answers[name] = summary(chosen_elsewhere(candidates))
     return answers
 
 
-def _chosen_elsewhere(candidates: Mapping[str, Sequence[judge.Judged]]) -> list[judge.Judged]:
+def chosen_elsewhere(candidates: Mapping[str, Sequence[judge.Judged]]) -> list[judge.Judged]:
     """For each lab, the results of the candidate with the highest mean of the other labs' median overlaps."""
     overlaps: dict[str, dict[str, float]] = {}
     for name, judged in candidates.items():
@@ -290,7 +290,7 @@ def _chosen_elsewhere(candidates: Mapping[str, Sequence[judge.Judged]]) -> list[
     return left_out
 
 
-def _labels(data: Path) -> list[FrameLabel]:
+def chosen_labels(data: Path) -> list[FrameLabel]:
     """First labels of recordings that are there; of those without an outline, `AT_REST` a lab."""
     labels = [
         label for label in load_labels(judge.OUTLINES) if label.round == 1 and label.contact is not None
@@ -311,7 +311,7 @@ def _video(path: Path) -> list[Picture]:
         return [to_bgr(frame[0], str(path)) for frame in frames]
 
 
-def _pair(label: FrameLabel, data: Path) -> tuple[Picture, Picture, PixelMapping]:
+def pair(label: FrameLabel, data: Path) -> tuple[Picture, Picture, PixelMapping]:
     """Reference and picture of a label as a pipeline of the judge processes them, and the mapping to them."""
     path = data / label.recording
     pictures = []
@@ -341,7 +341,7 @@ def _result(
     )
 
 
-def _summary(judged: Sequence[judge.Judged]) -> Numbers:
+def summary(judged: Sequence[judge.Judged]) -> Numbers:
     """Medians over outlined frames; shares of frames with contact that are missed, at rest that are not."""
     touched, rest = (
         [frame for frame in judged if frame.touched],

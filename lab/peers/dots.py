@@ -255,12 +255,12 @@ def on_gels(data: Path, methods: Sequence[str]) -> dict[str, Any]:
             judged[str(settings)] = list(judge_dots.judge(labels, data, finder, kinds=[""]))
         labs = sorted({frame.lab for frame in next(iter(judged.values()))})
         elsewhere = [
-            min(judged.values(), key=lambda frames, lab=lab: _missed(frames, lab, elsewhere=True))
+            min(judged.values(), key=lambda frames, lab=lab: missed(frames, lab, elsewhere=True))
             for lab in labs
         ]
-        here = [min(judged.values(), key=lambda frames, lab=lab: _missed(frames, lab)) for lab in labs]
+        here = [min(judged.values(), key=lambda frames, lab=lab: missed(frames, lab)) for lab in labs]
         answers[name] = {
-            key: _shares(
+            key: shares(
                 [
                     frame
                     for frames, lab in zip(chosen, labs, strict=True)
@@ -273,7 +273,7 @@ def on_gels(data: Path, methods: Sequence[str]) -> dict[str, Any]:
     return answers
 
 
-def _missed(frames: Sequence[judge_dots.FoundDots], lab: str, elsewhere: bool = False) -> float:
+def missed(frames: Sequence[judge_dots.FoundDots], lab: str, elsewhere: bool = False) -> float:
     """Mean over labs of the share of dots that are missed or false; of one lab, or of all others."""
     shares: dict[str, list[float]] = {}
     for frame in frames:
@@ -282,7 +282,7 @@ def _missed(frames: Sequence[judge_dots.FoundDots], lab: str, elsewhere: bool = 
     return float(np.mean([min(np.mean(values), 1.0) for values in shares.values()]))
 
 
-def _shares(frames: Sequence[judge_dots.FoundDots]) -> Numbers:
+def shares(frames: Sequence[judge_dots.FoundDots]) -> Numbers:
     dots = sum(frame.dots for frame in frames)
     return {
         "found": 100 * sum(frame.found for frame in frames) / dots,

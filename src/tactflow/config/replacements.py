@@ -52,8 +52,8 @@ def grouped(components: Iterable[Component]) -> list[tuple[Component, list[Compo
     Of stages that can replace each other, that of the shipped default pipeline has the others behind it; they
     have no entry of their own.
     """
-    components = list(components)
-    leaders = [component for component in components if component.name in default_stages()]
+    components, usual = list(components), default_stages()
+    leaders = [component for component in components if component.name in usual]
     followers = {
         leader.name: [other for other in components if _can_replace(other, leader)] for leader in leaders
     }

@@ -155,7 +155,7 @@ STAGES: Mapping[str, frozenset[str]] = {
 measured only in frames that show one."""
 
 
-QUICK_BUDGET_S, FULL_BUDGET_S = 1.5, 6.0
+QUICK_BUDGET_S, FULL_BUDGET_S = 1.5, 3.0
 """CPU time of a method on one scene, s, beyond which it is measured on fewer frames: a few seconds of a quick
 run of half a minute, and some minutes of a full one, even if several are as slow as that."""
 

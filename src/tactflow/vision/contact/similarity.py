@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32
 
-STABLE_MEAN: Final = (0.01 * 255) ** 2
+MEAN_STABILISER: Final = (0.01 * 255) ** 2
 """Keeps the quotient of the means from noise where both are dark, squared grey levels; of the article."""
-STABLE_VARIANCE: Final = (0.03 * 255) ** 2
+VARIANCE_STABILISER: Final = (0.03 * 255) ** 2
 """The same for the variances."""
 
 
@@ -54,7 +54,7 @@ def structural_similarity(
     variances = mean(a * a) - mean_a * mean_a + mean(b * b) - mean_b * mean_b
     covariance = mean(a * b) - mean_a * mean_b
     mean_a, mean_b = mean_a + middle, mean_b + middle
-    similar_mean = (2 * mean_a * mean_b + STABLE_MEAN) / (mean_a**2 + mean_b**2 + STABLE_MEAN)
+    similar_mean = (2 * mean_a * mean_b + MEAN_STABILISER) / (mean_a**2 + mean_b**2 + MEAN_STABILISER)
     return np.asarray(
-        similar_mean * (2 * covariance + STABLE_VARIANCE) / (variances + STABLE_VARIANCE), np.float32
+        similar_mean * (2 * covariance + VARIANCE_STABILISER) / (variances + VARIANCE_STABILISER), np.float32
     )

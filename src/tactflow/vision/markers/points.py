@@ -22,7 +22,7 @@ PointFlow = Callable[[NDArray[np.uint8], NDArray[np.uint8], Floats32, Floats32],
 """Takes two pictures, points (N, 2) float32 in the first, px, and starting points (N, 2) for the search in
 the second; returns their positions (N, 2) there, and which of them were found (N,)."""
 
-LEAST_CORRELATION: Final = 0.5
+MIN_CORRELATION: Final = 0.5
 """Least normalised correlation of a point's surroundings with those in the reference: halfway between
 chance and equality. A smooth flow returns to its origin on a blank picture, too, where nothing is there."""
 
@@ -84,7 +84,7 @@ class FlowTracker:
         back, returned = self._flow(image, self._reference, position, position - (last - origin))
         seen &= returned & (np.linalg.norm(back - origin, axis=1) <= self._max_error)
         likeness = (self._surroundings(image, position) * self._patches).sum(axis=1)
-        seen &= likeness >= LEAST_CORRELATION
+        seen &= likeness >= MIN_CORRELATION
         self._position = np.where(seen[:, None], position, self._position).astype(np.float64)
         return _markers(self._origin, self._position, seen)
 
