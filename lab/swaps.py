@@ -313,14 +313,16 @@ def masks_on_gels(data: Path) -> dict[str, Any]:
 
 
 def from_bench(path: Path) -> dict[str, Any]:
-    """Of a result of the bench: stage -> method -> quantity -> median over the scenes; and time, ms."""
+    """Of a result of the bench: stage -> method -> quantity -> median over the scenes; and their number."""
     values: dict[str, dict[str, dict[str, list[float]]]] = {}
+    scenes = set()
     for key, numbers in json.loads(path.read_text(encoding="utf-8"))["values"].items():
-        group, *method, _ = key.split("/")
+        group, *method, scene = key.split("/")
+        scenes |= {scene} if group in STAGES else set()
         own = values.setdefault(group, {}).setdefault("/".join(method), {})
         for quantity, value in numbers.items():
             own.setdefault(quantity, []).append(value)
-    return {
+    return {"scenes": len(scenes)} | {
         group: {
             name: {q: sum(v) if q in ("frames", LEFT_OUT) else median(v) for q, v in own.items()}
             for name, own in methods.items()
