@@ -231,7 +231,7 @@ def warped(picture: Picture, farthest: float, seed: int) -> Picture:
     places = np.column_stack([x.ravel(), y.ravel()])
     source = places.copy()
     # The displacement is that of the place at rest: a fixed point, since its slope is below 1.
-    for _ in range(30):
+    for _ in range(12):
         source = places - displaced(source, picture.shape, farthest)
     maps = source.astype(np.float32).reshape(*picture.shape[:2], 2)
     moved = cv2.remap(
