@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.sim import gel, markers, motion
+from tactflow.sim import faults, gel, markers, motion
 from tactflow.sim.camera import FPS, SIZE, Camera
 from tactflow.sim.picture import Painter
 from tactflow.sim.recipes import SCENES
@@ -75,7 +75,11 @@ class Scene:
         return self._contact(index)[0]
 
     def frame(self, index: int) -> NDArray[np.uint8]:
-        """Render raw frame `index`, a new (600, 800, 3) uint8 BGR array."""
+        """Raw frame `index` as the camera delivers it, a new (600, 800, 3) uint8 BGR array."""
+        return faults.delivered(index, self.settings, self._rendered)
+
+    def _rendered(self, index: int) -> NDArray[np.uint8]:
+        """Raw frame `index`, undamaged."""
         index = self._shown(index)
         pressed, cycle = self._contact(index)
         return self._painter.frame(index, pressed, ~self._hidden(cycle))

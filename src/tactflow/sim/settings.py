@@ -70,6 +70,15 @@ class Settings(BaseModel):
     jpeg: int = _number(0, 0, 100, "quality of a JPEG round trip; 0 for none")
     gain: float = _number(0, 0, 0.5, "amplitude of bands of gain that roll over the frame, relative")
     hot: int = _number(0, 0, 10_000, "number of hot pixels")
+    first: Literal["gel", "black", "green", "leftover", "half", "exposure"] = Field(
+        "gel",
+        description="what the camera's first pictures show: empty buffers, a picture of another session, "
+        "half a picture, settling exposure (gel|black|green|leftover|half|exposure)",
+    )
+    late: int = _number(3, 1, 1000, "number of these first pictures")
+    damaged: int = _number(
+        0, 0, 1_000_000, "every so many frames, one is damaged: half gray, half noise, or displaced; 0: none"
+    )
     perspective: float = _number(
         0, 0, 0.4, "tilt of the camera: how far the lower corners move in, of half the width"
     )

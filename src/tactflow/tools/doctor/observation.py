@@ -20,6 +20,7 @@ from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.files import ArrayFile, ImageFiles
 from tactflow.tools.doctor.measures import REGULAR, Gray, Pair, exposure, grey
 from tactflow.vision.arrays import ColorImage
+from tactflow.vision.change import DamageTest, shows_gel
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Detection, NoMarkersError, detect_markers
 
@@ -188,6 +189,7 @@ def _read(
 ) -> None:
     course, glances = observation.recorded.course, Watcher()
     begin: float | None = None
+    test: DamageTest | None = None
     stride = 1
     while (frame := _next(reader)) is not None:
         begin = frame.t if begin is None else begin
@@ -201,7 +203,13 @@ def _read(
             if len(pairs) > 2 * KEPT:
                 stride *= 2
                 pairs[:] = [pair for pair in pairs if pair.number % stride == 0]
-        course.add(glances.look(frame.image, frame.t, frame.seq, reference=frame.reference))
+        suspect = test is None or test.is_damaged(frame.image)
+        empty = suspect and not shows_gel(frame.image)
+        damaged = suspect and not empty and test is not None
+        if test is None and not empty:
+            test = DamageTest(frame.image)
+        of_frame = {"reference": frame.reference, "empty": empty, "damaged": damaged}
+        course.add(glances.look(frame.image, frame.t, frame.seq, **of_frame))
         if show(frame) is False:
             return
     if reader.live and begin is not None:
