@@ -31,7 +31,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     `tactflow bench --quick --json tests/tools/bench/baseline_quick.json`.
     """
     folder = tmp_path_factory.mktemp("bench")
-    words = ["bench", "--quick", "--json", str(folder / "b.json"), "--against", str(BASELINE)]
+    outputs = ["--json", str(folder / "b.json"), "--page", str(folder / "b.html")]
+    words = ["bench", "--quick", *outputs, "--against", str(BASELINE)]
     assert main(words) == 0
     return folder
 
@@ -47,6 +48,15 @@ def test_every_pipeline_and_every_method_is_timed_and_judged(folder: Path) -> No
     assert expected <= measured["pipeline/default/bright_cable"].keys()
     # Given the true mask, the geometry is exact.
     assert measured["hull/default/bright_cable"]["center_error"] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_page_shows_costs_growth_latency_and_pictures(folder: Path) -> None:
+    stored, page = json.loads((folder / "b.json").read_text()), (folder / "b.html").read_text()
+    assert stored["costs"]["default"]["contact"]["difference"] > 0
+    assert [grown["title"] for grown in stored["growth"]] == ["Picture", "Dots"]
+    assert stored["latency_ms"].keys() >= {"p50", "p99"}
+    for words in ("What a frame costs", "How the cost grows", "Latency", "What was found", "bright_cable"):
+        assert words in page
 
 
 def test_a_gel_without_markers_is_measured_without_a_tracker(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from tactflow.cli.options import refuse_output, writing
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.system.terminal import notes, progress_bar, say, show
+from tactflow.tools.bench.page import bench_page
 from tactflow.tools.bench.results import CLASSIC, load_errors, regressions
 from tactflow.tools.bench.run import DEFAULT, MARKERLESS, run_bench
 from tactflow.tools.bench.tables import lines
@@ -41,6 +42,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write every number here, as JSON (default: bench.json)",
     )
     add(
+        "--page",
+        type=Path,
+        default=Path("bench.html"),
+        metavar="PATH",
+        help="write the page with plots here (default: bench.html)",
+    )
+    add(
+        "--recording",
+        type=Path,
+        metavar="FILE",
+        help="show what each frame of this recording costs, instead of a simulated press",
+    )
+    add(
         "--against",
         type=Path,
         metavar="FILE",
@@ -52,19 +66,28 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print the tables, write what was asked for; returns the exit code."""
     stored = None if args.against is None else load_errors(args.against, quick=args.quick)
     refuse_output("--json", args.json, overwrite=True)
+    refuse_output("--page", args.page, overwrite=True)
+    if args.recording is not None and not args.recording.exists():
+        raise ConfigError(f"--recording {args.recording}: there is no such file")
     scenes = frozenset(args.scene) if args.scene else None
+    files = _files(args.pipelines)
     with notes("ERROR"), progress_bar("rendering") as update:
         result = run_bench(
-            _files(args.pipelines),
+            files,
             quick=args.quick,
             scenes=scenes,
+            recording=args.recording,
             progress=lambda what, n, total: update(description=what, completed=n, total=total),
         )
     show(lines(result))
     with writing(args.json):
         args.json.parent.mkdir(parents=True, exist_ok=True)
         result.save(args.json)
-    say(f"tactflow: wrote {args.json}")
+    own = [name for name in files if name not in packaged_files()]
+    with writing(args.page):
+        args.page.parent.mkdir(parents=True, exist_ok=True)
+        args.page.write_text(bench_page(result, own), encoding="utf-8")
+    say(f"tactflow: wrote {args.json} and {args.page}")
     if stored is None:
         return 0
     worse = regressions(result, stored, scenes)

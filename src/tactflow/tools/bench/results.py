@@ -10,12 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from tactflow.engine.errors import ConfigError
+from tactflow.tools.bench.costs import Costs
+from tactflow.tools.bench.growth import Growth
+from tactflow.tools.bench.latency import percentiles
 from tactflow.tools.bench.quantities import QUANTITIES
 
 SCHEMA = "tactflow.bench/3"
 
 PIPELINE = "pipeline"
 """Group of the rows about whole pipelines."""
+TRUTH = "truth"
+"""What the pictures of a scene show beside the pipelines."""
 CLASSIC = "classic"
 """Name of the pipeline that is the yardstick: the original script."""
 TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
@@ -60,7 +65,10 @@ class BenchResult:
     """A whole run of the bench.
 
     quick : whether it was the short one. machine : what it ran on. wall_s : how long the run took, s.
-    failures : group/method/scene -> why there are no numbers.
+    failures : group/method/scene -> why there are no numbers. costs : pipeline -> kind of frame -> stage ->
+    median CPU time, ms. grasp : name, and pipeline -> the frames of a recording, for the page. growth : cost
+    of a frame against sizes. latency_ms : ages of results at a camera's pace.
+    pictures : scene -> pipeline (or `TRUTH`) -> JPEG of its deepest frame, for the page; not in the JSON.
     """
 
     quick: bool
@@ -68,6 +76,11 @@ class BenchResult:
     wall_s: float = 0.0
     measured: list[Measurement] = field(default_factory=list[Measurement])
     failures: dict[str, str] = field(default_factory=dict[str, str])
+    costs: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
+    grasp: tuple[str, dict[str, Costs]] | None = None
+    growth: list[Growth] = field(default_factory=list[Growth])
+    latency_ms: list[float] = field(default_factory=list[float])
+    pictures: dict[str, dict[str, bytes]] = field(default_factory=dict)
 
     def add(
         self,
@@ -104,7 +117,9 @@ class BenchResult:
 
     def save(self, path: Path) -> None:
         """Write everything as JSON, one measurement a line."""
-        run = {name: value for name, value in asdict(self).items() if name != "measured"}
+        left_out = ("measured", "grasp", "pictures", "latency_ms")
+        run = {name: value for name, value in asdict(self).items() if name not in left_out}
+        run["latency_ms"] = percentiles(self.latency_ms)
         values = [f'"{m.key}": {json.dumps(m.values, allow_nan=False)}' for m in self.measured]
         head = json.dumps({"schema": SCHEMA, **run}, allow_nan=False)
         lines = ",\n".join(values)

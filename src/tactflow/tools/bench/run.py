@@ -19,15 +19,21 @@ from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
-from tactflow.tools.bench.lockstep import on_recording, take_turns
+from tactflow.tools.bench.costs import measure_costs
+from tactflow.tools.bench.growth import measure_growth
+from tactflow.tools.bench.latency import measure_latency
+from tactflow.tools.bench.lockstep import TimedResult, on_recording, take_turns
 from tactflow.tools.bench.methods import measure_methods
+from tactflow.tools.bench.pictures import deepest_frame, found_picture, true_picture
 from tactflow.tools.bench.quantities import Tally
-from tactflow.tools.bench.results import CLASSIC, PIPELINE, BenchResult
+from tactflow.tools.bench.results import CLASSIC, PIPELINE, TRUTH, BenchResult
 from tactflow.tools.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, rendered
 from tactflow.tools.bench.score import PipelineScore
 
 DEFAULT = "default"
 MARKERLESS = "markerless"
+GRASP_FRAMES = 360
+"""Frames of the simulated press whose frames are costed one by one, and played at a camera's pace."""
 _MARKER_STAGES = frozenset({"tracker", "flow_in_mask", "visualize"})
 """Ids of the stages that need markers."""
 
@@ -42,12 +48,14 @@ def run_bench(
     *,
     quick: bool = False,
     scenes: Collection[str] | None = None,
+    recording: Path | None = None,
     progress: Progress = lambda *_: None,
 ) -> BenchResult:
-    """Measure pipelines, and every method of their stages.
+    """Measure pipelines, every method of their stages, where time goes, and how it grows.
 
     files : pipeline name -> file; `DEFAULT` and `CLASSIC` must be among them. quick : a short run.
-    scenes : only these, or None for all.
+    scenes : only these, or None for all, with the costs, growth and latency, which have scenes of their own.
+    recording : whose frames are costed one by one; None: a simulated press.
 
     Raises
     ------
@@ -57,6 +65,7 @@ def run_bench(
     began = time.perf_counter()
     whole, alone = (QUICK, QUICK_STAGES) if quick else ((*FULL, *TROUBLES), FULL_STAGES)
     known = [case.label for case in whole]
+    everything = scenes is None
     scenes = frozenset(known if scenes is None else scenes)
     if unknown := sorted(scenes.difference(known)):
         measured = ", ".join(known)
@@ -65,7 +74,7 @@ def run_bench(
     result = BenchResult(quick=quick, machine=machine())
     with tempfile.TemporaryDirectory(prefix="tactflow-bench-") as folder:
         shared = (result, Path(folder))
-        steps = [
+        steps: list[tuple[str, Callable[[], None]]] = [
             (f"pipelines on {case.label}", partial(measure_scene, *shared, loaded, case))
             for case in whole
             if case.label in scenes
@@ -75,6 +84,8 @@ def run_bench(
             for case in alone
             if case.label in scenes
         ]
+        if everything or recording is not None:
+            steps += _further_steps(result, Path(folder), loaded, recording)
         for number, (what, measure) in enumerate(steps):
             progress(what, number, len(steps))
             measure()
@@ -95,13 +106,51 @@ def measure_scene(result: BenchResult, scratch: Path, loaded: Pipelines, case: C
             suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
         scores = {name: PipelineScore(scene, Tally()) for name in suited}
         ready = {name: on_recording(pipeline, scene.path) for name, pipeline in suited.items()}
-        times, failures = take_turns(ready, lambda name, found: scores[name].add(found))
+        deepest = deepest_frame(scene)
+        shown: dict[str, bytes] = {}
+
+        def observe(name: str, found: TimedResult) -> str:
+            if found.seq == deepest:
+                if found.mapping is not None and not shown:
+                    shown[TRUTH] = true_picture(found, scene.truths(found.mapping)[deepest])
+                shown[name] = found_picture(found)
+            return scores[name].add(found)
+
+        times, failures = take_turns(ready, observe)
+    result.pictures[case.label] = shown
     for name, score in scores.items():
         if name in failures:
             result.failures[f"{PIPELINE}/{name}/{case.label}"] = failures[name]
         else:
             errors, frames = score.tally.errors(), sum(map(len, times[name].values()))
             result.add(PIPELINE, name, case.label, errors, times=times[name], frames=frames)
+
+
+def _further_steps(
+    result: BenchResult, folder: Path, loaded: Pipelines, recording: Path | None
+) -> list[tuple[str, Callable[[], None]]]:
+    """What is measured beside errors: costs by stage, growth, latency."""
+    frames = GRASP_FRAMES // 4 if result.quick else GRASP_FRAMES
+    case = Case("press", frames)
+    source = recording or folder / "grasp.npy"
+
+    def costs() -> None:
+        if recording is None:
+            with rendered(case, folder) as scene:
+                scene.path.rename(source)
+        suited = {name: p for name, p in loaded.items() if not _is_for_one_camera(p)}
+        measured = measure_costs(suited, source)
+        result.costs = {name: cost.by_stage() for name, cost in measured.items()}
+        result.grasp = (recording.name if recording else "a simulated press", measured)
+
+    def growth() -> None:
+        markerless = loaded.get(MARKERLESS) or load_pipeline(find_pipeline(MARKERLESS))
+        result.growth = list(measure_growth(loaded[DEFAULT], markerless, quick=result.quick))
+
+    def latency() -> None:
+        result.latency_ms = measure_latency(loaded[DEFAULT], source)
+
+    return [("costs", costs), ("growth", growth), ("latency", latency)]
 
 
 def _marked(loaded: Pipelines) -> dict[str, Pipeline]:

@@ -78,11 +78,11 @@ def _methods(result: BenchResult, group: str) -> Iterator[str]:
         row = [method + _measured_frames(own)]
         for key in TIMES.values():
             times = [values[key] for values in own if key in values]
-            row.append(_number(median(times)) if times else "-")
+            row.append(number(median(times)) if times else "-")
         for quantity in quantities:
             errors = [values[quantity.key] for values in own if quantity.key in values]
             worst = max(errors, key=quantity.distance, default=0.0)
-            row.append(f"{_number(median(errors))} ({_number(worst)})" if errors else "-")
+            row.append(f"{number(median(errors))} ({number(worst)})" if errors else "-")
         rows.append(row)
     text = "Median over the scenes, in brackets the worst one."
     if any(LEFT_OUT in m.values for m in measured):
@@ -107,11 +107,11 @@ def _scenes(result: BenchResult) -> Iterator[str]:
 def _cells(measurement: Measurement, columns: dict[str, tuple[str, ...]]) -> list[str]:
     """The time, ms, and the quantities of each column; a dash where one was not measured."""
     values = measurement.values
-    time = "-" if measurement.time_ms is None else _number(measurement.time_ms)
-    cells = (", ".join(_number(values[k]) if k in values else "-" for k in keys) for keys in columns.values())
+    time = "-" if measurement.time_ms is None else number(measurement.time_ms)
+    cells = (", ".join(number(values[k]) if k in values else "-" for k in keys) for keys in columns.values())
     return [time, *cells]
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """Three significant digits, without an exponent."""
     return np.format_float_positional(value, 3, fractional=False, trim="-")
