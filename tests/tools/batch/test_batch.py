@@ -70,6 +70,7 @@ def test_every_recording_has_a_result_and_a_second_call_does_nothing(call: Call)
     assert not list((call.folder / "out" / "unfinished").iterdir())
     page = (call.folder / "out" / "index.html").read_text()
     pictures = re.findall(r'<img [^>]*src="([^"]*)"', page)
+    assert page.count("area, px²") == 2
     shapes = [np.shape(cv2.imread(str(call.folder / "out" / name))) for name in pictures]
     assert shapes == [(48, 64, 3)] * 2
     written = call.result(0).stat().st_mtime_ns

@@ -61,7 +61,8 @@ def test_the_choice_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     monkeypatch.setattr(search, "SIMULATED", (Case("press", 24),))
     path = Fitted(SMALL, Case("press", 30), tmp_path, 3).path
     budget = 1.5
-    assert terminal("tune", "default", "--source", str(path), "--max-error", str(budget)) == 0
+    words = ("tune", "default", "--source", str(path), "--max-error", str(budget), "--page", "tuned.html")
+    assert terminal(*words) == 0
     trials = candidates(find_pipeline("default"), (320, 240), None)
     judge(trials, [Fitted(SMALL, Case("press", 24), tmp_path, 50)])
     truth = {trial.name: trial.error for trial in trials}
@@ -69,6 +70,9 @@ def test_the_choice_keeps_the_budget_in_truth_and_nothing_cheaper_does(
     assert f"| CHOSEN | {ORIGINAL} " in terminal.out
     assert truth[ORIGINAL] <= budget < truth["mean"]
     assert "field" in tactflow.load("tuned.yaml").nodes
+    page = Path("tuned.html").read_text(encoding="utf-8")
+    assert "<td>mean</td>" in page
+    assert '<b class="good">chosen</b>' in page
     text = Path("tuned.yaml").read_text()
     assert all(f"# {line}".rstrip() in text for line in terminal.out.splitlines())
 

@@ -7,8 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+import numpy as np
 import orjson
 
 from tactflow.engine.errors import ConfigError
@@ -16,15 +18,21 @@ from tactflow.system.extras import missing
 from tactflow.system.files import completed
 from tactflow.tools.batch.recordings import Recording
 from tactflow.tools.batch.store import Format, Outcome, Store
-from tactflow.tools.page import Html, Section, marked, page, table
+from tactflow.tools.batch.summary import TRACED
+from tactflow.tools.page import Html, Section, marked, page, plot, series, table
 
-NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full", "pictures"}
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+NOT_IN_TABLE = {"pipeline", "recording_is", "result_is", "disk_full", "pictures", "trace"}
 """Internal fields of an outcome."""
 COLUMNS = (
     *("recording", "status", "frames", "duration, s", "frames/s", "contacts", "touching, %"),
-    *("largest contact, px²", "result", "largest contacts, or what went wrong"),
+    *("largest contact, px²", "result", "over time", "largest contacts, or what went wrong"),
 )
 """Headings of the page."""
+TRACE_WIDTH = 240
+"""Width of the plot of a recording, CSS pixels."""
 _TYPES = {"int": "int64", "float": "float64"}
 """Python type -> Arrow type; all others are strings."""
 
@@ -86,6 +94,23 @@ def write_page(store: Store, runs: Runs, title: str) -> Path:
     return path
 
 
+def _trace(outcome: Outcome) -> Html:
+    """A small plot of what the recording has of area, flow and force over time."""
+    values = {name: np.array(outcome.trace.get(name, ()), np.float64) for name in ("t", *TRACED)}
+    shown = [name for name in TRACED if np.isfinite(values[name]).any()]
+    if not shown:
+        return Html("")
+
+    def draw(figure: Figure) -> None:
+        for index, name in enumerate(shown):
+            axes = figure.add_subplot(len(shown), 1, index + 1)
+            axes.plot(values["t"], values[name], color=series(index), linewidth=1)
+            axes.set_ylabel(TRACED[name], fontsize=7)
+            axes.tick_params(labelsize=7, labelbottom=name == shown[-1])
+
+    return plot(draw, width=TRACE_WIDTH, height=60 * len(shown) + 20)
+
+
 def _cells(store: Store, recording: Recording, outcome: Outcome) -> Iterator[str]:
     """Cells of a row."""
     yield recording.name
@@ -98,8 +123,9 @@ def _cells(store: Store, recording: Recording, outcome: Outcome) -> Iterator[str
         yield f"{100.0 * outcome.touching_frames / max(1, outcome.frames):.1f}"
         yield f"{outcome.largest_area_px2:.0f}"
         yield Html(f'<a href="{escape(quote(str(outcome.result)))}">open</a>')
+        yield _trace(outcome)
     else:
-        yield from [""] * 7
+        yield from [""] * 8
     remarks = "\n".join(filter(None, (outcome.error, outcome.warnings)))
     pictures = zip(store.pictures(recording, len(outcome.pictures)), outcome.pictures, strict=True)
     addresses = ((escape(quote(file.relative_to(store.path).as_posix())), t) for file, t in pictures)

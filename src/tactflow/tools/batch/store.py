@@ -17,7 +17,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -43,7 +43,7 @@ class Outcome:
     started_unix, took_s : start time and processing time. worker : host and process. result : path relative
     to `--out`. warnings : one per line. tactflow : version. pipeline : `pipeline_digest`. recording_is,
     result_is : fingerprints. disk_full : whether a full disk caused the failure. pictures : times of its
-    pictures, s.
+    pictures, s. trace : a few quantities over time, see `Trace`.
     """
 
     recording: str
@@ -67,6 +67,7 @@ class Outcome:
     result_is: Fingerprint | None = None
     disk_full: bool = False
     pictures: tuple[float, ...] = ()
+    trace: dict[str, list[float | None]] = field(default_factory=dict)
 
 
 _OUTCOME = TypeAdapter(Outcome)

@@ -13,6 +13,10 @@ from tactflow.message.result import Result
 
 MAX_PICTURES = 4
 """Pictures per recording: they fit next to each other."""
+TRACED = {"area": "area, px²", "flow": "flow, px", "force": "force, N"}
+"""What is drawn over time for each recording: name -> label."""
+TRACE_POINTS = 150
+"""Points of such a curve, at least, in a long recording; twice as many at most."""
 PICTURE_SIDE = 240
 """Longer side of a picture, px."""
 PAPER_GREY = 45
@@ -29,10 +33,41 @@ class Picture(NamedTuple):
     jpeg: bytes
 
 
+class Trace:
+    """A few quantities of a run, thinned out evenly so that they stay few.
+
+    values : name of `TRACED` -> a number or None for each kept frame; "t" -> its time, s.
+    """
+
+    def __init__(self) -> None:
+        self.values: dict[str, list[float | None]] = {name: [] for name in ("t", *TRACED)}
+        self._stride, self._seen = 1, 0
+
+    def add(self, result: Result) -> None:
+        """Add one frame."""
+        self._seen += 1
+        if (self._seen - 1) % self._stride:
+            return
+        contact, flow, force = result.contact, result.flow, result.force
+        mean = None if flow is None else flow.mean
+        row = {
+            "t": result.t,
+            "area": None if contact is None else float(contact.area),
+            "flow": None if mean is None else float(np.hypot(*mean)),
+            "force": None if force is None else force.value[2],
+        }
+        for name, value in row.items():
+            self.values[name].append(value)
+        if len(self.values["t"]) > 2 * TRACE_POINTS:
+            self.values = {name: values[::2] for name, values in self.values.items()}
+            self._stride *= 2
+
+
 class Summary:
     """Collects the frames of a run in bounded memory."""
 
     def __init__(self) -> None:
+        self.trace = Trace()
         self.contacts = self.touching = 0
         self.largest = self.duration = 0.0
         self._pictures: list[Picture] = []
@@ -41,6 +76,7 @@ class Summary:
     def add(self, result: Result) -> None:
         """Add one frame."""
         contact = result.contact
+        self.trace.add(result)
         self.duration = result.t
         if contact is None:
             self._end_contact()

@@ -194,6 +194,7 @@ def _run(task: Task, outcome: Outcome, unfinished: Path) -> tuple[Outcome, list[
         result_is=fingerprint(unfinished),
         result=f"results/{unfinished.name}{RESULT_SUFFIXES[task.request.format]}",
         pictures=tuple(picture.t for picture in pictures),
+        trace=summary.trace.values,
     )
     return done, [picture.jpeg for picture in pictures]
 

@@ -129,6 +129,12 @@ def _fronts(result: BenchResult, own: Sequence[str]) -> Iterator[Html]:
 
 
 def draw_front(axes: Axes, found: Sequence[Point], quantity: Quantity, own: Sequence[str] = ()) -> None:
+    """Draw the methods against one error."""
+    draw_points(axes, found, own)
+    axes.set_title(f"1 - {quantity.title}" if quantity.best == 1 else quantity.heading)
+
+
+def draw_points(axes: Axes, found: Sequence[Point], own: Sequence[str] = ()) -> None:
     """Draw the methods, their front, and their names; the classic script and `own` ones are marked."""
     for point in found:
         marked = point.name in (CLASSIC, *own)
@@ -143,8 +149,6 @@ def draw_front(axes: Axes, found: Sequence[Point], quantity: Quantity, own: Sequ
     steps = [max(point.error[1], _FLOOR) for point in best]
     axes.plot([p.ms[1] for p in best], steps, color=colour("quiet"), linewidth=0.8, zorder=0)
     axes.set(xscale="log", yscale="log", xlabel="CPU time of a frame, ms")
-    error = f"1 - {quantity.title}" if quantity.best == 1 else quantity.heading
-    axes.set_title(error)
     axes.margins(x=0.25, y=0.15)
 
 

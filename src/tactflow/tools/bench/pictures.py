@@ -19,6 +19,7 @@ SIDE_PX: Final = 240
 _QUALITY: Final = 75
 """JPEG quality, 1 to 100: about 6 kB a picture."""
 _GREEN: Final = (90, 230, 60)
+"""Colour of the true outline, blue, green, red."""
 
 
 def deepest_frame(scene: Rendered) -> int:

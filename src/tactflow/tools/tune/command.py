@@ -45,6 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("tuned.yaml"), metavar="FILE", help="default: tuned.yaml"
     )
+    parser.add_argument(
+        "--page", type=Path, metavar="FILE.html", help="also draw time against error of all candidates here"
+    )
     add_overwrite(parser)
 
 
@@ -57,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
         If the options are wrong, or the recording cannot be used.
     """
     refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".yaml", ".yml"))
+    if args.page is not None:
+        refuse_output("--page", args.page, overwrite=args.overwrite, suffixes=(".html",))
     # Imported here: the simulator and the bench take their time.
     from tactflow.tools.tune import report
     from tactflow.tools.tune.recording import take
@@ -75,6 +80,10 @@ def run(args: argparse.Namespace) -> int:
         goal = Goal(args.max_error, args.max_ms)
         tuned = search(trials, recording, folder, goal, say, swaps(file, args.sensor))
     show(report.lines(tuned))
+    if args.page is not None:
+        with writing(args.page), completed(args.page) as unfinished:
+            unfinished.write_text(report.front_page(tuned, goal), encoding="utf-8")
+        say(f"{args.page} is written")
     if tuned.chosen is None:
         say(tuned.impossible())
         return StageError.exit_code

@@ -5,14 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import yaml
 
+from tactflow.drawing.plots import colour
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.system.terminal import markdown, printable
+from tactflow.tools.bench.page import Point, draw_points
+from tactflow.tools.page import Section, marked, page, plot, table
 from tactflow.tools.tune.measure import ERRORS
-from tactflow.tools.tune.search import Tuned
+from tactflow.tools.tune.search import Goal, Tuned
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def lines(tuned: Tuned) -> Iterator[str]:
@@ -31,6 +38,31 @@ def lines(tuned: Tuned) -> Iterator[str]:
         rows.append([mark, trial.name, ms, *errors, remark])
     columns = ["", "pipeline", "time, ms", *(f"{kind}, px" for kind in kinds), "remarks"]
     yield from markdown("Time and error", "\n\n".join(facts), columns, rows)
+
+
+def front_page(tuned: Tuned, goal: Goal) -> str:
+    """A page: each candidate's time against its largest error, their front, the budgets, and the choice."""
+    usable = [trial for trial in tuned.trials if trial.usable and math.isfinite(trial.ms)]
+    found = [Point(trial.name, (trial.ms,) * 3, (trial.error,) * 3) for trial in usable]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        draw_points(axes, found, [] if tuned.chosen is None else [tuned.chosen.name])
+        axes.set_title("largest error, px of the camera image")
+        if goal.max_ms is not None:
+            axes.axvline(goal.max_ms, color=colour("warn"), linewidth=1)
+        if goal.max_error is not None:
+            axes.axhline(goal.max_error, color=colour("warn"), linewidth=1)
+
+    rows = []
+    for trial in tuned.trials:
+        choice = marked("chosen", "good") if trial is tuned.chosen else ""
+        error, ms = (f"{value:.3f}" if math.isfinite(value) else "" for value in (trial.error, trial.ms))
+        rows.append([trial.name, ms, error, choice or trial.fault.partition("\n")[0]])
+    columns = ["pipeline", "time, ms", "largest error, px", ""]
+    text = f"Simulated sensor fitted to {tuned.recording.source}: {tuned.look}."
+    body = [plot(draw, width=760, height=420), table(columns, rows, sortable=True)]
+    return page("tactflow tune", [Section("Time against error", text, body)])
 
 
 def pipeline_text(tuned: Tuned, out: Path) -> str:
