@@ -63,7 +63,8 @@ class InThisProcess:
 
 def recording(path: Path, *, brightness: int = 200, frames: int = 6) -> Path:
     """A .npy recording in which a bright square touches from the third frame on."""
-    pictures = np.full((frames, 48, 64, 3), 60, np.uint8)
+    gel = np.linspace(50, 70, 64).astype(np.uint8)[:, None].repeat(3, axis=1)
+    pictures = np.tile(gel, (frames, 48, 1, 1))
     pictures[2:, 16:32, 20:40] = brightness
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, pictures)
