@@ -9,7 +9,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage
 from tactflow.parameters import MarkParams
 from tactflow.ports import Image, MarkerMask, Valid
-from tactflow.vision.markers.detection import to_gray
+from tactflow.vision.markers.detection import detect_markers, to_gray
 from tactflow.vision.markers.mask import Dot, find_dot
 
 
@@ -59,7 +59,10 @@ class AdaptiveThreshold(Stage):
         params = self.params
         if not self._known:
             self._known = True
-            self._dot = find_dot(image, radius=params.dot, polarity=params.polarity, valid=valid)
+            detect = self.once.keeping(detect_markers)
+            self._dot = find_dot(
+                image, radius=params.dot, polarity=params.polarity, valid=valid, detect=detect
+            )
         if self._dot is None:
             return np.zeros(image.shape[:2], np.uint8)
         gray = to_gray(image)

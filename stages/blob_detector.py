@@ -10,7 +10,7 @@ import numpy as np
 from tactflow.engine.contract import Stage
 from tactflow.parameters import MarkParams
 from tactflow.ports import Image, MarkerMask, Valid
-from tactflow.vision.markers.detection import to_gray
+from tactflow.vision.markers.detection import detect_markers, to_gray
 from tactflow.vision.markers.mask import Dot, find_dot
 
 
@@ -50,7 +50,11 @@ class BlobDetector(Stage):
         """Discs of 255 where a dot covers the gel; all 0 where the first frame showed none."""
         if not self._known:
             self._known = True
-            self._dot = find_dot(image, radius=self.params.dot, polarity=self.params.polarity, valid=valid)
+            params = self.params
+            detect = self.once.keeping(detect_markers)
+            self._dot = find_dot(
+                image, radius=params.dot, polarity=params.polarity, valid=valid, detect=detect
+            )
             self._detector = cv2.SimpleBlobDetector.create(self._settings())
         mask = np.zeros(image.shape[:2], np.uint8)
         if self._dot is not None:

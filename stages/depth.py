@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
@@ -30,15 +28,13 @@ class Depth(Stage):
 
     memory = "pure"
 
-    def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
-        """Prepare. calibration : the file."""
+    def __init__(self, params: StageParams, calibration: Calibration | None = None) -> None:
+        """Prepare. calibration : of the sensor."""
         super().__init__(params)
-        known = None if calibration is None else Calibration.load(calibration)
+        self._known = known = calibration
         photometric = None if known is None else known.photometric
-        self._known = known
         self._errors = None if photometric is None else photometric.errors()
         self._darkness = None if known is None or known.darkness is None else known.darkness.model()
-        self._rest: tuple[Untouched, Rest] | None = None
 
     def process(
         self,
@@ -54,9 +50,7 @@ class Depth(Stage):
             return Absent("no_calibration")
         if not contact_mask.any():
             return Absent("no_contact")
-        if self._rest is None or self._rest[0] is not untouched:
-            self._rest = untouched, Rest(untouched)
-        rest = self._rest[1]
+        rest = self.once(Rest, untouched)
         if known.darkness is not None and self._darkness is not None and gradients is None:
             dark = DarkSurface(self._darkness, scale, known.darkness.stderr)
             return dark.depth(unmarked, rest, contact_mask)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Absent
 from tactflow.ports import Image
 from tactflow.vision.flow.displacement_field import MIN_MARKERS, DisplacementField, FieldModel
@@ -31,18 +31,10 @@ class Field(Stage):
 
     memory = "pure"
 
-    def __init__(self, params: StageParams) -> None:
-        super().__init__(params)
-        self._model: FieldModel | None = None
-        self._reference = b"", (0, 0)
-
     def process(self, markers: Markers, image: Image) -> FieldPorts | Absent:
         """The field of this frame; absent where fewer than three markers are seen."""
         if len(markers.origin) < MIN_MARKERS:
             return Absent("no_markers")
-        # What the reference alone tells is kept; it is known again by its markers.
-        reference = markers.origin.tobytes(), (image.shape[1], image.shape[0])
-        if self._model is None or self._reference != reference:
-            self._model, self._reference = FieldModel(markers.origin, reference[1]), reference
-        field = self._model(markers)
+        model = self.once(FieldModel, markers.origin, (image.shape[1], image.shape[0]))
+        field = model(markers)
         return Absent("no_markers") if field is None else FieldPorts(field)

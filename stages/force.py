@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
@@ -32,12 +31,11 @@ class Force(Stage):
 
     memory = "pure"
 
-    def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
-        """Prepare. calibration : the file."""
+    def __init__(self, params: StageParams, calibration: Calibration | None = None) -> None:
+        """Prepare. calibration : of the sensor."""
         super().__init__(params)
-        self._entry = None if calibration is None else Calibration.load(calibration).force
+        self._entry = None if calibration is None else calibration.force
         self._model = None if self._entry is None else self._entry.model()
-        self._light: LightChange | None = None
         self._warned = False
 
     def process(
@@ -58,9 +56,8 @@ class Force(Stage):
             if depth is None:
                 return Absent("no_depth")
         else:
-            if self._light is None or self._light.untouched is not untouched:
-                self._light = LightChange(untouched)
-            change = scale.area(self._light(unmarked)) - model.change_at_rest
+            light_change = self.once(LightChange, untouched)
+            change = scale.area(light_change(unmarked)) - model.change_at_rest
         force = model.force(seen(contact, scale, depth, change, flow))
         if not force.in_range and not self._warned:
             self._warned = True

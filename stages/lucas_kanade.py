@@ -60,7 +60,9 @@ class LucasKanade(Stage):
         """Position and status of every dot of the first frame."""
         params, gray = self.params, to_gray(image)
         if self._tracker is None:
-            found = detect_markers(image, dot_radius=params.dot, polarity=params.polarity, valid=valid)
+            found = self.once(
+                detect_markers, image, dot_radius=params.dot, polarity=params.polarity, valid=valid
+            )
             self._side = params.window or 2 * round(2 * found.dot_radius) + 1
             self._tracker = FlowTracker(gray, found.centers, found.dot_radius, self._flow, params.max_error)
         return self._tracker.track(gray)

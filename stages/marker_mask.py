@@ -10,6 +10,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.ports import Image, MarkerMask, Valid
+from tactflow.vision.markers.detection import detect_markers
 from tactflow.vision.markers.mask import Dot, find_dot, marker_mask
 
 
@@ -60,7 +61,8 @@ class MarkerMaskStage(Stage):
     def _find(self, image: Image, valid: Valid | None) -> Dot | None:
         params = self.params
         radius = None if params.dot == "auto" else params.dot
-        found = find_dot(image, radius=radius, polarity=params.polarity, valid=valid)
+        detect = self.once.keeping(detect_markers)
+        found = find_dot(image, radius=radius, polarity=params.polarity, valid=valid, detect=detect)
         if found is None or params.contrast == "auto":
             return found
         return replace(found, contrast=params.contrast)

@@ -56,7 +56,9 @@ class NearestDots(Stage):
         """Position and status of every dot of the first frame."""
         params = self.params
         if self._tracker is None:
-            found = detect_markers(image, dot_radius=params.dot, polarity=params.polarity, valid=valid)
+            found = self.once(
+                detect_markers, image, dot_radius=params.dot, polarity=params.polarity, valid=valid
+            )
             self._radius, self._polarity = found.dot_radius, found.polarity
             self._tracker = NearestTracker(found.centers, params.max_displacement or found.pitch / 2)
             return self._tracker.link(found.centers)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
@@ -29,14 +27,12 @@ class SurfaceNormals(Stage):
 
     memory = "pure"
 
-    def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
-        """Prepare. calibration : the file."""
+    def __init__(self, params: StageParams, calibration: Calibration | None = None) -> None:
+        """Prepare. calibration : of the sensor."""
         super().__init__(params)
-        known = None if calibration is None else Calibration.load(calibration)
-        photometric = None if known is None else known.photometric
-        self._slopes = None if known is None else known.slopes
+        photometric = None if calibration is None else calibration.photometric
+        self._slopes = None if calibration is None else calibration.slopes
         self._errors = None if photometric is None else photometric.errors()
-        self._rest: tuple[Untouched, Rest] | None = None
 
     def process(
         self,
@@ -51,8 +47,5 @@ class SurfaceNormals(Stage):
             return Absent("no_calibration")
         if not contact_mask.any():
             return Absent("no_contact")
-        if self._rest is None or self._rest[0] is not untouched:
-            self._rest = untouched, Rest(untouched)
-        return Surface(self._slopes, scale, self._errors).normals(
-            unmarked, self._rest[1], contact_mask, gradients
-        )
+        rest = self.once(Rest, untouched)
+        return Surface(self._slopes, scale, self._errors).normals(unmarked, rest, contact_mask, gradients)

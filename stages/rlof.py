@@ -61,7 +61,9 @@ class Rlof(Stage):
         """Position and status of every dot of the first frame."""
         params, gray = self.params, to_gray(image)
         if self._tracker is None:
-            found = detect_markers(image, dot_radius=params.dot, polarity=params.polarity, valid=valid)
+            found = self.once(
+                detect_markers, image, dot_radius=params.dot, polarity=params.polarity, valid=valid
+            )
             self._settings = cv2.optflow.RLOFOpticalFlowParameter.create()
             self._settings.setSupportRegionType(cv2.optflow.SR_FIXED)
             self._settings.setLargeWinSize(params.window or max(9, 2 * round(2 * found.dot_radius) + 1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 from tactflow.calibration.file import UNLIKE, UNLIKE_KIND, Calibration
 from tactflow.engine.contract import Stage, StageParams
@@ -32,31 +31,29 @@ class Scale(Stage):
 
     memory = "pure"
 
-    def __init__(self, params: StageParams, calibration: Path | None = None) -> None:
-        """Prepare. calibration : the file."""
+    def __init__(self, params: StageParams, calibration: Calibration | None = None) -> None:
+        """Prepare. calibration : of the sensor."""
         super().__init__(params)
-        self._calibration = None if calibration is None else Calibration.load(calibration)
-        self._recorded = calibration is not None and calibration.suffix == ".mcap"
-        self._checked: Untouched | None = None
-        self._scale: MillimetresPerPixel | None = None
+        self._calibration = calibration
+        self._is_described = False
 
     def process(
         self, untouched: Untouched, mapping: PixelMapping | None = None
     ) -> MillimetresPerPixel | Absent:
         """The scale, or Absent("no_calibration")."""
-        if self._calibration is not None and self._checked is not untouched:
-            mapping = mapping or PixelMapping.identity((untouched.shape[1], untouched.shape[0]))
-            self._scale = self._fitting(self._calibration, untouched, mapping)
-            self._checked = untouched
-        return Absent("no_calibration") if self._scale is None else self._scale
+        if self._calibration is None:
+            return Absent("no_calibration")
+        scale = self.once(self._fitting, self._calibration, untouched, mapping)
+        return Absent("no_calibration") if scale is None else scale
 
     def _fitting(
-        self, calibration: Calibration, untouched: Untouched, mapping: PixelMapping
+        self, calibration: Calibration, untouched: Untouched, mapping: PixelMapping | None
     ) -> MillimetresPerPixel | None:
         """The scale for a new reference; None where a calibration that nobody chose does not fit."""
-        kind, first = calibration.kind, self._checked is None
+        kind, first, self._is_described = calibration.kind, not self._is_described, True
+        size = untouched.shape[1], untouched.shape[0]
         unlike = 100 * calibration.unlikeness(untouched)
-        misfit = calibration.misfit(mapping)
+        misfit = calibration.misfit(mapping or PixelMapping.identity(size))
         if misfit is None and kind is not None and unlike > 100 * UNLIKE_KIND:
             measured, limit = distinct(unlike, 100 * UNLIKE_KIND)
             misfit = (
@@ -65,7 +62,7 @@ class Scale(Stage):
                 "something touches it"
             )
         if misfit is not None:
-            if not (self._recorded or kind):
+            if not (calibration.recorded or kind):
                 raise StageError(f"{misfit}; use the pipeline that it was made with, or calibrate anew")
             if first:
                 which = "in the recording" if kind is None else f"of a {kind}"
@@ -79,7 +76,7 @@ class Scale(Stage):
             )
         elif kind is not None and first:
             _describe_default(calibration)
-        return calibration.scale_at((untouched.shape[1], untouched.shape[0]))
+        return calibration.scale_at(size)
 
 
 def _describe_default(calibration: Calibration) -> None:

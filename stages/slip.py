@@ -7,7 +7,6 @@ from typing import NamedTuple
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import ContactMask, MarkerMask, Slipping, Touching, Unmarked, Untouched
-from tactflow.vision.arrays import ColorImage
 from tactflow.vision.flow import DisplacementField, SlipTracker
 from tactflow.vision.flow.registration import cells, light_change
 from tactflow.vision.types import Slip
@@ -36,7 +35,6 @@ class SlipStage(Stage):
 
     def __init__(self, params: StageParams) -> None:
         super().__init__(params)
-        self._rest: tuple[Untouched, ColorImage] | None = None
         self._tracker = SlipTracker()
 
     def reset(self) -> None:
@@ -57,8 +55,6 @@ class SlipStage(Stage):
         if not touching or field is None:
             self._tracker.reset()
             return SlipPorts(False, None)
-        if self._rest is None or self._rest[0] is not untouched:
-            self._rest = untouched, cells(untouched)
-        change = light_change(unmarked, self._rest[1], marker_mask)
+        change = light_change(unmarked, self.once(cells, untouched), marker_mask)
         slip = self._tracker(frame.seq, frame.t, change, field, contact_mask)
         return SlipPorts(slip is not None and slip.slipping, slip)

@@ -55,8 +55,9 @@ class Tracker(Stage):
         """
         if self._tracker is None:
             self._valid = valid
-            self._detection = detect_markers(
-                image, dot_radius=self.params.dot, polarity=self.params.polarity, valid=valid
+            params = self.params
+            self._detection = self.once(
+                detect_markers, image, dot_radius=params.dot, polarity=params.polarity, valid=valid
             )
             self._references = [image]
             self._tracker = self._tracker_of(self._detection)

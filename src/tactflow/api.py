@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tactflow.config.load import load_pipeline
 from tactflow.config.overrides import Override, from_settings
-from tactflow.config.recorded import with_recorded_calibration
+from tactflow.config.recorded import read_calibration, with_recorded_calibration
 from tactflow.config.registry import resolve
 from tactflow.config.shipped import find_pipeline
 from tactflow.config.validation import validated
@@ -177,13 +177,14 @@ def run(
 def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
     """A run of a pipeline; loops are compiled, and OpenCV has the threads that the pipeline sets.
 
-    options : passed to `Runner`.
+    options : passed to `Runner`. Raises ConfigError if the calibration cannot be read.
     """
     _warn_of_opencv()
     compiled.load()
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
-    return Runner(with_recorded_calibration(pipeline), **options)
+    pipeline = with_recorded_calibration(pipeline)
+    return Runner(pipeline, offered={"calibration": read_calibration(pipeline)}, **options)
 
 
 @cache

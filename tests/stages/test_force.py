@@ -45,7 +45,7 @@ def stage(folder: Path, press: LinearForceEntry, drag: LinearForceEntry | None =
         force=force,
     )
     made.save(folder / "main.yaml")
-    return Force(StageParams(), folder / "main.yaml")
+    return Force(StageParams(), Calibration.load(folder / "main.yaml"))
 
 
 def test_the_force_is_linear_in_what_is_seen_with_its_error(tmp_path: Path) -> None:

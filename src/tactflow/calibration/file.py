@@ -165,6 +165,7 @@ class Calibration(_Entry):
     darkness : depth from darkening, for gels in white light. force : from contacts. None if not known.
     kind : of sensor that it is the default of, for frames of the same shape and any size; else None.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
+    recorded : whether it comes from a recording, which was made with it.
     information : (114, 114) float64, `Photometry.information`, to refine it for another sensor; None without
     slopes.
     """
@@ -185,6 +186,7 @@ class Calibration(_Entry):
     darkness: DarknessEntry | None = None
     force: ForceEntry | None = None
     look: NDArray[np.float32] = Field(exclude=True, repr=False)
+    recorded: bool = Field(False, exclude=True, repr=False)
     slopes: SlopeModel | None = Field(None, exclude=True, repr=False)
     information: NDArray[np.float64] | None = Field(None, exclude=True, repr=False)
 
@@ -241,7 +243,8 @@ class Calibration(_Entry):
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
             information = _symmetric(arrays["information"]) if "information" in arrays else None
             look = arrays["look"].astype(np.float32)
-            loaded = cls(**document, look=look, slopes=slopes, information=information)
+            recorded = path.suffix == ".mcap"
+            loaded = cls(**document, look=look, slopes=slopes, information=information, recorded=recorded)
             if (slopes is None) != (loaded.photometric is None):
                 raise ValueError("its .npz is of another file")
             if loaded.darkness is not None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,8 +17,8 @@ from tactflow.config.registry import Section, code_place, resolve
 from tactflow.config.shipped import is_packaged
 from tactflow.config.validation import validate
 from tactflow.config.wiring import Draft
-from tactflow.engine.conformance import configured, declares
-from tactflow.engine.contract import Part, StageParams
+from tactflow.engine.conformance import accepts, configured, declares
+from tactflow.engine.contract import StageParams
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Node, OnError, Pipeline
 from tactflow.engine.plan import plan_problem
@@ -276,12 +275,7 @@ def _warnings(document: Document, drafts: Sequence[Draft]) -> list[str]:
     if not any(draft.section == "sinks" for draft in drafts):
         warnings.append(f"{document.mark('sinks')}  there are no sinks, so nothing will be computed")
     users = (draft.component.make for draft in drafts if draft.component)
-    if document.get("calibration") and not any(map(_takes_calibration, users)):
+    if document.get("calibration") and not any(accepts(make, "calibration") for make in users):
         mark = document.mark("calibration")
         warnings.append(f"{mark}  calibration: no stage uses it; add untouched, scale and depth")
     return warnings
-
-
-def _takes_calibration(make: Callable[..., Part]) -> bool:
-    """Whether the constructor of a stage takes the calibration."""
-    return "calibration" in inspect.signature(make).parameters

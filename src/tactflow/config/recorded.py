@@ -1,13 +1,18 @@
-"""The calibration that a recording was made with, for a pipeline that plays it."""
+"""The calibration of a run: the one that the pipeline names, or that its recording was made with."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from tactflow.calibration import KINDS
+from tactflow.engine.conformance import accepts
 from tactflow.engine.errors import SourceError
 from tactflow.engine.graph import Pipeline
+
+if TYPE_CHECKING:
+    from tactflow.calibration.file import Calibration
 
 
 def with_recorded_calibration(pipeline: Pipeline) -> Pipeline:
@@ -35,3 +40,16 @@ def with_recorded_calibration(pipeline: Pipeline) -> Pipeline:
         stored_text(path)
         return replace(pipeline, calibration=path)
     return pipeline
+
+
+def read_calibration(pipeline: Pipeline) -> Calibration | None:
+    """The calibration, read once for all stages; None if the pipeline names none, or no stage uses it.
+
+    Raises ConfigError if it cannot be read.
+    """
+    users = [node for node in pipeline.nodes.values() if accepts(node.component.make, "calibration")]
+    if pipeline.calibration is None or not users:
+        return None
+    from tactflow.calibration.file import Calibration
+
+    return Calibration.load(pipeline.calibration)

@@ -62,6 +62,11 @@ def configured(component: Component, params: StageParams) -> Component:
     return replace(component, ports=Ports(declared.inputs, declared.outputs), memory=declared.memory)
 
 
+def accepts(make: Callable[..., Part], argument: str) -> bool:
+    """Whether the constructor of a part takes an argument."""
+    return argument in inspect.signature(make).parameters
+
+
 def build(make: Callable[..., Part], params: StageParams, offered: Mapping[str, Any]) -> Part:
     """Construct a part of a pipeline with the arguments that its constructor takes.
 

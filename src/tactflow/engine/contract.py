@@ -10,7 +10,7 @@ engine. A constructor may also take, by name:
     directory : Path          folder of the pipeline file, for relative paths
     skipping : bool           whether the run may skip work
     control : Control         handle on the run, see `tactflow.engine.control`
-    calibration : Path | None the sensor's calibration file, if the pipeline names one
+    calibration : Calibration | None, the sensor's, read once for all parts; None if the pipeline names none
 
 In each run, `open()` is called once before the first frame, and `close()` once at the end for every part
 whose `open()` was started, even after an error. `begin()` of a sink follows when all parts are open.
@@ -19,12 +19,14 @@ whose `open()` was started, even after an error. `begin()` of a sink follows whe
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict
 
 from tactflow.engine.frame import Frame
+from tactflow.engine.once import Once
 from tactflow.engine.ports import Port
 
 Memory = Literal["pure", "stateful"]
@@ -140,6 +142,14 @@ class Stage(Part):
     """The reason for requesting a new reference, in snake_case, or None. `process` sets it on `self`; the
     engine clears it and makes a frame the reference of a new epoch, which resets all stages: the next frame
     if all stages are in one segment, as by default; else the source is asked to retake."""
+
+    @cached_property
+    def once(self) -> Once:
+        """Keeps what depends on the reference or on settings alone, for all stages of a run.
+
+        `rest = self.once(Rest, untouched)` computes `Rest(untouched)` when there is another `untouched`.
+        """
+        return Once()
 
     process: Callable[..., Any]
     """Computes the outputs of a frame, see above."""

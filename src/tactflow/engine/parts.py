@@ -4,36 +4,42 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 from tactflow.engine.conformance import build
-from tactflow.engine.contract import Part, Source
+from tactflow.engine.contract import Part, Source, Stage
 from tactflow.engine.control import Control
 from tactflow.engine.errors import SourceError, StageError, TactflowError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.engine.node import UNCONNECTED, RunningNode, Slots
+from tactflow.engine.once import Once
 
 
 class Parts:
     """The open parts of a run.
 
-    control : handed to parts that ask for it. check : as in `Runner`.
+    control : handed to parts that ask for it. offered : further arguments of constructors, by name. check :
+    as in `Runner`.
 
     Attributes
     ----------
     source : once it is open. nodes : id -> open stage or sink. slots : of the outputs of all nodes.
     """
 
-    def __init__(self, pipeline: Pipeline, control: Control, *, check: bool) -> None:
+    def __init__(
+        self, pipeline: Pipeline, control: Control, offered: Mapping[str, Any], *, check: bool
+    ) -> None:
         self._pipeline = pipeline
         self._check = check
+        self._once = Once()
         self._offered = {
+            **offered,
             "sensor": pipeline.sensor,
             "directory": pipeline.directory,
             "skipping": pipeline.skipping,
             "control": control,
-            "calibration": pipeline.calibration,
         }
         self._opened: list[tuple[str, Part]] = []
         self.source: Source | None = None
@@ -72,6 +78,8 @@ class Parts:
         with _located(node, kind):
             part = build(node.component.make, node.params, self._offered)
             self._opened.append((node.id, part))
+            if isinstance(part, Stage):
+                part.once = self._once
             part.open()
         return part
 

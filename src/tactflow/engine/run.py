@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from tactflow.engine.capturing import Capturing
@@ -46,7 +47,8 @@ class Runner:
     """One run of a pipeline. Its interface for sinks is documented in `tactflow.engine.control.Control`.
 
     pipeline : validated. max_frames : stop after this number of captured frames. check : check values against
-    their port types, and pass read-only inputs.
+    their port types, and pass read-only inputs. offered : further arguments that constructors of parts may
+    take by name.
 
     Attributes
     ----------
@@ -58,14 +60,21 @@ class Runner:
         If the pipeline cannot be planned, or `max_frames` is less than 1. Nothing was started.
     """
 
-    def __init__(self, pipeline: Pipeline, *, max_frames: int | None = None, check: bool = False) -> None:
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        *,
+        max_frames: int | None = None,
+        check: bool = False,
+        offered: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
         if max_frames is not None and max_frames < 1:
             raise ConfigError(f"max_frames: required a whole number from 1, got {max_frames}")
         self.pipeline = pipeline
         self.max_frames = max_frames
         self.plan: Plan = make_plan(pipeline)
         self._ending = Ending(self._wake)
-        self._parts = Parts(pipeline, self, check=check)
+        self._parts = Parts(pipeline, self, offered, check=check)
         self._capturing = Capturing(pipeline.source, self._parts.slots, self._ending, max_frames)
         self._threads = Threads(self._ending, self.retake_reference)
         self._began = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal
@@ -63,6 +64,7 @@ def find_dot(
     radius: float | None = None,
     polarity: Literal["dark", "bright", "auto"] = "auto",
     valid: Bytes | None = None,
+    detect: Callable[..., Detection] = detect_markers,
 ) -> Dot | None:
     """Estimate size, polarity and contrast of the markers from a picture of the untouched gel.
 
@@ -72,6 +74,7 @@ def find_dot(
     radius : of a marker, px, if it is known.
     polarity : of the markers; "auto" takes the better lattice.
     valid : (H, W) uint8, non-zero where there is gel; None: everywhere.
+    detect : called like `detect_markers`; may return what it has found in this picture before.
 
     Returns
     -------
@@ -85,7 +88,7 @@ def find_dot(
     'dark'
     """
     try:
-        found = detect_markers(image, dot_radius=radius, polarity=polarity, valid=valid)
+        found = detect(image, dot_radius=radius, polarity=polarity, valid=valid)
     except NoMarkersError:
         return None
     contrast = np.median(_contrast(_even(image), found.dot_radius, found.polarity), axis=2)
