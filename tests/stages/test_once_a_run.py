@@ -10,8 +10,6 @@ import tactflow
 from tactflow.calibration.file import Calibration
 from tactflow.vision.markers import detection
 
-QUIET = {"sinks": {}}
-
 
 def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> list[str]:
     """The calls of a function from now on."""
@@ -38,11 +36,14 @@ def test_the_dots_of_the_reference_are_detected_once_for_the_mask_and_the_tracke
 
 def test_the_calibration_is_read_once_for_all_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = counted(monkeypatch, Calibration, "load")
-    settings = {"stages.normals": {}, "stages.force": {}, **QUIET}
+    settings = {"stages.normals": {}, "stages.force": {}}
     pipeline = tactflow.load("mini", source="sim:idle?frames=2", settings=settings)
     assert {"scale", "depth", "normals", "force"} <= set(pipeline.nodes)
-    tactflow.run(pipeline)
+    assert len(list(tactflow.stream(pipeline))) == 2
     assert calls == ["load"]
-    calls.clear()
-    tactflow.run("markerless", source="sim:unmarked?frames=2", settings=QUIET)
+
+
+def test_a_calibration_that_no_sink_needs_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = counted(monkeypatch, Calibration, "load")
+    tactflow.run("mini", source="sim:idle?frames=2", settings={"sinks": {}})
     assert calls == []

@@ -10,6 +10,7 @@ from tactflow.calibration import KINDS
 from tactflow.engine.conformance import accepts
 from tactflow.engine.errors import SourceError
 from tactflow.engine.graph import Pipeline
+from tactflow.engine.plan import make_plan
 
 if TYPE_CHECKING:
     from tactflow.calibration.file import Calibration
@@ -47,8 +48,11 @@ def read_calibration(pipeline: Pipeline) -> Calibration | None:
 
     Raises ConfigError if it cannot be read.
     """
+    if pipeline.calibration is None:
+        return None
+    pruned = {node.id for node in make_plan(pipeline).pruned}
     users = [node for node in pipeline.nodes.values() if accepts(node.component.make, "calibration")]
-    if pipeline.calibration is None or not users:
+    if all(node.id in pruned for node in users):
         return None
     from tactflow.calibration.file import Calibration
 
