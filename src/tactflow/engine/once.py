@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, ParamSpec, TypeVar
 
@@ -33,20 +32,24 @@ class Once:
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._kept: dict[Hashable, deque[tuple[Sequence[Any], Any]]] = {}
+        self._kept: dict[Hashable, Sequence[tuple[Sequence[Any], Any]]] = {}
 
     def __call__(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """The result of `function(*args, **kwargs)`."""
-        given = (*args, *sorted(kwargs.items()))
+        given = (*args, *sorted(kwargs.items())) if kwargs else args
+        for earlier, result in self._kept.get(function, ()):
+            if _are_same(earlier, given):
+                found: T = result
+                return found
         # Held while it computes, so that two stages never compute the same.
         with self._lock:
-            kept = self._kept.setdefault(function, deque(maxlen=KEPT_RESULTS))
+            kept = self._kept.get(function, ())
             for earlier, result in kept:
-                if len(earlier) == len(given) and all(map(_is_same, earlier, given)):
-                    found: T = result
-                    return found
+                if _are_same(earlier, given):
+                    return result  # type: ignore[no-any-return]
             computed = function(*args, **kwargs)
-            kept.appendleft((given, computed))
+            # Replaced as a whole, so that it can be read without the lock.
+            self._kept[function] = ((given, computed), *kept)[:KEPT_RESULTS]
             return computed
 
     def keeping(self, function: Callable[P, T]) -> Callable[P, T]:
@@ -58,12 +61,22 @@ class Once:
         return call
 
 
-def _is_same(first: Any, second: Any) -> bool:
-    if first is second:
-        return True
-    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+def _are_same(first: Sequence[Any], second: Sequence[Any]) -> bool:
+    if len(first) != len(second):
+        return False
+    for one, other in zip(first, second, strict=True):
+        if one is not other and not _is_equal(one, other):
+            return False
+    return True
+
+
+def _is_equal(first: Any, second: Any) -> bool:
+    """Whether arguments that are not identical are equal."""
+    if type(first) is not type(second):
+        return False
+    if isinstance(first, np.ndarray):
         alike = first.shape == second.shape and first.dtype == second.dtype
         return alike and first.nbytes <= COMPARED_BYTES and first.tobytes() == second.tobytes()
-    if isinstance(first, tuple) and isinstance(second, tuple):
-        return len(first) == len(second) and all(map(_is_same, first, second))
-    return isinstance(first, str | float | int) and type(first) is type(second) and first == second
+    if isinstance(first, tuple):
+        return _are_same(first, second)
+    return isinstance(first, str | float | int) and first == second
