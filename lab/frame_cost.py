@@ -2,6 +2,7 @@
 
     python lab/frame_cost.py                        # this checkout
     python lab/frame_cost.py --against DIR          # DIR (old) and this checkout (new) in turns
+    python lab/frame_cost.py --scene press --pipeline classic    # the original script, for the README
 
 Each checkout needs its own `.venv`. The pipeline runs in one thread with a JSON Lines sink; reading the
 recording is not counted. Two checkouts take turns every 20 frames, and each frame is compared with the same
@@ -90,15 +91,15 @@ class Stopwatch:
         setattr(cls, method, call)
 
 
-def measure_frames(recording: Path, results: Path) -> list[Times]:
+def measure_frames(file: str, recording: Path, results: Path) -> list[Times]:
     """CPU times of each frame in the current checkout, ms, as `contact frame`, `idle tracker`, ..."""
     import tactflow
 
     settings: dict[str, Any] = {"sinks": {"jsonl": {"path": str(results), "segment": "capture"}}}
-    for node in tactflow.load("pipeline.yaml").nodes.values():
+    for node in tactflow.load(file).nodes.values():
         if node.component.kind == "stage":
             settings[f"stages.{node.id}.segment"] = "capture"
-    pipeline = tactflow.load("pipeline.yaml", source=str(recording), settings=settings)
+    pipeline = tactflow.load(file, source=str(recording), settings=settings)
     stopwatch = Stopwatch()
     for node in pipeline.nodes.values():
         method = {"source": "frames", "stage": "process", "sink": "write"}[node.component.kind]
@@ -118,13 +119,14 @@ def python(tree: Path, *arguments: str | Path) -> list[str]:
     return [str(tree / ".venv" / "bin" / "python"), *map(str, arguments)]
 
 
-def measure_scene(trees: dict[str, Path], recording: Path) -> Samples:
+def measure_scene(trees: dict[str, Path], file: str, recording: Path) -> Samples:
     """Run all checkouts on a recording, taking turns of `BLOCK` frames."""
     children: dict[str, Any] = {}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with tempfile.TemporaryDirectory() as folder:
         for name, tree in trees.items():
-            command = python(tree, Path(__file__).resolve(), "--child", recording, f"{folder}/{name}.jsonl")
+            child = ("--pipeline", file, "--child", recording, f"{folder}/{name}.jsonl")
+            command = python(tree, Path(__file__).resolve(), *child)
             children[name] = subprocess.Popen(command, cwd=tree, **pipes)
             children[name].stdout.readline()
         samples: Samples = {}
@@ -178,10 +180,11 @@ def main() -> None:
     parser.add_argument("--against", type=Path, metavar="DIR", help="the old checkout")
     parser.add_argument("--scene", action="append", metavar="NAME", help=f"default: {', '.join(SCENES)}")
     parser.add_argument("--turns", type=int, default=5, help="runs of each checkout (default: 5)")
+    parser.add_argument("--pipeline", default="pipeline.yaml", help="file or name (default: pipeline.yaml)")
     parser.add_argument("--child", type=Path, nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child is not None:
-        print(json.dumps(measure_frames(*args.child)))
+        print(json.dumps(measure_frames(args.pipeline, *args.child)))
         return
     trees = {"old": args.against.resolve()} if args.against else {}
     trees["new"] = ROOT
@@ -193,7 +196,7 @@ def main() -> None:
             recording = Path(folder) / f"{scene}.npy"
             command = ("sim", f"{scene}?frames={FRAMES}", "--out", recording)
             subprocess.run(python(ROOT, "-m", "tactflow", *command), capture_output=True, check=True)
-            print_rows(f"{scene}, ", [measure_scene(trees, recording) for _ in range(args.turns)])
+            print_rows(f"{scene}, ", [measure_scene(trees, args.pipeline, recording) for _ in range(args.turns)])
     print_rows("", [measure_start(trees) for _ in range(args.turns)])
 
 

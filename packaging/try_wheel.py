@@ -28,14 +28,15 @@ PATIENCE_S: Final = 1800
 
 
 def first_screen(readme: str) -> tuple[list[str], str]:
-    """Commands and program of the README's first screen, without the installation.
+    """Commands and program of the README's first screen, behind the installation.
 
     Returns
     -------
     commands : lines for a shell, in order, without comments.
     program : Python source.
     """
-    shell, program = re.findall(r"```(?:sh|python)\n(.*?)```", readme, re.DOTALL)[:2]
+    shell = re.findall(r"```sh\n(pip install \..*?)```", readme, re.DOTALL)[0]
+    program = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)[0]
     lines = [line.split("#")[0].strip() for line in shell.splitlines()]
     return [re.sub(r"frames=\d+", SHORT, line) for line in lines if line.startswith("tactflow ")], program
 
