@@ -2,7 +2,7 @@
 
     python lab/frame_cost.py                        # this checkout
     python lab/frame_cost.py --against DIR          # DIR (old) and this checkout (new) in turns
-    python lab/frame_cost.py --scene press --pipeline classic    # the original script, for the README
+    python lab/frame_cost.py --scene "press?light=bright" --pipeline classic    # for the README
 
 Each checkout needs its own `.venv`. The pipeline runs in one thread with a JSON Lines sink; reading the
 recording is not counted. Two checkouts take turns every 20 frames, and each frame is compared with the same
@@ -193,8 +193,9 @@ def main() -> None:
     print(f"{'median, ms':<32}" + "".join(f"{name:>10}" for name in trees) + "   ratio")
     with tempfile.TemporaryDirectory() as folder:
         for scene in args.scene or SCENES:
-            recording = Path(folder) / f"{scene}.npy"
-            command = ("sim", f"{scene}?frames={FRAMES}", "--out", recording)
+            recording = Path(folder) / f"{scene}.npy".replace("?", "-")
+            options = f"{'&' if '?' in scene else '?'}frames={FRAMES}"
+            command = ("sim", f"{scene}{options}", "--out", recording)
             subprocess.run(python(ROOT, "-m", "tactflow", *command), capture_output=True, check=True)
             print_rows(f"{scene}, ", [measure_scene(trees, args.pipeline, recording) for _ in range(args.turns)])
     print_rows("", [measure_start(trees) for _ in range(args.turns)])
