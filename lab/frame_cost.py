@@ -197,7 +197,8 @@ def main() -> None:
             options = f"{'&' if '?' in scene else '?'}frames={FRAMES}"
             command = ("sim", f"{scene}{options}", "--out", recording)
             subprocess.run(python(ROOT, "-m", "tactflow", *command), capture_output=True, check=True)
-            print_rows(f"{scene}, ", [measure_scene(trees, args.pipeline, recording) for _ in range(args.turns)])
+            turns = [measure_scene(trees, args.pipeline, recording) for _ in range(args.turns)]
+            print_rows(f"{scene}, ", turns)
     print_rows("", [measure_start(trees) for _ in range(args.turns)])
 
 
