@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tactflow.sim import Truth, open_scene
 from tactflow.tools.bench import score
@@ -155,3 +156,17 @@ def test_flow_is_compared_where_both_know_it_and_with_its_own_standard_error(
     score.add_flow(tally, None, truth)
     within = {"flow_within_one": 50, "flow_within_two": pytest.approx(75)}
     assert tally.errors() == {"flow_error": pytest.approx(0.5), "flow_rms": pytest.approx(0.5)} | within
+
+
+def test_a_field_is_compared_in_the_contact_alone(truth: Truth, tally: Tally) -> None:
+    class Shifted:
+        """The true field, off by (0.3, 0.4) px."""
+
+        def at(self, rest: NDArray[np.float64]) -> NDArray[np.float64]:
+            columns, rows = rest.astype(int).T
+            assert truth.contact_mask[rows, columns].all()
+            return truth.displacement(rest) + (0.3, 0.4)
+
+    score.add_field(tally, Shifted(), truth)  # type: ignore[arg-type]
+    score.add_field(tally, None, truth)
+    assert tally.errors() == {"field_rms": pytest.approx(0.5)}

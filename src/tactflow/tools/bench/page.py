@@ -44,6 +44,7 @@ FRONTS: Final = (
     (PIPELINE, "center_error"),
     (PIPELINE, "angle_mean"),
     (PIPELINE, "flow_error"),
+    (PIPELINE, "field_rms"),
     ("tracker", "displacement_rms"),
     ("tracker", "lost_percent"),
     ("marker_mask", "localisation_rms"),

@@ -88,6 +88,7 @@ _ALL = [
     Quantity("angle_invented", "round contacts with a direction", "%", slack=4.0),
     Quantity("flow_error", "mean flow of the gel in contact, error, mean", "px", slack=0.02),
     Quantity("flow_rms", "mean flow of the gel in contact, error, RMS", "px", rms, slack=0.02),
+    Quantity("field_rms", "displacement field in contact, error, RMS", "px", rms, slack=0.02),
     Quantity("flow_within_one", "mean-flow errors within one stderr", "%", MEAN, 68.0, slack=15.0),
     Quantity("flow_within_two", "mean-flow errors within two stderr", "%", MEAN, 95.0, slack=5.0),
     Quantity("false_contacts", "idle frames called contact", "%"),

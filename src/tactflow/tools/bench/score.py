@@ -11,11 +11,15 @@ from tactflow.tools.bench import metrics
 from tactflow.tools.bench.lockstep import TimedResult
 from tactflow.tools.bench.quantities import Tally
 from tactflow.tools.bench.scenes import Rendered
+from tactflow.vision.flow import DisplacementField
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
 
 DIRECTED = 2.0
 """Minimum ratio of the axes of a contact whose direction is judged. Chosen by hand."""
+
+_FIELD_POINTS = 100
+"""Places at which a displacement field is compared."""
 
 _ROUND = 100
 """Minimum number of pixels of a contact whose roundness is judged. Chosen by hand."""
@@ -82,6 +86,17 @@ def add_flow(tally: Tally, flow: Flow | None, truth: Truth) -> None:
     tally.add(flow_error=error, flow_rms=error)
     if flow.stderr is not None and min(flow.stderr) > 0:
         tally.within("flow", np.subtract(flow.mean, truth.contact_flow), flow.stderr)
+
+
+def add_field(tally: Tally, field: DisplacementField | None, truth: Truth) -> None:
+    """Compare the displacement field where the gel is in contact, at up to `_FIELD_POINTS` places."""
+    rows, columns = np.nonzero(truth.contact_mask)
+    if field is None or not len(rows):
+        return
+    chosen = np.unique(np.linspace(0, len(rows) - 1, _FIELD_POINTS).round().astype(np.int64))
+    points = np.column_stack([columns, rows])[chosen].astype(np.float64)
+    errors = field.at(points) - truth.displacement(points)
+    tally.add(field_rms=np.hypot(*errors.T))
 
 
 def add_detection(tally: Tally, points: NDArray[np.float64], truth: Truth) -> None:
@@ -169,4 +184,5 @@ class PipelineScore:
         if result.markers is not None:
             self._markers.add(result.markers, truth)
         add_flow(self.tally, result.flow, truth)
+        add_field(self.tally, result.field, truth)
         return "contact" if truth.touching else "idle"
