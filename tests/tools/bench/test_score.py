@@ -165,7 +165,7 @@ def test_a_field_is_compared_in_the_contact_alone(truth: Truth, tally: Tally) ->
         def at(self, rest: NDArray[np.float64]) -> NDArray[np.float64]:
             columns, rows = rest.astype(int).T
             assert truth.contact_mask[rows, columns].all()
-            return truth.displacement(rest) + (0.3, 0.4)
+            return truth.displacement(rest) + np.array([0.3, 0.4])
 
     score.add_field(tally, Shifted(), truth)  # type: ignore[arg-type]
     score.add_field(tally, None, truth)
