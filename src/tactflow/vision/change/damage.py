@@ -33,12 +33,16 @@ UNCORRELATED: Final = 0.6
 behind the sharpest lens, whose blur has a standard deviation of 0.7 px."""
 LAG: Final = 32
 """Largest displacement that is searched, px."""
-SHORTEST_LAG: Final = 2
-"""Smallest displacement that is damage, px; a camera that is shaken moves by less."""
+SHORTEST_LAG: Final = 4
+"""Smallest displacement that is damage, px: half a block of JPEG. A gel that is dragged as a whole moves by 2
+to 3 px on the recordings."""
+LEFT: Final = 3.0
+"""Largest squared residual of a displaced row, relative to that of noise: bytes are displaced by whole
+pixels, while a dragged gel, by any distance, leaves a residual at the edges of its dots."""
 BETTER: Final = 9.0
 """Ratio of the squared residuals without and with the displacement: three standard deviations of noise."""
 DISPLACED: Final = 6
-"""Minimum number of displaced rows: an eighth of the picture. On all recordings, sheared gels show 3."""
+"""Minimum number of displaced rows: an eighth of the picture."""
 LASTING: Final = 30
 """Number of successive displaced pictures after which this is how the camera delivers them."""
 SAMPLES: Final = 32
@@ -178,17 +182,25 @@ class DamageTest:
         lag = min(LAG, width // 8)
         # What is left after a displacement is at least the noise of both.
         least = np.float32(width * max(2 * self._reference.noise, 1 / 12))
-        still = np.square(now - before).sum(axis=1)
-        changed = still > np.float32(BETTER) * least
+        changed = np.square(now - before).sum(axis=1) > np.float32(BETTER) * least
         if lag < SHORTEST_LAG or np.count_nonzero(changed) < DISPLACED:
             return False
-        now, before, still = now[changed], before[changed], still[changed]
+        now, before = now[changed], before[changed]
         size = fft.next_fast_len(width + lag, real=True)
         spectra = fft.rfft(now, size, axis=1) * np.conj(fft.rfft(before, size, axis=1))
         products = fft.irfft(spectra, size, axis=1)[:, np.arange(-lag, lag + 1)]
-        moved = np.abs(products.argmax(axis=1) - lag) >= SHORTEST_LAG
-        left = still - 2 * (products.max(axis=1) - products[:, lag])
-        return bool(np.count_nonzero(moved & (still > BETTER * np.maximum(left, least / 2))) >= DISPLACED)
+        best = products.argmax(axis=1) - lag
+        shifts, counts = np.unique(best[np.abs(best) >= SHORTEST_LAG], return_counts=True)
+        inner = slice(lag, width - lag)
+        for shift in shifts[counts >= DISPLACED]:
+            rows_there = best == shift
+            there = before[rows_there, lag - shift : width - lag - shift]
+            left = np.square(now[rows_there, inner] - there).mean(axis=1)
+            still = np.square(now[rows_there, inner] - before[rows_there, inner]).mean(axis=1)
+            exact = (left < LEFT * least / width) & (still > BETTER * left)
+            if np.count_nonzero(exact) >= DISPLACED:
+                return True
+        return False
 
 
 def _places(length: int, number: int) -> NDArray[np.intp]:
