@@ -13,6 +13,10 @@ START: Final = Command(
 BENCH: Final = Command(
     "measure run time against error, per method and for whole pipelines", "tactflow.tools.bench.command"
 )
+STRESS: Final = Command(
+    "measure numerical stability: perturbed, turned and degenerate pictures, long runs, other arithmetic",
+    "tactflow.tools.stress.command",
+)
 BATCH: Final = Command(
     "run a pipeline over many recordings; a second call does what is missing", "tactflow.tools.batch.command"
 )

@@ -138,6 +138,11 @@ def kernel(signature: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     return wrap
 
 
+def kernels() -> list[Kernel[..., Any]]:
+    """The kernels of all imported modules."""
+    return list(_kernels)
+
+
 def load() -> tuple[int, int]:
     """Compile the kernels of all imported modules, or read them from disk.
 

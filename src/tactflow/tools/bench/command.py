@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     if args.recording is not None and not args.recording.exists():
         raise ConfigError(f"--recording {args.recording}: there is no such file")
     scenes = frozenset(args.scene) if args.scene else None
-    files = _files(args.pipelines)
+    files = pipeline_files(args.pipelines)
     with notes("ERROR"), progress_bar("rendering") as update:
         result = run_bench(
             files,
@@ -101,7 +101,7 @@ def packaged_files() -> dict[str, Path]:
     return {name: find_pipeline(f"pipelines/{name}.yaml") for name in (DEFAULT, CLASSIC, MARKERLESS)}
 
 
-def _files(words: list[str]) -> dict[str, Path]:
+def pipeline_files(words: list[str]) -> dict[str, Path]:
     """The packaged pipelines, `./pipeline.yaml` where it differs, and those on the command line."""
     files = packaged_files()
     local = Path("pipeline.yaml")

@@ -1,0 +1,112 @@
+"""Short recordings whose truth is known, and what results on them are compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.message.result import Result
+from tactflow.sim import Scene, Truth, open_scene
+from tactflow.tools.bench.quantities import Tally
+from tactflow.tools.bench.scenes import Case
+from tactflow.tools.bench.score import MarkerScore, add_decision, add_flow, add_geometry
+from tactflow.vision.geometry import PixelMapping, Preprocessor
+
+Image = NDArray[np.uint8]
+Matrix = NDArray[np.float64]
+
+DEEP: Final = 0.5
+"""Share of its full depth from which a contact must be found, as in the bench."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames of a simulated scene at the size of processed frames, and where the truth about them lies.
+
+    scene : of the simulator. indices : its frames. frames : (H, W, 3) uint8 each; the first is the reference.
+    matrices : (3, 3) for each frame, from the pixels of the plain clip to those of this one.
+    """
+
+    scene: Scene
+    indices: tuple[int, ...]
+    frames: tuple[Image, ...]
+    mapping: PixelMapping
+    matrices: tuple[Matrix, ...]
+
+    def truth(self, number: int) -> tuple[Truth, bool]:
+        """The truth about a frame, and whether its contact must be found."""
+        height, width = self.frames[number].shape[:2]
+        matrix = self.matrices[number] @ self.mapping.matrix
+        index = self.indices[number]
+        deep = any(p.depth >= DEEP * p.shape.depth - 1e-9 for p in self.scene.presses(index))
+        return _truth(self.scene, index, (width, height), matrix.tobytes()), deep
+
+    def changed(self, frames: list[Image], matrices: list[Matrix] | None = None) -> Clip:
+        """The same clip with other pictures."""
+        return replace(self, frames=tuple(frames), matrices=tuple(matrices or self.matrices))
+
+    def kept(self, numbers: list[int]) -> Clip:
+        """Some frames of the clip."""
+        return replace(
+            self,
+            indices=tuple(self.indices[number] for number in numbers),
+            frames=tuple(self.frames[number] for number in numbers),
+            matrices=tuple(self.matrices[number] for number in numbers),
+        )
+
+    @property
+    def deepest(self) -> int:
+        """The frame with the deepest contact."""
+        return max(range(len(self.frames)), key=lambda number: self.truth(number)[0].depth)
+
+    def score(self, results: list[Result]) -> dict[str, float]:
+        """Key of the bench's quantities -> error, over all frames but the reference."""
+        tally = Tally()
+        dots = MarkerScore(tally)
+        for result in results:
+            truth, deep = self.truth(result.seq)
+            if result.markers is not None:
+                dots.add(result.markers, truth)
+            if result.seq == 0:
+                continue
+            if add_decision(tally, result.contact is not None, truth, deep) and result.contact is not None:
+                add_geometry(tally, result.contact, truth)
+            add_flow(tally, result.flow, truth)
+        return tally.errors()
+
+
+@lru_cache(maxsize=4096)
+def _truth(scene: Scene, index: int, size: tuple[int, int], matrix: bytes) -> Truth:
+    """Computed once for a frame and a mapping, and shared by all pipelines and perturbations."""
+    mapping = PixelMapping(scene.size, size, np.frombuffer(matrix).reshape(3, 3))
+    return scene.truth(index, mapping)
+
+
+@lru_cache(maxsize=64)
+def clip(case: Case, step: int = 1) -> Clip:
+    """Every `step`-th frame of a case, halved to 400 x 300 px."""
+    scene = open_scene(f"{case.name}?frames={case.frames}&{case.query}".rstrip("&"))
+    small = Preprocessor(scene.size, downsample=2)
+    indices = tuple(range(0, case.frames, step))
+    frames = []
+    for index in indices:
+        frames.append(np.ascontiguousarray(small(scene.frame(index))))
+        frames[-1].flags.writeable = False
+    eye = np.eye(3)
+    return Clip(scene, indices, tuple(frames), small.mapping, (eye,) * len(frames))
+
+
+@lru_cache(maxsize=8)
+def clean(case: Case, step: int, number: int, *, dots: bool) -> NDArray[np.float64]:
+    """A frame of a clip without noise, (H, W, 3) float64. dots : with its markers."""
+    query = f"{case.name}?frames={case.frames}&{case.query}".rstrip("&")
+    scene = open_scene(f"{query}&noise=0" if dots else query)
+    index = number * step
+    picture = scene.frame(index) if dots else scene.clean(index)
+    half = (picture.shape[1] // 2, picture.shape[0] // 2)
+    return np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.float64)

@@ -1,0 +1,137 @@
+"""`tactflow stress`: numerical stability, measured."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+from tactflow.cli.options import refuse_output, writing
+from tactflow.engine.errors import ConfigError
+from tactflow.system.terminal import notes, progress_bar, say, show
+from tactflow.tools.bench.command import pipeline_files
+from tactflow.tools.bench.run import machine
+from tactflow.tools.stress.arithmetic import run_arithmetic
+from tactflow.tools.stress.conditioning import run_conditioning
+from tactflow.tools.stress.degenerate import run_degenerate
+from tactflow.tools.stress.endurance import FRAMES, run_endurance
+from tactflow.tools.stress.parts import Part
+from tactflow.tools.stress.perturbation import run_perturbation
+from tactflow.tools.stress.report import SCHEMA, Report, lines, save_picture, stress_page
+from tactflow.tools.stress.same import Answers, load_answers, run_same
+from tactflow.tools.stress.subjects import stage_components, subjects
+
+BROKEN: Final = 3
+"""Exit code when a promise is broken."""
+PARTS: Final = ("arithmetic", "perturbation", "conditioning", "degenerate", "long", "same")
+"""Names of the parts, in the order in which they run."""
+ONLY_FULL: Final = frozenset({"arithmetic"})
+"""Parts that a quick run leaves out: to compile all loops a second time takes longer than all the rest."""
+PICTURE_OF: Final = "default, press"
+"""Curves in the picture of the docs."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `stress`."""
+    add = parser.add_argument
+    add(
+        "pipelines",
+        nargs="*",
+        metavar="PIPELINE",
+        help="also stress these, besides the packaged ones and ./pipeline.yaml if it exists",
+    )
+    add("--quick", action="store_true", help="a few cases of each part, half a minute")
+    add(
+        "--part",
+        action="append",
+        choices=PARTS,
+        metavar="PART",
+        help=f"only this part, repeatable: {', '.join(PARTS)}",
+    )
+    add(
+        "--frames",
+        type=int,
+        metavar="N",
+        help=f"length of the long run (default: {FRAMES:,}, with --quick 2,000)",
+    )
+    add("--seed", type=int, default=1, metavar="N", help="of everything at random (default: 1)")
+    add(
+        "--json",
+        type=Path,
+        default=Path("stress.json"),
+        metavar="PATH",
+        help="write every number here, as JSON (default: stress.json)",
+    )
+    add(
+        "--page",
+        type=Path,
+        default=Path("stress.html"),
+        metavar="PATH",
+        help="write the page here (default: stress.html)",
+    )
+    add("--picture", type=Path, metavar="PATH", help="write the picture of the documentation here, PNG")
+    add(
+        "--against",
+        type=Path,
+        metavar="FILE",
+        help="compare the answers with those of another --json: of another OpenCV, or another machine",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the tables, write the page; returns the exit code."""
+    if args.frames is not None and args.frames < 1:
+        raise ConfigError(f"--frames: required a number of frames, 1 or more, got {args.frames}")
+    stored = None if args.against is None else load_answers(args.against, SCHEMA)
+    for option, path in (("--json", args.json), ("--page", args.page), ("--picture", args.picture)):
+        if path is not None:
+            refuse_output(option, path, overwrite=True)
+    report = Report(quick=args.quick, machine=machine())
+    began = time.perf_counter()
+    parts = _parts(args, report, stored)
+    with notes("CRITICAL"), progress_bar("stress", total=len(parts)) as update:
+        for number, (name, measure) in enumerate(parts.items()):
+            update(description=name, completed=number)
+            start = time.perf_counter()
+            part = measure()
+            part.seconds = time.perf_counter() - start
+            report.parts.append(part)
+    report.wall_s = time.perf_counter() - began
+    show(lines(report))
+    for path in filter(None, (args.json, args.page, args.picture)):
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path is args.json:
+                report.save(path)
+            elif path is args.page:
+                path.write_text(stress_page(report), encoding="utf-8")
+            else:
+                save_picture(report, path, PICTURE_OF)
+        say(f"tactflow: wrote {path}")
+    say(f"tactflow: {report.summary}")
+    return BROKEN if report.broken else 0
+
+
+def _parts(
+    args: argparse.Namespace, report: Report, stored: Answers | None
+) -> Mapping[str, Callable[[], Part]]:
+    """Name -> function that measures it, of the parts that were asked for."""
+    who = subjects(pipeline_files(args.pipelines))
+    quick, seed = args.quick, args.seed
+
+    def same() -> Part:
+        part, report.answers = run_same(who, quick=quick, stored=stored)
+        return part
+
+    known: dict[str, Callable[[], Part]] = {
+        "arithmetic": lambda: run_arithmetic(who, quick=quick),
+        "perturbation": lambda: run_perturbation(who, quick=quick, seed=seed),
+        "conditioning": lambda: run_conditioning(who, quick=quick, seed=seed),
+        "degenerate": lambda: run_degenerate(who, stage_components()[0], quick=quick, seed=seed),
+        "long": lambda: run_endurance(who, quick=quick, length=args.frames),
+        "same": same,
+    }
+    chosen = args.part or [name for name in PARTS if not (quick and name in ONLY_FULL)]
+    return {name: known[name] for name in PARTS if name in chosen}

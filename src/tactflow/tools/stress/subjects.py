@@ -1,0 +1,122 @@
+"""What is stressed: the pipelines, and every stage that the registry knows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import tactflow
+from tactflow.config.registry import catalogue
+from tactflow.engine.errors import TactflowError
+from tactflow.engine.graph import Component, Pipeline
+from tactflow.message.result import Result
+from tactflow.tools.bench.lockstep import with_params
+from tactflow.tools.bench.results import CLASSIC
+
+Image = NDArray[np.uint8]
+
+UPRIGHT: Mapping[str, Any] = {
+    "rotate": 0,
+    "downsample": 1,
+    "crop": None,
+    "homography": None,
+    "undistort": None,
+}
+"""Parameters of a preprocess stage that leave the picture as it is: frames are given as processed ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A pipeline. name : in reports. file : of the pipeline. dots : whether it tracks dots."""
+
+    name: str
+    file: Path
+    dots: bool = True
+
+    @property
+    def reference(self) -> bool:
+        """Whether it is the classic script: measured beside the others, without promises."""
+        return self.name == CLASSIC
+
+    def load(self, frames: Any, **settings: Any) -> Pipeline:
+        """The pipeline on frames in memory, taken as they are.
+
+        settings : keys of the file, `a__b` for a.b.
+        """
+        values = {key.replace("__", "."): value for key, value in settings.items()}
+        pipeline = tactflow.load(self.file, source=frames, settings=values)
+        for id_, node in pipeline.nodes.items():
+            known = {key: value for key, value in UPRIGHT.items() if hasattr(node.params, key)}
+            if len(known) > 1:
+                pipeline = with_params(pipeline, id_, node.params.changed(**known))
+        return pipeline
+
+    def run(self, frames: Any, **settings: Any) -> list[Result]:
+        """Results of all frames, with every array that a stage has computed. TactflowError if it fails."""
+        return results(self.load(frames, **settings))
+
+
+def subjects(files: Mapping[str, Path]) -> list[Subject]:
+    """The pipelines of these files. files : name -> file."""
+    return [Subject(name, file, _tracks(file)) for name, file in files.items()]
+
+
+def _tracks(file: Path) -> bool:
+    nodes = tactflow.load(file).nodes.values()
+    return any(port.name == "markers" for node in nodes for port in node.component.ports.outputs)
+
+
+def results(pipeline: Pipeline, *, sinks: bool = False) -> list[Result]:
+    """Results of all frames of a loaded pipeline."""
+    return list(tactflow.stream(pipeline, images=True, sinks=sinks))
+
+
+def in_segments(pipeline: Pipeline) -> Pipeline:
+    """The same graph with every stage in a segment, and so a thread, of its own."""
+    nodes = {
+        id_: node if node.component.kind == "sink" else replace(node, segment=f"of-{id_}")
+        for id_, node in pipeline.nodes.items()
+    }
+    return replace(pipeline, nodes=nodes)
+
+
+def stage_components() -> tuple[list[Component], dict[str, str]]:
+    """Every stage of the registry that works with default parameters; name -> why another does not."""
+    usable, unusable = [], {}
+    for component in catalogue()[0]:
+        if component.kind != "stage":
+            continue
+        try:
+            tactflow.stage(component.name).close()
+        except TactflowError as error:
+            unusable[component.name] = str(error).splitlines()[0]
+        else:
+            usable.append(component)
+    return usable, unusable
+
+
+def swaps(pipeline: Pipeline, components: Sequence[Component]) -> Iterator[tuple[str, str]]:
+    """(id of a stage, name of another) for every other stage of the registry that fits in its place.
+
+    Another fits if it has the outputs that other nodes read, and no required input that the stage lacks.
+    """
+    for id_, node in pipeline.nodes.items():
+        if node.component.kind != "stage":
+            continue
+        read = {
+            ref.port
+            for other in pipeline.nodes.values()
+            for ref in [*other.inputs.values(), *(gate.signal for gate in other.gates)]
+            if ref is not None and ref.node == id_
+        }
+        offered = {port.name for port in node.component.ports.inputs}
+        for other in components:
+            outputs = {port.name for port in other.ports.outputs}
+            needed = {port.name for port in other.ports.inputs if not port.optional}
+            if other.cls is not node.component.cls and read and read <= outputs and needed <= offered:
+                yield id_, other.name
