@@ -87,8 +87,20 @@ def _truth(scene: Scene, index: int, size: tuple[int, int], matrix: bytes) -> Tr
     return scene.truth(index, mapping)
 
 
+MARKED: Final = (Case("bright_cable", 40), Case("press", 44), Case("jumps", 40))
+BARE: Final = (Case("unmarked", 44),)
+"""Scenes for pipelines that track dots, and for those that do not. Every method sees the first one."""
+STEP: Final = 2
+"""Every second frame: contacts that come and go within a few frames, and half the work."""
+
+
+def cases_for(*, dots: bool, count: int | None = None) -> tuple[Case, ...]:
+    """The first scenes for a pipeline that tracks dots or does not. count : None for all."""
+    return (MARKED if dots else BARE)[:count]
+
+
 @lru_cache(maxsize=64)
-def clip(case: Case, step: int = 1) -> Clip:
+def clip(case: Case, step: int = STEP) -> Clip:
     """Every `step`-th frame of a case, halved to 400 x 300 px."""
     scene = open_scene(f"{case.name}?frames={case.frames}&{case.query}".rstrip("&"))
     small = Preprocessor(scene.size, downsample=2)
@@ -102,11 +114,11 @@ def clip(case: Case, step: int = 1) -> Clip:
 
 
 @lru_cache(maxsize=8)
-def clean(case: Case, step: int, number: int, *, dots: bool) -> NDArray[np.float64]:
+def clean(case: Case, number: int, *, dots: bool) -> NDArray[np.float64]:
     """A frame of a clip without noise, (H, W, 3) float64. dots : with its markers."""
     query = f"{case.name}?frames={case.frames}&{case.query}".rstrip("&")
     scene = open_scene(f"{query}&noise=0" if dots else query)
-    index = number * step
+    index = number * STEP
     picture = scene.frame(index) if dots else scene.clean(index)
     half = (picture.shape[1] // 2, picture.shape[0] // 2)
     return np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.float64)

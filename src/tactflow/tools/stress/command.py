@@ -12,7 +12,7 @@ from tactflow.cli.options import refuse_output, writing
 from tactflow.engine.errors import ConfigError
 from tactflow.system.terminal import notes, progress_bar, say, show
 from tactflow.tools.bench.command import pipeline_files
-from tactflow.tools.bench.run import machine
+from tactflow.tools.bench.run import DEFAULT, machine
 from tactflow.tools.stress.arithmetic import run_arithmetic
 from tactflow.tools.stress.conditioning import run_conditioning
 from tactflow.tools.stress.degenerate import run_degenerate
@@ -21,14 +21,17 @@ from tactflow.tools.stress.parts import Part
 from tactflow.tools.stress.perturbation import run_perturbation
 from tactflow.tools.stress.report import SCHEMA, Report, lines, save_picture, stress_page
 from tactflow.tools.stress.same import Answers, load_answers, run_same
-from tactflow.tools.stress.subjects import stage_components, subjects
+from tactflow.tools.stress.subjects import Subject, stage_components, subjects, swapped
 
 BROKEN: Final = 3
 """Exit code when a promise is broken."""
-PARTS: Final = ("arithmetic", "perturbation", "conditioning", "degenerate", "long", "same")
+PARTS: Final = ("arithmetic", "perturbation", "conditioning", "swapped", "degenerate", "long", "same")
 """Names of the parts, in the order in which they run."""
-ONLY_FULL: Final = frozenset({"arithmetic"})
-"""Parts that a quick run leaves out: to compile all loops a second time takes longer than all the rest."""
+ONLY_FULL: Final = frozenset({"arithmetic", "swapped"})
+"""Parts that a quick run leaves out: to compile all loops a second time takes longer than all the rest, and
+there are many stages to swap in."""
+SWAPPED_UNDER: Final = ("noise", "displacement a frame")
+"""Perturbations of the pipelines with another stage."""
 PICTURE_OF: Final = "default, press"
 """Curves in the picture of the docs."""
 
@@ -54,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--frames",
         type=int,
         metavar="N",
-        help=f"length of the long run (default: {FRAMES:,}, with --quick 2,000)",
+        help=f"length of the long run (default: {FRAMES:,}, with --quick 1,000)",
     )
     add("--seed", type=int, default=1, metavar="N", help="of everything at random (default: 1)")
     add(
@@ -119,19 +122,42 @@ def _parts(
 ) -> Mapping[str, Callable[[], Part]]:
     """Name -> function that measures it, of the parts that were asked for."""
     who = subjects(pipeline_files(args.pipelines))
+    if args.quick:
+        # The script takes as long as all the others together.
+        who = [subject for subject in who if not subject.reference]
     quick, seed = args.quick, args.seed
 
     def same() -> Part:
         part, report.answers = run_same(who, quick=quick, stored=stored)
         return part
 
+    def others() -> Part:
+        return run_swapped([other for one in who if one.name == DEFAULT for other in swapped(one)], seed)
+
     known: dict[str, Callable[[], Part]] = {
         "arithmetic": lambda: run_arithmetic(who, quick=quick),
         "perturbation": lambda: run_perturbation(who, quick=quick, seed=seed),
         "conditioning": lambda: run_conditioning(who, quick=quick, seed=seed),
+        "swapped": others,
         "degenerate": lambda: run_degenerate(who, stage_components()[0], quick=quick, seed=seed),
         "long": lambda: run_endurance(who, quick=quick, length=args.frames),
         "same": same,
     }
     chosen = args.part or [name for name in PARTS if not (quick and name in ONLY_FULL)]
     return {name: known[name] for name in PARTS if name in chosen}
+
+
+def run_swapped(others: list[Subject], seed: int) -> Part:
+    """The default pipeline with another stage or method in the place of each of its own."""
+    perturbed = run_perturbation(others, quick=False, seed=seed, names=SWAPPED_UNDER)
+    turned = run_conditioning(others, quick=False, seed=seed, scenes=1)
+    part = Part(
+        "Other stages",
+        "The default pipeline with another registered stage, or another method, in the place of its "
+        "own. They are listed, without promises.",
+    )
+    part.trials = perturbed.trials + turned.trials
+    part.checks = turned.checks
+    part.listings = perturbed.listings + turned.listings
+    part.curves = perturbed.curves
+    return part

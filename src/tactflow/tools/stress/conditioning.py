@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import TactflowError
 from tactflow.message.result import Result
-from tactflow.tools.bench.scenes import Case
-from tactflow.tools.stress.clips import Clip, clip
+from tactflow.tools.stress.clips import Clip, cases_for, clip
 from tactflow.tools.stress.compare import add_differences, cells, heads, numbers
 from tactflow.tools.stress.parts import Listing, Part, Worst
 from tactflow.tools.stress.subjects import Subject
@@ -20,13 +19,12 @@ from tactflow.tools.stress.subjects import Subject
 Array = NDArray[Any]
 Matrix = NDArray[np.float64]
 
-PIXELS: Final = 12
+PIXELS: Final = 9
 """Pixels that are changed by a grey level, one in each run."""
 MARGIN: Final = 2
 """Border that is cut off so that a picture can be shifted without inventing pixels, px."""
-DOTS, BARE = (Case("press", 44), Case("bright_cable", 40)), (Case("unmarked", 44),)
-STEP: Final = 4
-"""Every fourth frame of the scenes."""
+SCENES: Final = 2
+"""Scenes that each pipeline is run on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,18 +61,21 @@ TURNS: Final[Mapping[str, Turn]] = {
 """Name -> change of all pictures. What is shifted is compared with the same inner part of the picture."""
 
 
-def run_conditioning(subjects: Sequence[Subject], *, quick: bool, seed: int = 1) -> Part:
-    """Every pipeline, with other stages in the place of its own as well, under changes that mean little."""
+def run_conditioning(
+    subjects: Sequence[Subject], *, quick: bool, seed: int = 1, scenes: int = SCENES
+) -> Part:
+    """Every pipeline under changes that mean little. scenes : on so many scenes only."""
     part = Part(
         "Conditioning",
         "The largest change of each number over all frames. One grey level in one pixel and one level of "
-        "dither change one frame; turning, mirroring, shifting and exchanging channels change the whole recording.",
+        "dither change one frame; turning, mirroring, shifting and exchanging channels "
+        "change the whole recording.",
     )
     rows = []
     for subject in subjects:
         worst = Worst(subject.name, reference=subject.reference)
-        for case in (DOTS if subject.dots else BARE)[: 1 if quick else None]:
-            whole = clip(case, STEP)
+        for case in cases_for(dots=subject.dots, count=1 if quick else scenes):
+            whole = clip(case)
             plain = whole.kept(list(range(whole.deepest + 1)))
             try:
                 for name, largest, frames in _changes(subject, plain, worst, quick=quick, seed=seed):

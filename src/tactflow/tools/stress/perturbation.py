@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import TactflowError
 from tactflow.tools.bench.quantities import QUANTITIES
 from tactflow.tools.bench.scenes import Case
-from tactflow.tools.stress.clips import Clip, Image, Matrix, clean, clip
+from tactflow.tools.stress.clips import Clip, Image, Matrix, cases_for, clean, clip
 from tactflow.tools.stress.parts import Curve, Listing, Part
 from tactflow.tools.stress.subjects import Subject
 
@@ -163,11 +163,9 @@ PERTURBATIONS: Final[Mapping[str, Perturbation]] = {
 }
 """Name -> perturbation."""
 
-QUICK: Final = ("noise", "blur", "occluded dots")
-DOTS, BARE = (Case("bright_cable", 40), Case("press", 44)), (Case("unmarked", 44),)
-"""Scenes for pipelines that track dots, and for those that do not. Every method sees the first one."""
-STEP: Final = 2
-"""Every second frame: faster contacts, and half the work."""
+QUICK: Final = ("noise", "occluded dots")
+SCENES: Final = 2
+"""Scenes that each pipeline is run on."""
 
 
 def noise_bound(case: Case, sigma: float, quantity: str) -> float | None:
@@ -178,11 +176,11 @@ def noise_bound(case: Case, sigma: float, quantity: str) -> float | None:
     the gradients of the noise-free frame with the deepest contact. None where the quantity has no bound.
     """
     variance = sigma**2 + 1 / 12
-    frames = clip(case, STEP)
+    frames = clip(case)
     number = frames.deepest
     truth = frames.truth(number)[0]
     if quantity == "displacement_rms":
-        picture = clean(case, STEP, number, dots=True)
+        picture = clean(case, number, dots=True)
         squares = []
         for x, y in truth.position[truth.visible]:
             region = (
@@ -191,7 +189,7 @@ def noise_bound(case: Case, sigma: float, quantity: str) -> float | None:
             squares.append(2 * _bound(picture, region, variance))
         return float(np.sqrt(np.mean(squares)))
     if quantity == "center_error":
-        change = clean(case, STEP, number, dots=False) - clean(case, STEP, 0, dots=False)
+        change = clean(case, number, dots=False) - clean(case, 0, dots=False)
         # The mean length of an error with two normal components, of the same variance each.
         return float(np.sqrt(np.pi / 4 * 2 * _bound(change, np.ones(change.shape[:2], bool), variance)))
     return None
@@ -207,22 +205,24 @@ def _bound(picture: NDArray[np.float64], region: NDArray[np.bool_], variance: fl
 
 def own_noise(case: Case) -> float:
     """Standard deviation of the noise of a clip, grey levels: of 2 x 2 pixels together."""
-    return float(clip(case, STEP).scene.settings.noise) / 2
+    return float(clip(case).scene.settings.noise) / 2
 
 
-def run_perturbation(subjects: Sequence[Subject], *, quick: bool, seed: int = 1) -> Part:
-    """Every pipeline on its scenes under every perturbation."""
+def run_perturbation(
+    subjects: Sequence[Subject], *, quick: bool, seed: int = 1, names: Sequence[str] = ()
+) -> Part:
+    """Every pipeline on its scenes under every perturbation. names : only these, on the first scene."""
     part = Part(
         "Perturbation",
         "Error against the strength of what is wrong with the pictures, at 400 x 300 px. It "
         "disturbs the whole recording with its reference, but for occlusion, displacement, dropped frames.",
     )
     rows = []
-    for name in QUICK if quick else PERTURBATIONS:
+    for name in names or (QUICK if quick else PERTURBATIONS):
         perturbation = PERTURBATIONS[name]
         levels = perturbation.levels[:: 3 if quick else 1]
-        for case, who in _pairs(subjects, quick=quick):
-            plain = clip(case, STEP)
+        for case, who in _pairs(subjects, short=quick or bool(names)):
+            plain = clip(case)
             found: dict[str, list[dict[str, float] | str]] = {subject.name: [] for subject in who}
             for level in levels:
                 changed = perturbation.perturb(plain, level, np.random.default_rng(seed)) if level else plain
@@ -243,14 +243,12 @@ def run_perturbation(subjects: Sequence[Subject], *, quick: bool, seed: int = 1)
     return part
 
 
-def _pairs(subjects: Sequence[Subject], *, quick: bool) -> Iterator[tuple[Case, list[Subject]]]:
-    """Scene and pipelines that suit it."""
-    with_dots = [subject for subject in subjects if subject.dots]
-    without = [subject for subject in subjects if not subject.dots]
-    for case in DOTS[:1] if quick else DOTS:
-        yield case, [s for s in with_dots if not (quick and s.reference)]
-    for case in () if quick else BARE:
-        yield case, without
+def _pairs(subjects: Sequence[Subject], *, short: bool) -> Iterator[tuple[Case, list[Subject]]]:
+    """Scene and pipelines that suit it. short : the first scene only."""
+    for dots in (True, False):
+        who = [subject for subject in subjects if subject.dots == dots]
+        for case in cases_for(dots=dots, count=1 if short else SCENES) if who else ():
+            yield case, who
 
 
 def _errors(subject: Subject, changed: Clip) -> dict[str, float] | str:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result, encode_message
-from tactflow.tools.bench.scenes import Case
-from tactflow.tools.stress.clips import clip
+from tactflow.tools.stress.clips import cases_for, clip
 from tactflow.tools.stress.compare import add_differences, cells, difference, heads, numbers
 from tactflow.tools.stress.parts import Listing, Part, Worst
 from tactflow.tools.stress.subjects import Subject, in_segments, results
@@ -25,7 +24,6 @@ Run = Callable[[Subject, Sequence[Any], Path], list[Result]]
 
 DIGITS: Final = 5
 """Decimals of stored answers."""
-DOTS, BARE = (Case("press", 44), Case("bright_cable", 40), Case("jumps", 40)), (Case("unmarked", 44),)
 
 
 def _sinks(folder: Path, *names: str) -> dict[str, Any]:
@@ -72,8 +70,8 @@ def run_same(
     ways = dict(list(EXACT.items())[1::2]) if quick else EXACT
     for subject in subjects:
         worst = Worst(subject.name, reference=subject.reference)
-        for case in (DOTS if subject.dots else BARE)[: 1 if quick else None]:
-            found = clip(case).frames[:: 2 if quick or subject.reference else 1]
+        for case in cases_for(dots=subject.dots, count=1 if quick else None):
+            found = clip(case).frames
             plain = subject.run(found)
             part.trials += len(plain)
             label = f"{subject.name}/{case.label}"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tactflow
+from tactflow.config.models import RESERVED
 from tactflow.config.registry import catalogue
+from tactflow.config.replacements import methods_of, replacements
 from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Component, Pipeline
 from tactflow.message.result import Result
@@ -32,23 +34,28 @@ UPRIGHT: Mapping[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A pipeline. name : in reports. file : of the pipeline. dots : whether it tracks dots."""
+    """A pipeline.
+
+    name : in reports. file : of the pipeline. dots : whether it tracks dots. settings : values of the file
+    that are replaced, as for `tactflow.load`.
+    """
 
     name: str
     file: Path
     dots: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
     def reference(self) -> bool:
-        """Whether it is the classic script: measured beside the others, without promises."""
-        return self.name == CLASSIC
+        """Whether it is the classic script or has a swapped stage: measured, but without promises."""
+        return self.name == CLASSIC or bool(self.settings)
 
     def load(self, frames: Any, **settings: Any) -> Pipeline:
         """The pipeline on frames in memory, taken as they are.
 
         settings : keys of the file, `a__b` for a.b.
         """
-        values = {key.replace("__", "."): value for key, value in settings.items()}
+        values = dict(self.settings) | {key.replace("__", "."): value for key, value in settings.items()}
         pipeline = tactflow.load(self.file, source=frames, settings=values)
         for id_, node in pipeline.nodes.items():
             known = {key: value for key, value in UPRIGHT.items() if hasattr(node.params, key)}
@@ -88,8 +95,9 @@ def in_segments(pipeline: Pipeline) -> Pipeline:
 def stage_components() -> tuple[list[Component], dict[str, str]]:
     """Every stage of the registry that works with default parameters; name -> why another does not."""
     usable, unusable = [], {}
-    for component in catalogue()[0]:
+    for component in catalogue(("stages",))[0]:
         if component.kind != "stage":
+            # A source has no inputs.
             continue
         try:
             tactflow.stage(component.name).close()
@@ -100,23 +108,21 @@ def stage_components() -> tuple[list[Component], dict[str, str]]:
     return usable, unusable
 
 
-def swaps(pipeline: Pipeline, components: Sequence[Component]) -> Iterator[tuple[str, str]]:
-    """(id of a stage, name of another) for every other stage of the registry that fits in its place.
-
-    Another fits if it has the outputs that other nodes read, and no required input that the stage lacks.
-    """
+def swapped(subject: Subject) -> list[Subject]:
+    """The pipeline with every other registered stage, or method of a stage, in the place of its own."""
+    pipeline = tactflow.load(subject.file)
+    files: Mapping[str, Any] = pipeline.settings["stages"]
+    found = []
     for id_, node in pipeline.nodes.items():
         if node.component.kind != "stage":
             continue
-        read = {
-            ref.port
-            for other in pipeline.nodes.values()
-            for ref in [*other.inputs.values(), *(gate.signal for gate in other.gates)]
-            if ref is not None and ref.node == id_
-        }
-        offered = {port.name for port in node.component.ports.inputs}
-        for other in components:
-            outputs = {port.name for port in other.ports.outputs}
-            needed = {port.name for port in other.ports.inputs if not port.optional}
-            if other.cls is not node.component.cls and read and read <= outputs and needed <= offered:
-                yield id_, other.name
+        own = files[id_] or {}
+        kept = {key: value for key, value in own.items() if key in RESERVED and key != "use"}
+        for other in replacements(node.component):
+            change = {f"stages.{id_}": {**kept, "use": other.name}}
+            found.append(replace(subject, name=f"{id_}: {other.name}", settings=change))
+        for method in methods_of(node.component):
+            if method != getattr(node.params, "method", None):
+                only = {f"stages.{id_}.method": method}
+                found.append(replace(subject, name=f"{id_}: {method}", settings=only))
+    return found
