@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -15,6 +16,8 @@ from tactflow.tools.stress.parts import PROMISES, Worst
 from tactflow.vision.geometry.mapping import project
 from tactflow.vision.types import MarkerStatus
 
+FLOW_FLOOR: Final = 0.05
+"""Differences of flows that do not matter, px: the tolerance of results."""
 NUMBERS: Final[Mapping[str, str]] = {
     "dots": "px",
     "center": "px",
@@ -36,6 +39,8 @@ def numbers(result: Result) -> dict[str, Any]:
             found["angle"] = result.contact.angle
     if result.flow is not None and result.flow.mean is not None:
         found["flow"] = list(result.flow.mean)
+        stated = math.hypot(*result.flow.stderr) if result.flow.stderr is not None else 0.0
+        found["flow_stderr"] = stated if math.isfinite(stated) else 0.0
     if result.markers is not None:
         seen = result.markers.status == MarkerStatus.TRACKED
         found["origin"] = result.markers.origin[seen].tolist()
@@ -59,6 +64,8 @@ def difference(
             by = move if key == "center" else move * [[1, 1, 0], [1, 1, 0], [0, 0, 1]]
             moved = project(by, np.array([one[key]], np.float64))[0]
             found[key] = float(metrics.distance(moved, other[key]))
+    if "flow" in found:
+        found["flow_stated"] = found["flow"] / max(FLOW_FLOOR, one["flow_stderr"])
     if "angle" in one and "angle" in other:
         angle = np.radians(one["angle"])
         # Angles are counter-clockwise on the screen, whose y axis points down.

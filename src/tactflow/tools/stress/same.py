@@ -22,6 +22,8 @@ Answers = dict[str, list[dict[str, Any]]]
 """pipeline/scene -> the numbers of each frame."""
 Run = Callable[[Subject, Sequence[Any], Path], list[Result]]
 
+QUICK_FRAMES: Final = 8
+"""Frames of a scene in a quick run."""
 DIGITS: Final = 5
 """Decimals of stored answers."""
 
@@ -71,7 +73,7 @@ def run_same(
     for subject in subjects:
         worst = Worst(subject.name, reference=subject.reference)
         for case in cases_for(dots=subject.dots, count=1 if quick else None):
-            found = clip(case).frames
+            found = clip(case).frames[: QUICK_FRAMES if quick else None]
             plain = subject.run(found)
             part.trials += len(plain)
             label = f"{subject.name}/{case.label}"

@@ -50,6 +50,11 @@ class Subject:
         """Whether it is the classic script or has a swapped stage: measured, but without promises."""
         return self.name == CLASSIC or bool(self.settings)
 
+    def stages(self) -> set[str]:
+        """Names of its stages, as in `use:`."""
+        nodes = tactflow.load(self.file, settings=self.settings).nodes.values()
+        return {node.component.name for node in nodes}
+
     def load(self, frames: Any, **settings: Any) -> Pipeline:
         """The pipeline on frames in memory, taken as they are.
 

@@ -10,13 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.drawing.results import Annotator
+from tactflow.tools.stress.inputs import SIZE, gel
 from tactflow.vision.change import RestTest
 from tactflow.vision.flow import flow_in_mask, inside_mask
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.markers.inpaint import remove_markers
 from tactflow.vision.types import Contact, Flow, Markers
-from tests.stress.builders import PICTURE_METHODS, SIZE, gel
+from tests.tools.stress.methods import PICTURE_METHODS
 
 Array = NDArray[Any]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
 from contextlib import suppress
 
 import cv2
@@ -13,57 +13,62 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import tactflow
+from tactflow.config.shipped import find_pipeline
 from tactflow.drawing.results import Annotator
+from tactflow.engine.conformance import component
+from tactflow.engine.contract import Stage
 from tactflow.engine.errors import TactflowError
+from tactflow.ports import Deviations, Image
+from tactflow.tools.stress.degenerate import require_defined, run_degenerate, try_pictures
+from tactflow.tools.stress.inputs import gel
+from tactflow.tools.stress.parts import Worst
+from tactflow.tools.stress.subjects import stage_components, subjects
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
 from tactflow.vision.types import Markers
-from tests.stress.builders import (
-    PICTURE_METHODS,
-    Image,
-    assert_defined,
-    assert_mask,
-    detector,
-    gel,
-)
+from tests.tools.stress.methods import PICTURE_METHODS, detector
 
-SHAPES = ((1, 1), (1, 7), (7, 1), (3, 5), (17, 31), (64, 48))
 HEIGHT, WIDTH = 60, 80
 
 
-def checkerboard(shape: tuple[int, int], cell: int) -> Image:
-    rows, columns = np.indices(shape) // cell
-    return np.repeat(((rows + columns) % 2 * 255).astype(np.uint8)[..., None], 3, axis=2)
+class Broken(Stage):
+    """A stage with every mistake, one for each level of grey."""
+
+    memory = "pure"
+
+    def process(self, image: Image) -> Deviations:
+        level = int(image[0, 0, 0])
+        if level == 1:
+            raise ZeroDivisionError("no light")
+        if level == 2:
+            warnings.warn("dim", RuntimeWarning, stacklevel=1)
+        if level == 3:
+            raise ValueError("required light, got none")
+        cells = np.zeros((2, 3, 3), np.float64 if level == 4 else np.float32)
+        cells[0, 0, 0] = np.nan if level == 5 else 1
+        return cells
 
 
-PICTURES: dict[str, Callable[[tuple[int, int]], Image]] = {
-    "black": lambda shape: np.zeros((*shape, 3), np.uint8),
-    "white": lambda shape: np.full((*shape, 3), 255, np.uint8),
-    "one channel": lambda shape: np.full((*shape, 3), (0, 0, 255), np.uint8),
-    "fine checkerboard": lambda shape: checkerboard(shape, 1),
-    "checkerboard": lambda shape: checkerboard(shape, 8),
-    "noise": lambda shape: np.random.default_rng(3).integers(0, 256, (*shape, 3), dtype=np.uint8),
-}
+@pytest.mark.parametrize(
+    ("level", "broken"),
+    [
+        *((0, set()), (1, {"exceptions"}), (2, {"exceptions"}), (3, set())),
+        *((4, {"undefined"}), (5, {"undefined"})),
+    ],
+)
+def test_mistakes_of_a_stage_are_found_and_a_refusal_in_words_is_none(level: int, broken: set[str]) -> None:
+    worst = Worst("broken")
+    pictures = [np.full((4, 4, 3), level, np.uint8)]
+    try_pictures([component(Broken, "broken", "a test", ())], {"broken": worst}, "grey", pictures)
+    assert {check.promise for check in worst.checks() if not check.kept} == broken
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("method", PICTURE_METHODS)
-def test_every_pair_of_degenerate_pictures_has_a_defined_answer(method: str, shape: tuple[int, int]) -> None:
-    pictures = [make(shape) for make in PICTURES.values()]
-    for reference, image in ((a, b) for a in pictures for b in pictures):
-        try:
-            answer = PICTURE_METHODS[method](reference, image)
-        except NoMarkersError:
-            assert method == "tracker"
-            continue
-        assert_defined(answer)
-        if isinstance(answer, Markers):
-            assert (answer.origin > -1).all()
-            assert (answer.origin < shape[::-1]).all()
-        elif method.startswith("inpaint"):
-            assert (answer.shape, answer.dtype) == (image.shape, np.uint8)
-        else:
-            assert_mask(answer, shape)
+def test_a_quick_run_through_all_stages_and_the_default_pipeline_keeps_all_promises() -> None:
+    default = subjects({"default": find_pipeline("default")})
+    part = run_degenerate(default, stage_components()[0], quick=True)
+    assert [check for check in part.checks if not check.kept and not check.reference] == []
+    assert {"hull", "difference", "tracker", "default"} <= {check.subject for check in part.checks}
+    assert part.trials > 1000
 
 
 ANY_PICTURE = arrays.arrays(np.uint8, st.tuples(st.integers(1, 20), st.integers(1, 20), st.just(3)))
@@ -77,8 +82,9 @@ def test_any_pair_of_pictures_has_a_mask_and_marks_within_it_or_none(
     contact = detector(reference)
     assert not contact.detect(reference).touching
     result = contact.detect(data.draw(arrays.arrays(np.uint8, reference.shape)))
-    assert_defined(result.strength)
-    assert_mask(result.mask, reference.shape[:2])
+    require_defined(result.strength)
+    assert result.mask.shape == reference.shape[:2]
+    assert set(np.unique(result.mask).tolist()) <= {0, 255}
     with suppress(NoMarkersError):
         centers = detect_markers(reference).centers
         assert (centers > -1).all()
@@ -93,7 +99,7 @@ def test_frames_of_two_megapixels_have_an_answer(method: str) -> None:
         large.append(np.full((1080, 1920, 3), 120, np.uint8))
         large[-1][250 : 250 + once.shape[0], 450 : 450 + once.shape[1]] = once
     answer = PICTURE_METHODS[method](*large)
-    assert_defined(answer)
+    require_defined(answer)
     if isinstance(answer, Markers):
         # Marks move by up to 4 * 2.5 px.
         assert len(answer.origin) == 24
@@ -105,7 +111,7 @@ def test_frames_of_two_megapixels_have_an_answer(method: str) -> None:
 def test_markers_far_outside_the_picture_have_a_defined_flow_and_are_drawn() -> None:
     at = np.array([[-500, 1e9], [40, 30], [1e300, 0]])
     markers = Markers(at, at + 1, np.zeros(3, np.uint8), np.full(3, np.nan))
-    assert_defined(flow_in_mask(markers, np.full((HEIGHT, WIDTH), 255, np.uint8)))
+    require_defined(flow_in_mask(markers, np.full((HEIGHT, WIDTH), 255, np.uint8)))
     near = Markers(np.clip(at, -1e7, 1e7), np.clip(at, -1e7, 1e7) + 1, markers.status, markers.stderr)
     assert Annotator()(np.zeros((HEIGHT, WIDTH, 3), np.uint8), markers=near).shape == (HEIGHT, WIDTH, 3)
 
@@ -120,7 +126,7 @@ def test_tiny_and_odd_frames_end_in_an_answer_or_in_words(name: str, shape: tupl
         assert "required" in str(error) or "markers found" in str(error)  # noqa: PT017
         return
     for result in found:
-        assert_defined([result.image, result.contact, result.flow, result.markers])
+        require_defined([result.image, result.contact, result.flow, result.markers])
 
 
 def test_a_detector_ends_every_one_of_many_contacts() -> None:
