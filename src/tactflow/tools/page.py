@@ -135,13 +135,14 @@ def plot(
     draw: Callable[[Figure], object],
     *,
     caption: str = "",
+    label: str = "",
     width: int = WIDTH,
     height: int = HEIGHT,
 ) -> Html:
     """A plot as SVG in the page; empty without matplotlib.
 
-    draw : draws on a figure. caption : below it. width, height : CSS pixels; one wider than `WIDTH` scrolls
-    on narrow screens.
+    draw : draws on a figure. caption : below it. label : for readers who cannot see it.
+    width, height : CSS pixels; one wider than `WIDTH` scrolls on narrow screens.
     """
     if missing("plots", "plot", ["matplotlib"]):
         return Html("")
@@ -150,7 +151,9 @@ def plot(
         draw(figure)
         figure.savefig(written, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     svg = written.getvalue()
-    svg = svg[svg.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{escape(caption)}"', 1)
+    svg = svg[svg.index("<svg") :].replace(
+        "<svg", f'<svg role="img" aria-label="{escape(label or caption)}"', 1
+    )
     for name, (light, _) in COLOURS.items():
         svg = svg.replace(light, f"var(--{name})")
     # Fixed sizes in points would keep it from following the width of its column.

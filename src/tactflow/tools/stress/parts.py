@@ -55,7 +55,7 @@ PROMISES: Final[Mapping[str, Promise]] = {
     "disc": Promise(
         "a disc has no direction", 0, "answers", "a direction that the shape does not have is null"
     ),
-    "line": Promise("a line has its direction", 0.5, "deg", "half a pixel over 57 px"),
+    "line": Promise("a line has its direction within", 0.5, "deg", "half a pixel over 57 px"),
     "rest": Promise("the reference itself shows no contact", 0, "answers", "nothing has changed"),
     "pixel_dots": Promise("one grey level in one pixel moves a dot by less than", 0.05, "px", _STATED),
     "pixel_center": Promise("one grey level in one pixel moves the centre by less than", 0.5, "px", _STATED),

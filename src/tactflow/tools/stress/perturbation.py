@@ -161,6 +161,8 @@ PERTURBATIONS: Final[Mapping[str, Perturbation]] = {
 }
 """Name -> perturbation."""
 
+OF_DOTS: Final = "occluded dots"
+"""The perturbation that needs dots."""
 QUICK: Final = ("noise", "occluded dots")
 SCENES: Final = 2
 """Scenes that each pipeline is run on."""
@@ -220,6 +222,8 @@ def run_perturbation(
         perturbation = PERTURBATIONS[name]
         levels = perturbation.levels[:: 3 if quick else 1]
         for case, who in _pairs(subjects, short=quick or bool(names)):
+            if name == OF_DOTS and not who[0].dots:
+                continue
             plain = clip(case)
             found: dict[str, list[dict[str, float] | str]] = {subject.name: [] for subject in who}
             for level in levels:
