@@ -36,6 +36,7 @@ run: $(VENV)/.installed
 
 test: lint types
 	$(PY) -m pytest -m "not slow" --numprocesses auto --dist loadfile --no-loadscope-reorder
+	$(PY) -m tactflow stress --quick --json build/stress.json --page build/stress.html
 
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
 soak: $(VENV)/.installed-test

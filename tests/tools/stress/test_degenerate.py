@@ -13,16 +13,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import tactflow
-from tactflow.config.shipped import find_pipeline
 from tactflow.drawing.results import Annotator
 from tactflow.engine.conformance import component
 from tactflow.engine.contract import Stage
 from tactflow.engine.errors import TactflowError
 from tactflow.ports import Deviations, Image
-from tactflow.tools.stress.degenerate import require_defined, run_degenerate, try_pictures
+from tactflow.tools.stress.degenerate import require_defined, try_pictures
 from tactflow.tools.stress.inputs import gel
 from tactflow.tools.stress.parts import Worst
-from tactflow.tools.stress.subjects import stage_components, subjects
 from tactflow.vision.flow import flow_in_mask
 from tactflow.vision.markers.detection import NoMarkersError, detect_markers
 from tactflow.vision.types import Markers
@@ -61,14 +59,6 @@ def test_mistakes_of_a_stage_are_found_and_a_refusal_in_words_is_none(level: int
     pictures = [np.full((4, 4, 3), level, np.uint8)]
     try_pictures([component(Broken, "broken", "a test", ())], {"broken": worst}, "grey", pictures)
     assert {check.promise for check in worst.checks() if not check.kept} == broken
-
-
-def test_a_quick_run_through_all_stages_and_the_default_pipeline_keeps_all_promises() -> None:
-    default = subjects({"default": find_pipeline("default")})
-    part = run_degenerate(default, stage_components()[0], quick=True)
-    assert [check for check in part.checks if not check.kept and not check.reference] == []
-    assert {"hull", "difference", "tracker", "default"} <= {check.subject for check in part.checks}
-    assert part.trials > 1000
 
 
 ANY_PICTURE = arrays.arrays(np.uint8, st.tuples(st.integers(1, 20), st.integers(1, 20), st.just(3)))
