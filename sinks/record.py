@@ -23,6 +23,7 @@ from tactflow.recording import missing_packages
 from tactflow.recording.course import Watcher
 from tactflow.recording.verdict import Recorded, examine_recording, extent, verdict_of
 from tactflow.system.files import expanded, next_name
+from tactflow.vision.change import shows_gel
 
 if TYPE_CHECKING:
     from tactflow.recording.writer import Entry, RecordingWriter
@@ -203,12 +204,14 @@ class Record(OutputSink, Recorder):
         glance = None
         # A reference image that is not part of the source has no results.
         if frame.seq >= 0:
+            empty = frame.damaged and not shows_gel(frame.image)
             glance = self._watcher.look(
                 frame.image,
                 frame.t,
                 frame.seq,
                 reference=frame.reference,
-                damaged="damaged" in result.skipped.values(),
+                empty=empty,
+                damaged=frame.damaged and not empty,
             )
             data["results"] = encode_message(result, detail=True)
             if self._previews is not None and self._previews.due(frame.t):

@@ -2,7 +2,8 @@
 
 `file` is the calibration file; `scale` finds millimetres per pixel, `presses` finds presses of a
 ball in results, `photometric` learns from them which slope of the gel has which colour, and `force` how the
-force follows from a contact. Nothing here runs a pipeline: results come in, numbers go out.
+force follows from a contact. `session` makes a calibration of them, `check` tests one. Nothing here runs a
+pipeline: results come in, numbers go out.
 """
 
 from __future__ import annotations

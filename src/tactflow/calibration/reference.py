@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -54,6 +54,10 @@ class Reference:
     def seconds(self, frames: Floats, times: Floats) -> Floats:
         """(N,): its time, s. frames, times : (M,) number and time of each frame that was seen, growing."""
         return np.interp(self.time, frames, times) if self.by_frame else self.time
+
+    def later(self, seconds: float) -> Reference:
+        """The same forces some seconds later; unchanged if they belong to frames."""
+        return self if self.by_frame else replace(self, time=self.time + seconds)
 
     @property
     def sideways(self) -> bool:

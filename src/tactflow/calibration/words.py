@@ -1,0 +1,63 @@
+"""How good a calibration is, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tactflow.calibration.file import DarknessEntry, LinearForceEntry
+from tactflow.calibration.force import Fit
+from tactflow.calibration.reference import Reference
+
+
+def darkness_words(found: DarknessEntry) -> str:
+    """The range and the error of a depth that was learned from darkening."""
+    return (
+        f"depth up to {found.depth[-1]:.2f} mm, where the gel is {100 * found.darkening[-1]:.0f} % darker; "
+        f"standard error {found.stderr:.3f} mm"
+    )
+
+
+def photometric_words(errors: Mapping[str, float]) -> str:
+    """The errors of a depth that was learned from colours, as in a `PhotometricEntry`.
+
+    >>> photometric_words({"normal_error": 3.21, "depth_stderr": 0.1})
+    'normals 3.2 degrees off in the mean, standard error of the depth 10 %'
+    """
+    return (
+        f"normals {errors['normal_error']:.1f} degrees off in the mean, "
+        f"standard error of the depth {100 * errors['depth_stderr']:.0f} %"
+    )
+
+
+def force_words(fit: Fit, readings: Mapping[str, Reference]) -> list[str]:
+    """What was learned about the force, and what not. readings : of the gauge, by recording."""
+    entry = fit.entry
+    words = [f"{name}: its clock is {s:+.3f} s ahead of its CSV's" for name, s in entry.recordings.items()]
+    words.append(f"force, {entry.presses} presses: {_quality(entry.press, entry.left_out)}")
+    if "volume" not in entry.press.stiffness:
+        words.append(
+            "heights are not known, so the force is fitted to the change of light and the area: it is valid "
+            "only for objects like these"
+        )
+    if fit.turned is not None:
+        side = ", mirrored" if fit.mirrored else ""
+        words.append(
+            f"the gauge's x axis lies {fit.turned:+.0f} degrees counter-clockwise in the picture{side}"
+        )
+        if entry.drag is None:
+            words.append("fx and fy do not follow the flow of the contact, and are left out")
+        else:
+            words.append(f"force sideways: {_quality(entry.drag, entry.left_out)}")
+    elif any(reading.sideways for reading in readings.values()):
+        words.append("fx and fy are left out: not every CSV has them")
+    return words
+
+
+def _quality(part: LinearForceEntry, left_out: str) -> str:
+    absolute, relative = part.error
+    groups = {"object": "objects", "recording": "recordings", "press": "presses"}[left_out]
+    return (
+        f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
+        f"{100 * part.r2:.0f} % of the variance explained, on {groups} left out of the fit; "
+        f"standard error {absolute:.2f} N and {100 * relative:.0f} % of the force"
+    )
