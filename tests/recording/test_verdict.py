@@ -20,7 +20,9 @@ from tests.terminal import Terminal
 FPS = 30.0
 COUNT = 300
 RNG = np.random.default_rng(3)
-NOISE = [RNG.integers(90, 110, (48, 64, 3)).astype(np.uint8) for _ in range(8)]
+LIGHT = np.linspace(60, 180, 64)[None, :, None]
+NOISE = [(LIGHT + RNG.integers(-9, 10, (48, 64, 3))).astype(np.uint8) for _ in range(8)]
+"""Pictures of one gel that differ by noise."""
 
 Indices = NDArray[np.int64]
 Times = NDArray[np.float64]
@@ -29,7 +31,7 @@ Times = NDArray[np.float64]
 def verdict(
     seqs: Iterable[int], times: Iterable[float], *, stays: range = range(0), recorded: Recorded | None = None
 ) -> Verdict:
-    """The verdict on frames of noise. stays : frames that show the picture before them."""
+    """The verdict on frames of a gel. stays : frames that show the picture before them."""
     recorded = recorded or Recorded()
     watcher = Watcher()
     image = NOISE[0]
@@ -163,7 +165,7 @@ def test_the_wait_between_the_references_of_a_camera_and_its_next_frame_is_no_lo
     assert str(verdict_of(examine_recording(recorded), extent(recorded))) == "good: 40 frames in 1.3 s"
 
 
-def test_the_sink_counts_each_recording_by_itself_and_damaged_pictures_by_their_results(
+def test_the_sink_counts_each_recording_by_itself_and_damaged_pictures(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "tactflow")
@@ -173,13 +175,18 @@ def test_the_sink_counts_each_recording_by_itself_and_damaged_pictures_by_their_
     for begin in (0, 500):
         sink.start_recording()
         for seq in range(begin, begin + 20):
-            skipped = {"contact": "damaged"} if seq == 505 else {}
-            sink.write(Result(Frame("main", seq, seq / FPS, NOISE[seq % 8]), {}, skipped))
+            image, is_damaged = NOISE[seq % 8], seq in (505, 508)
+            if seq == 508:
+                image = np.zeros_like(image)
+            sink.write(Result(Frame("main", seq, seq / FPS, image, damaged=is_damaged), {}))
         sink.stop_recording()
     sink.close()
     notes = [record.getMessage() for record in caplog.records]
     assert any(note.endswith("press-001.mcap is good: 20 frames in 633 ms") for note in notes)
-    assert sink.verdict == "usable: 1 of 20 pictures are damaged, the first is number 5"
+    assert sink.verdict == (
+        "bad: 1 of 20 pictures are damaged, the first is number 5; "
+        "1 of 20 pictures show no gel, the first is number 8"
+    )
 
 
 def test_the_last_line_of_record_is_the_verdict_and_doctor_says_the_same(
