@@ -187,8 +187,7 @@ class MarkerTracker:
             if self._join(image):
                 return self.track(image)
         probability = None if self._prior is None else self._evidence.probability
-        # The origin is shared by the results of all frames, by which others know that it is the same.
-        return Markers(self._origin, position.copy(), status, errors, self._radius, probability)
+        return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
 
     def _align(self, image: NDArray[np.uint8], start: Floats) -> Alignment:
         """Align the marks from starting points (N, 2), px; rejected marks count as invisible."""
