@@ -68,7 +68,9 @@ class MarkerGraph:
         if len(self._edges) and not 0 <= self._edges.min() <= self._edges.max() < count:
             raise ValueError(f"required edges between marks 0 to {count - 1}, got {self._edges.tolist()}")
         self._origin = origin
-        self._length = np.linalg.norm(origin[self._edges[:, 0]] - origin[self._edges[:, 1]], axis=1)
+        self._ends = np.ascontiguousarray(self._edges.T)
+        length = np.linalg.norm(origin[self._ends[0]] - origin[self._ends[1]], axis=1)
+        self._limit = (MAX_STRAIN * length) ** 2
         self._grid = components(self._edges, count)
         self.grids = [np.flatnonzero(self._grid == grid) for grid in np.unique(self._grid)]
         """The marks of each connected grid."""
@@ -78,12 +80,14 @@ class MarkerGraph:
 
         position : (N, 2), px. seen : (N,), whether a mark is visible.
         """
-        one, other = self._edges.T
+        one, other = self._ends
         moved = position - self._origin
-        x, y = (moved[one] - moved[other]).T
-        both = seen[one] & seen[other]
-        smooth = both & (x * x + y * y < (MAX_STRAIN * self._length) ** 2)
-        return smooth, bool((both & ~smooth).any())
+        change = moved.take(one, axis=0) - moved.take(other, axis=0)
+        change *= change
+        smooth = change[:, 0] + change[:, 1] < self._limit
+        both = seen.take(one) & seen.take(other)
+        smooth &= both
+        return smooth, np.count_nonzero(smooth) < np.count_nonzero(both)
 
     def largest_component(self, seen: Flags, smooth: Flags) -> Flags:
         """The visible marks (N,) of the largest component of each grid, connected by links of little
