@@ -87,7 +87,7 @@ class MarkerGraph:
         smooth = change[:, 0] + change[:, 1] < self._limit
         both = seen.take(one) & seen.take(other)
         smooth &= both
-        return smooth, np.count_nonzero(smooth) < np.count_nonzero(both)
+        return smooth, bool(np.count_nonzero(smooth) < np.count_nonzero(both))
 
     def largest_component(self, seen: Flags, smooth: Flags) -> Flags:
         """The visible marks (N,) of the largest component of each grid, connected by links of little
