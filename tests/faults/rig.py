@@ -58,9 +58,11 @@ class At(Sink):
 
 
 def array(folder: Path, frames: int = FRAMES) -> Path:
-    """A recording of noise, 160 x 120, as an array: so large that encoders do not keep all of it."""
+    """A recording of noise on a gradient, 160 x 120, as an array: so large that encoders do not keep all of
+    it."""
     path = folder / "noise.npy"
-    np.save(path, np.random.default_rng(1).integers(0, 256, (frames, 120, 160, 3), np.uint8))
+    noise = np.random.default_rng(1).integers(0, 128, (frames, 120, 160, 3), np.uint8)
+    np.save(path, noise + np.linspace(0, 127, 160).astype(np.uint8)[:, None])
     return path
 
 

@@ -39,6 +39,7 @@ def frames(seqs: Sequence[int], references: Sequence[int] = (0,), start: float =
 def record(path: Path, made: Sequence[Frame], *, cut: bool = False) -> Path:
     sink = Record(Record.Params(path=str(path), preview=0))
     sink.open()
+    sink.begin()
     for frame in made:
         sink.write(Result(frame))
     if cut:
