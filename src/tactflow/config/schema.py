@@ -16,7 +16,7 @@ def pipeline_schema(components: Sequence[Component]) -> dict[str, Any]:
 
     >>> from tactflow.config.registry import catalogue
     >>> sorted(pipeline_schema(catalogue()[0])["properties"])[:3]
-    ['calibration', 'opencv_threads', 'sensor']
+    ['calibration', 'gel', 'opencv_threads']
     """
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
