@@ -41,6 +41,10 @@ LEFT: Final = 3.0
 pixels, while a dragged gel, by any distance, leaves a residual at the edges of its dots."""
 BETTER: Final = 9.0
 """Ratio of the squared residuals without and with the displacement: three standard deviations of noise."""
+PARTS: Final = 4
+WIDE_PARTS: Final = 3
+"""Parts of a row, and the number of them that must show the displacement: an object that has moved fills one
+or two, or leaves the dots beside it."""
 DISPLACED: Final = 6
 """Minimum number of displaced rows: an eighth of the picture."""
 LASTING: Final = 30
@@ -195,12 +199,19 @@ class DamageTest:
         for shift in shifts[counts >= DISPLACED]:
             rows_there = best == shift
             there = before[rows_there, lag - shift : width - lag - shift]
-            left = np.square(now[rows_there, inner] - there).mean(axis=1)
-            still = np.square(now[rows_there, inner] - before[rows_there, inner]).mean(axis=1)
-            exact = (left < LEFT * least / width) & (still > BETTER * left)
+            left = _part_means(now[rows_there, inner] - there)
+            still = _part_means(now[rows_there, inner] - before[rows_there, inner])
+            widely = np.count_nonzero(still > BETTER * left, axis=1) >= WIDE_PARTS
+            exact = widely & (left.mean(axis=1) < LEFT * least / width)
             if np.count_nonzero(exact) >= DISPLACED:
                 return True
         return False
+
+
+def _part_means(differences: Floats32) -> Floats32:
+    """Mean squares (n, `PARTS`) of parts of rows (n, W)."""
+    parts = np.array_split(np.square(differences), PARTS, axis=1)
+    return np.stack([part.mean(axis=1) for part in parts], axis=1)
 
 
 def _places(length: int, number: int) -> NDArray[np.intp]:
