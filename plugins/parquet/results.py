@@ -39,7 +39,7 @@ def _message(row: Mapping[str, Any]) -> dict[str, Any]:
     message = _part([column for column in frame_columns() if column.name in row], 0, row) or {}
     skipped = message.get("skipped")
     message["skipped"] = dict(skipped) if skipped else {}
-    empty = {"contact": None, "contacts": [], "flow": None, "markers": None}
+    empty: dict[str, Any] = {"contact": None, "contacts": [], "flow": None, "markers": None}
     return {"schema": "tactflow.frame/1"} | empty | message
 
 

@@ -68,14 +68,16 @@ def frames(count: int, *, dots: bool, seed: int = 1) -> Iterator[Image]:
 
 
 def memory_mb() -> float:
-    """Memory of this process, MB: resident now, or the peak where the system does not tell."""
+    """Memory of this process, MB: resident now, or its peak where that is not told; NaN on Windows."""
+    if sys.platform == "win32":
+        return float("nan")
     statm = Path("/proc/self/statm")
     if statm.exists():
-        return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+        return float(int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20)
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return float(peak / (2**20 if sys.platform == "darwin" else 2**10))
 
 
 @dataclass(slots=True)
