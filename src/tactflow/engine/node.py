@@ -176,7 +176,7 @@ class RunningNode:
         inherited = self._inherited_reason(tick) if inherits else None
         for number, slot in enumerate(self.slots):
             tick.values[slot] = value = outputs[number]
-            if isinstance(value, Absent):
+            if isinstance(value, Absent) and not (tick.frame.damaged and inherited):
                 tick.reasons[slot] = value.reason
             elif inherited is not None:
                 tick.reasons[slot] = inherited

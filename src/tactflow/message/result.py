@@ -146,7 +146,7 @@ class Result(Tick):
         """
         try:
             parsed: Any = message if isinstance(message, Mapping) else orjson.loads(message)
-            read = Message.model_validate(parsed)
+            read = Message.model_validate(_completed(parsed))
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
             place = ".".join(map(str, problem["loc"]))
@@ -161,6 +161,16 @@ class Result(Tick):
         result._size = read.size
         result._message = parsed
         return result
+
+
+def _completed(message: Any) -> Any:
+    """The message with the values of the keys that other programs may leave out."""
+    if not isinstance(message, Mapping):
+        return message
+    completed = {"size": (1, 1), "contacts": [], **message}
+    if isinstance(contact := message.get("contact"), Mapping):
+        completed["contact"] = {"evidence": "light", "probability": None, **contact}
+    return completed
 
 
 class MessageParams(StageParams):
