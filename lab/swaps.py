@@ -39,7 +39,6 @@ from tactflow.tools.bench import metrics
 from tactflow.tools.bench.command import packaged_files
 from tactflow.tools.bench.methods import STAGES, alternatives
 from tactflow.tools.bench.quantities import QUANTITIES, Tally
-from tactflow.tools.bench.results import LEFT_OUT
 from tactflow.tools.bench.run import machine
 from tactflow.tools.bench.score import MarkerScore
 from tactflow.tools.bench.tables import PRIMARY, TITLES
@@ -313,22 +312,30 @@ def masks_on_gels(data: Path) -> dict[str, Any]:
 
 
 def from_bench(path: Path) -> dict[str, Any]:
-    """Of a result of the bench: stage -> method -> quantity -> median over the scenes; and their number."""
+    """Of a result of the bench: stage -> method -> quantity -> median over the scenes; with `, worst` behind
+    the quantity the worst of them; and the number of scenes."""
     values: dict[str, dict[str, dict[str, list[float]]]] = {}
     scenes = set()
     for key, numbers in json.loads(path.read_text(encoding="utf-8"))["values"].items():
         group, *method, scene = key.split("/")
-        scenes |= {scene} if group in STAGES else set()
+        if group not in STAGES:
+            continue
+        scenes.add(scene)
         own = values.setdefault(group, {}).setdefault("/".join(method), {})
         for quantity, value in numbers.items():
             own.setdefault(quantity, []).append(value)
-    return {"scenes": len(scenes)} | {
-        group: {
-            name: {q: sum(v) if q in ("frames", LEFT_OUT) else median(v) for q, v in own.items()}
+    summaries: dict[str, Any] = {"scenes": len(scenes)}
+    for group, methods in values.items():
+        summaries[group] = {
+            name: {key: median(found) for key, found in own.items()}
+            | {
+                f"{key}, worst": max(own[key], key=QUANTITIES[key].distance)
+                for key in own
+                if key in QUANTITIES
+            }
             for name, own in methods.items()
         }
-        for group, methods in values.items()
-    }
+    return summaries
 
 
 def write(numbers: Mapping[str, Any], path: Path) -> None:
@@ -367,8 +374,8 @@ FRONTS: Final[Mapping[str, tuple[str, Sequence[page.Column]]]] = {
         (
             ("ms", "bench|tracker|*|contact_ms", ".2f", -1),
             ("named scenes: RMS px", "bench|tracker|*|displacement_rms", ".3f", -1),
-            ("wrong %", "bench|tracker|*|wrong_percent", ".1f", -1),
-            ("lost %", "bench|tracker|*|lost_percent", ".1f", -1),
+            ("wrong %, worst scene", "bench|tracker|*|wrong_percent, worst", ".1f", -1),
+            ("lost %, worst scene", "bench|tracker|*|lost_percent, worst", ".1f", -1),
             ("random gels: RMS px", "dots_wide|all|*|displacement_rms", ".2f", -1),
             ("wrong %", "dots_wide|all|*|wrong_percent", ".1f", -1),
             ("lost %", "dots_wide|all|*|lost_percent", ".1f", -1),
@@ -382,8 +389,8 @@ FRONTS: Final[Mapping[str, tuple[str, Sequence[page.Column]]]] = {
         (
             ("ms", "bench|difference|*|contact_ms", ".2f", -1),
             ("named scenes: IoU", "bench|difference|*|contact_iou", ".2f", 1),
-            ("false %", "bench|difference|*|false_contacts", ".1f", -1),
-            ("missed %", "bench|difference|*|missed_contacts", ".1f", -1),
+            ("false %, worst scene", "bench|difference|*|false_contacts, worst", ".1f", -1),
+            ("missed %, worst scene", "bench|difference|*|missed_contacts, worst", ".1f", -1),
             ("random gels: IoU", "contact_wide|all|*|contact_iou", ".2f", 1),
             ("false %", "contact_wide|all|*|false_contacts", ".1f", -1),
             ("missed %", "contact_wide|all|*|missed_contacts", ".1f", -1),

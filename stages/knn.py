@@ -16,6 +16,10 @@ from tactflow.vision.contact.specks import without_specks
 REPETITIONS: Final = 20
 """Times that the first frame is learned: OpenCV needs seven or more until its samples are filled."""
 
+MIN_LEARNING_RATE: Final = 1e-9
+"""Weight of a new frame that changes nothing in a run of years. With 0, OpenCV divides by it and forgets the
+reference within four frames."""
+
 
 class Knn(Stage):
     """Detect contact by background subtraction with k nearest neighbours.
@@ -63,8 +67,7 @@ class Knn(Stage):
             for _ in range(1 if self._known else REPETITIONS):
                 self._background.apply(unmarked, learningRate=-1)
             self._known = True
-        changed = np.asarray(
-            self._background.apply(unmarked, learningRate=self.params.learning_rate), np.uint8
-        )
+        rate = max(self.params.learning_rate, MIN_LEARNING_RATE)
+        changed = np.asarray(self._background.apply(unmarked, learningRate=rate), np.uint8)
         mask = without_specks(changed, self.params.opening, valid)
         return ContactPorts(mask, bool(mask.any()))

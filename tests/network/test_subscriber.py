@@ -277,7 +277,10 @@ def test_a_subscriber_that_falls_behind_says_so_once(
         # As if they had waited in the queue: older by more than a second than the one before.
         for seq, t in ((102, 9.3), (103, 8.9), (104, 8.8)):
             publisher.sink.write(result_of(Tick(Frame("main", seq, t, IMAGE)), Results(IMAGE)))
-        queued = [results.receive() for _ in range(3)]
+        queued = []
+        for _ in range(3):
+            assert results._socket.poll(1000 * LONG)
+            queued.append(results.receive())
     assert [result.seq for result in queued] == [102, 103, 104]
     (said,) = [record.getMessage() for record in caplog.records if "behind" in record.getMessage()]
     assert "Subscriber(..., latest=True) skips to the newest result" in said

@@ -134,6 +134,16 @@ def test_a_contact_is_found_at_its_place_and_none_at_rest(name: str, press: list
 
 
 @pytest.mark.parametrize("name", DETECTORS)
+def test_a_contact_that_lasts_stays_one_and_leaves_no_trace(name: str, press: list[Picture]) -> None:
+    stage = tactflow.stage(name)
+    detect(stage, press[0], 0)
+    lasting = [detect(stage, press[2], seq) for seq in range(1, 30)]
+    np.testing.assert_array_equal(lasting[-1].contact_mask, lasting[0].contact_mask)
+    assert lasting[-1].touching
+    assert not detect(stage, press[1], 30).touching
+
+
+@pytest.mark.parametrize("name", DETECTORS)
 def test_nothing_outside_of_the_gel_counts(name: str, press: list[Picture]) -> None:
     stage, valid = tactflow.stage(name), np.zeros(press[0].shape[:2], np.uint8)
     valid[:20] = 255

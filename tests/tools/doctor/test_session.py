@@ -62,10 +62,11 @@ def test_sensors_with_a_common_clock_are_compared_at_the_same_moments() -> None:
 
 
 def films(folder: Path, *lags: int) -> list[str]:
-    """A lossless film of noise for each lag, frames."""
+    """A lossless film of a gel that moves, for each lag, frames."""
     rng = np.random.default_rng(6)
     steps = np.stack([rng.normal(0, move / 5, (48, 64, 3)) for move in MOVES[:120]])
-    pictures = np.clip(120 + np.cumsum(steps, axis=0), 0, 255).astype(np.uint8)
+    light = np.linspace(60, 180, 64)[:, None]
+    pictures = np.clip(light + np.cumsum(steps, axis=0), 0, 255).astype(np.uint8)
     paths = []
     for number, lag in enumerate(lags):
         path = folder / f"finger-{number}.avi"

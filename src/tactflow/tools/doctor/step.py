@@ -80,7 +80,10 @@ def _compared(left: Track, right: Track) -> Finding:
     limit = max(FRAMES_IN_STEP * interval, CLOSING_SECONDS)
     texts = [*apart, *_lag_texts(left.name, right.name, lag, limit)]
     if not texts:
-        if lag is None or not lag.proven:
+        if lag is None:
+            needed = seconds_text(2 * MIN_MOMENTS * interval)
+            return Finding(None, f"{right.name}: required {needed} in common", name="step", unit="ms")
+        if not lag.proven:
             unknown = f"{right.name}: the sensors have no motion in common that tells; press both at once"
             return Finding(None, unknown, name="step", unit="ms")
         texts = [f"{right.name} and {left.name} are in step"]

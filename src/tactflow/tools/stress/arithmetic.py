@@ -47,7 +47,7 @@ def run_arithmetic(subjects: Sequence[Subject], *, quick: bool) -> Part:
             with strict():
                 slow = [numbers(result) for result in subject.run(plain.frames)]
             found = add_differences(worst, "arithmetic", list(zip(fast, slow, strict=True)), case.label)
-            largest = {key: max(largest.get(key, 0.0), value) for key, value in found.items()}
+            largest |= {key: max(largest.get(key, 0.0), value) for key, value in found.items()}
             part.trials += 2 * len(fast)
         rows.append([subject.name, *cells(largest)])
         part.checks += worst.checks()

@@ -104,7 +104,7 @@ def _changes(
         frame[y, x, channel] += 1 if frame[y, x, channel] < 255 else -1
         after = _numbers(subject.run([*plain.frames[:last], frame]))
         found = add_differences(worst, "pixel", [(before[last], after[last])], f"pixel ({x}, {y})")
-        largest = {key: max(largest.get(key, 0.0), value) for key, value in found.items()}
+        largest |= {key: max(largest.get(key, 0.0), value) for key, value in found.items()}
     yield "one grey level in one pixel", largest, len(plain.frames) * (2 if quick else PIXELS)
     if not quick:
         dither = random.integers(-1, 2, plain.frames[last].shape)
