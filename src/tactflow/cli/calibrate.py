@@ -11,11 +11,11 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from tactflow.api import Settings, ended_by_signals, load, make_runner
-from tactflow.calibration.check import check
+from tactflow.calibration.check import check, check_force
 from tactflow.calibration.file import Calibration
 from tactflow.calibration.force import Watched
 from tactflow.calibration.guide import Guide
-from tactflow.calibration.reference import Reference, read_reference, recordings_with_csv
+from tactflow.calibration.reference import read_reference, recordings_with_csv
 from tactflow.calibration.session import (
     ENOUGH_PRESSES,
     Method,
@@ -217,13 +217,21 @@ def _check(args: argparse.Namespace) -> int:
     guide = None if pressed is None else Guide(presses, say)
     session = find_presses(_player(_load(args, pipeline)), guide)
 
-    def force_today() -> tuple[Watched, Reference]:
+    if (misfit := calibration.misfit(session.mapping)) is not None:
+        show([f"does not fit: {misfit}; use the pipeline that it was made with, or calibrate again"])
+        return StageError.exit_code
+    fits, lines = check(calibration, session)
+    show(lines)
+    if args.csv is not None:
         if calibration.force is None:
             raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
         watched = watch(_player(_load(args, pipeline)), path)
-        return watched, read_reference(args.csv).later(args.offset)
-
-    fits = check(calibration, session, lambda line: show([line]), force_today if args.csv else None)
+        force_fits, lines = check_force(
+            calibration.force, watched, read_reference(args.csv).later(args.offset)
+        )
+        show(lines)
+        fits = fits and force_fits
+    show(["it still fits" if fits else "it does not fit; unless a reason above applies, calibrate again"])
     return 0 if fits else StageError.exit_code
 
 
