@@ -20,7 +20,7 @@ Flags = NDArray[np.bool_]
 
 MAD_TO_SIGMA: Final = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-SATURATED: Final = 250
+SATURATED_GREY: Final = 250
 """Grey level from which a pixel counts as saturated. Chosen by hand."""
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
 from tactflow.vision.change import DamageTest, shows_gel
-from tactflow.vision.change.damage import LASTING
+from tactflow.vision.change.damage import MAX_DISPLACED_PICTURES
 
 Picture = NDArray[np.uint8]
 
@@ -84,12 +84,15 @@ def test_a_displacement_that_lasts_is_how_the_camera_delivers_its_pictures() -> 
     scene = open_scene("idle?frames=2")
     test = DamageTest(scene.frame(0))
     moved = np.roll(scene.frame(1), 8, axis=1)
-    assert [test.is_damaged(moved) for _ in range(LASTING + 3)] == [*[True] * (LASTING - 1), *[False] * 4]
+    assert [test.is_damaged(moved) for _ in range(MAX_DISPLACED_PICTURES + 3)] == [
+        *[True] * (MAX_DISPLACED_PICTURES - 1),
+        *[False] * 4,
+    ]
 
 
 def test_an_empty_buffer_is_damaged_however_long_it_lasts() -> None:
     test = DamageTest(open_scene("idle?frames=2").frame(0))
-    assert all(test.is_damaged(uniform(0)) for _ in range(2 * LASTING))
+    assert all(test.is_damaged(uniform(0)) for _ in range(2 * MAX_DISPLACED_PICTURES))
 
 
 def test_nothing_is_damaged_where_the_reference_shows_nothing() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.change.settling import MOST, Settling, change_between, look_at, unevenness
+from tactflow.vision.change.settling import MAX_STEADY_FRAMES, Settling, change_between, look_at, unevenness
 
 Image = NDArray[np.uint8]
 
@@ -38,8 +38,8 @@ def settled(frames: list[Image], rate: float = 25.0) -> Settling:
 
 def test_light_that_is_steady_from_the_start_leaves_the_first_frame_the_reference() -> None:
     settling = settled([picture() for _ in range(30)])
-    assert (len(settling), settling.best()) == (MOST, 0)
-    assert settling.alike() == list(range(MOST))
+    assert (len(settling), settling.best()) == (MAX_STEADY_FRAMES, 0)
+    assert settling.alike() == list(range(MAX_STEADY_FRAMES))
 
 
 @pytest.mark.parametrize("white_balance", [False, True])
@@ -144,7 +144,7 @@ def test_a_lamp_that_flickers_is_as_steady_as_it_gets() -> None:
 
 def test_separate_pictures_are_no_video_and_the_first_one_is_the_reference() -> None:
     settling = Settling()
-    for index in range(2 * MOST):
+    for index in range(2 * MAX_STEADY_FRAMES):
         assert not settling.unrelated
         settling.add(np.roll(picture(1, 0.6 if index else 0), 13 * index, axis=1), index / 25)
     assert settling.unrelated
@@ -153,6 +153,6 @@ def test_separate_pictures_are_no_video_and_the_first_one_is_the_reference() -> 
 
 @pytest.mark.parametrize("shape", [(3, 4), (1, 1, 3), (48, 64, 1), (700, 30, 3), (1, 640), (2000, 2, 3)])
 def test_pictures_of_any_size_can_be_looked_at(shape: tuple[int, ...]) -> None:
-    settling = settled([np.full(shape, 100, np.uint8)] * MOST)
+    settling = settled([np.full(shape, 100, np.uint8)] * MAX_STEADY_FRAMES)
     assert settling.steady
     assert settling.best() == 0

@@ -19,42 +19,42 @@ from scipy import fft
 
 from tactflow.vision.arrays import Floats32, check_color_image
 
-ROWS: Final = 48
+EXAMINED_ROWS: Final = 48
 """Rows of a picture that are examined: three for each of the 16 lines of a block of JPEG at 800 x 600."""
-SHORTEST_RUN: Final = 4
+MIN_RUN_ROWS: Final = 4
 """Minimum number of successive rows of those that are damaged: a twelfth of the picture."""
-STRUCTURE: Final = 1.0
+MAX_CONSTANT_ROW_VARIANCE: Final = 1.0
 """Largest variance of a constant row after compression, squared grey levels."""
-VISIBLE: Final = 9.0
-"""Smallest variance of a row whose loss is noticed, squared grey levels: three times `STRUCTURE` in standard
-deviations."""
-UNCORRELATED: Final = 0.6
+MIN_STRUCTURED_ROW_VARIANCE: Final = 9.0
+"""Smallest variance of a row whose loss is noticed, squared grey levels: three times
+`MAX_CONSTANT_ROW_VARIANCE` in standard deviations."""
+NOISE_VON_NEUMANN_RATIO: Final = 0.6
 """Ratio of von Neumann, 1 for white noise, above which no lens has drawn a row. Even white texture has 0.4
 behind the sharpest lens, whose blur has a standard deviation of 0.7 px."""
-LAG: Final = 32
+MAX_LAG_PX: Final = 32
 """Largest displacement that is searched, px."""
-SHORTEST_LAG: Final = 4
+MIN_LAG_PX: Final = 4
 """Smallest displacement that is damage, px: half a block of JPEG. A gel that is dragged as a whole moves by 2
 to 3 px on the recordings."""
-LEFT: Final = 3.0
+MAX_RESIDUAL_NOISE_RATIO: Final = 3.0
 """Largest squared residual of a displaced row, relative to that of noise: bytes are displaced by whole
 pixels, while a dragged gel, by any distance, leaves a residual at the edges of its dots."""
-BETTER: Final = 9.0
+MIN_IMPROVEMENT_RATIO: Final = 9.0
 """Ratio of the squared residuals without and with the displacement: three standard deviations of noise."""
-PARTS: Final = 4
-WIDE_PARTS: Final = 3
+PARTS_PER_ROW: Final = 4
+MIN_DISPLACED_PARTS: Final = 3
 """Parts of a row, and the number of them that must show the displacement: an object that has moved fills one
 or two, or leaves the dots beside it."""
-DISPLACED: Final = 6
+MIN_DISPLACED_ROWS: Final = 6
 """Minimum number of displaced rows: an eighth of the picture."""
-LASTING: Final = 30
+MAX_DISPLACED_PICTURES: Final = 30
 """Number of successive displaced pictures after which this is how the camera delivers them."""
-SAMPLES: Final = 32
+SAMPLES_PER_SIDE: Final = 32
 """Points along each side of the picture that decide whether it is examined."""
-CHANGED: Final = 0.01
+MIN_CHANGED_SHARE: Final = 0.01
 """Minimum share of these points that changed since the last whole picture. A displacement of the lower half
 by 8 px changes 3.4 % in the scene `press`."""
-SIGMAS: Final = 6.0
+MIN_CHANGE_SIGMAS: Final = 6.0
 """Minimum change of such a point, standard deviations of the noise of one picture: of its difference from
 another one, 4.2."""
 
@@ -63,7 +63,7 @@ class _Rows:
     """Some rows of a picture, (n, W, 3) uint8; each property is computed once."""
 
     def __init__(self, picture: NDArray[np.uint8]) -> None:
-        self._rows = picture[_places(picture.shape[0], ROWS)]
+        self._rows = picture[_places(picture.shape[0], EXAMINED_ROWS)]
 
     @cached_property
     def empty(self) -> NDArray[np.bool_]:
@@ -71,7 +71,9 @@ class _Rows:
         flags = np.ones(len(self._rows), np.bool_)
         for channel in (1, 0, 2):
             structure, noise = _variances(self._rows[flags, :, channel])
-            limit = np.maximum(np.float32(STRUCTURE), np.float32(1 / UNCORRELATED - 1) * noise)
+            limit = np.maximum(
+                np.float32(MAX_CONSTANT_ROW_VARIANCE), np.float32(1 / NOISE_VON_NEUMANN_RATIO - 1) * noise
+            )
             flags[flags] = structure < limit
         return flags
 
@@ -79,7 +81,10 @@ class _Rows:
     def visible(self) -> NDArray[np.bool_]:
         """(n,) whether a row has a strong correlated part in some channel."""
         pairs = [_variances(self._rows[..., channel]) for channel in range(3)]
-        flags = [structure > np.maximum(np.float32(VISIBLE), noise) for structure, noise in pairs]
+        flags = [
+            structure > np.maximum(np.float32(MIN_STRUCTURED_ROW_VARIANCE), noise)
+            for structure, noise in pairs
+        ]
         return np.asarray(np.any(flags, axis=0))
 
     @cached_property
@@ -89,9 +94,9 @@ class _Rows:
 
     @cached_property
     def detail(self) -> Floats32:
-        """(n, W), green without its mean over 2 `LAG` + 1 px."""
+        """(n, W), green without its mean over 2 `MAX_LAG_PX` + 1 px."""
         green = self._rows[..., 1].astype(np.float32)
-        return np.asarray(green - cv2.blur(green, (2 * LAG + 1, 1)), np.float32)
+        return np.asarray(green - cv2.blur(green, (2 * MAX_LAG_PX + 1, 1)), np.float32)
 
 
 def _variances(rows: NDArray[np.uint8]) -> tuple[Floats32, Floats32]:
@@ -155,13 +160,16 @@ class DamageTest:
             raise ValueError(f"required a picture of shape {self._shape}, got {picture.shape}")
         points = self._sampled(picture)
         change = np.abs(points - self._last)
-        if self._reference is not None and np.count_nonzero(change > self._noise) > CHANGED * change.size:
+        if (
+            self._reference is not None
+            and np.count_nonzero(change > self._noise) > MIN_CHANGED_SHARE * change.size
+        ):
             rows = _Rows(picture)
             if _longest(rows.empty & self._reference.visible) >= self._shortest:
                 return True
             if self._is_displaced(rows):
                 self._displaced += 1
-                if self._displaced < LASTING:
+                if self._displaced < MAX_DISPLACED_PICTURES:
                     return True
                 self._learn(rows)
         self._displaced = 0
@@ -174,43 +182,43 @@ class DamageTest:
     def _learn(self, rows: _Rows) -> None:
         """Compare with these rows from now on."""
         self._reference = rows
-        self._noise = SIGMAS * max(rows.noise, 1 / 12) ** 0.5
+        self._noise = MIN_CHANGE_SIGMAS * max(rows.noise, 1 / 12) ** 0.5
         # Rows between the pins of a picture in black and white are empty, too.
-        self._shortest = max(SHORTEST_RUN, 2 * _longest(rows.empty))
+        self._shortest = max(MIN_RUN_ROWS, 2 * _longest(rows.empty))
 
     def _is_displaced(self, rows: _Rows) -> bool:
         """Whether enough rows show what those of the reference show, but displaced."""
         assert self._reference is not None
         now, before = rows.detail, self._reference.detail
         width = now.shape[1]
-        lag = min(LAG, width // 8)
+        lag = min(MAX_LAG_PX, width // 8)
         # What is left after a displacement is at least the noise of both.
         least = np.float32(width * max(2 * self._reference.noise, 1 / 12))
-        changed = np.square(now - before).sum(axis=1) > np.float32(BETTER) * least
-        if lag < SHORTEST_LAG or np.count_nonzero(changed) < DISPLACED:
+        changed = np.square(now - before).sum(axis=1) > np.float32(MIN_IMPROVEMENT_RATIO) * least
+        if lag < MIN_LAG_PX or np.count_nonzero(changed) < MIN_DISPLACED_ROWS:
             return False
         now, before = now[changed], before[changed]
         size = fft.next_fast_len(width + lag, real=True)
         spectra = fft.rfft(now, size, axis=1) * np.conj(fft.rfft(before, size, axis=1))
         products = fft.irfft(spectra, size, axis=1)[:, np.arange(-lag, lag + 1)]
         best = products.argmax(axis=1) - lag
-        shifts, counts = np.unique(best[np.abs(best) >= SHORTEST_LAG], return_counts=True)
+        shifts, counts = np.unique(best[np.abs(best) >= MIN_LAG_PX], return_counts=True)
         inner = slice(lag, width - lag)
-        for shift in shifts[counts >= DISPLACED]:
+        for shift in shifts[counts >= MIN_DISPLACED_ROWS]:
             rows_there = best == shift
             there = before[rows_there, lag - shift : width - lag - shift]
             left = _part_means(now[rows_there, inner] - there)
             still = _part_means(now[rows_there, inner] - before[rows_there, inner])
-            widely = np.count_nonzero(still > BETTER * left, axis=1) >= WIDE_PARTS
-            exact = widely & (left.mean(axis=1) < LEFT * least / width)
-            if np.count_nonzero(exact) >= DISPLACED:
+            widely = np.count_nonzero(still > MIN_IMPROVEMENT_RATIO * left, axis=1) >= MIN_DISPLACED_PARTS
+            exact = widely & (left.mean(axis=1) < MAX_RESIDUAL_NOISE_RATIO * least / width)
+            if np.count_nonzero(exact) >= MIN_DISPLACED_ROWS:
                 return True
         return False
 
 
 def _part_means(differences: Floats32) -> Floats32:
-    """Mean squares (n, `PARTS`) of parts of rows (n, W)."""
-    parts = np.array_split(np.square(differences), PARTS, axis=1)
+    """Mean squares (n, `PARTS_PER_ROW`) of parts of rows (n, W)."""
+    parts = np.array_split(np.square(differences), PARTS_PER_ROW, axis=1)
     return np.stack([part.mean(axis=1) for part in parts], axis=1)
 
 
@@ -221,8 +229,8 @@ def _places(length: int, number: int) -> NDArray[np.intp]:
 
 
 def _stride(length: int) -> slice:
-    """A slice of about `SAMPLES` indices, evenly spread over a length."""
-    step = max(1, length // SAMPLES)
+    """A slice of about `SAMPLES_PER_SIDE` indices, evenly spread over a length."""
+    step = max(1, length // SAMPLES_PER_SIDE)
     return slice(step // 2, None, step)
 
 

@@ -25,31 +25,31 @@ from tactflow.vision.contact.background_kernels import weigh_change
 from tactflow.vision.contact.components import WIDE_DEVIATION
 from tactflow.vision.contact.illumination import positions
 
-TILES: Final = 24
+LONG_SIDE_TILES: Final = 24
 """Tiles along the longer side of a frame: a contact of 4 % of its width fills one. A smaller spot without
 colour may be missed."""
-READ: Final = 250_000
+READ_BYTES: Final = 250_000
 """Bytes of a frame that are read: all of a small one, a sixth of 800 x 600 px. More would cost time."""
-LINES: Final = 6
+MIN_LINES_PER_TILE: Final = 6
 """Minimum number of lines that are read per tile. A third of the lines is evenly spaced, so that no contact
 falls between them; the others are those with the strongest edges, which show motion best."""
-NOISE: Final = 1.0
+TILE_NOISE_GREY: Final = 1.0
 """Standard deviation of a tile's light, grey levels: compression changes it by up to as much."""
-STRAY: Final = 0.077
+GEL_MOVEMENT_TILES: Final = 0.077
 """Movement of the untouched gel against the camera, tiles: the detector's 1 px of 300."""
-ALIKE: Final = 0.05
+GROWTH_TOLERANCE: Final = 0.05
 """Tolerated growth of a deviation that showed no contact, in thresholds. At 0 to 0.05 none of 360 real
 contacts begins late, at 0.1 one does; at 0 flicker and noise cost 2 % of the frames at rest."""
-NEAR: Final = 3
+WINDOW_TILES: Final = 3
 """Width of the windows in which a displacement is measured, tiles."""
-BLOCK: Final = 8
+NOISE_BLOCK_FRAMES: Final = 8
 """Number of frame differences per estimate of the noise; half as many for the first one."""
-BLOCKS: Final = 5
+NOISE_BLOCK_COUNT: Final = 5
 """Number of estimates whose median is the noise, so that motion in two of them has no effect: about a
 second."""
-SHIFT: Final = 0.05
-"""px: tolerance of the dots' positions."""
-ROUNDING: Final = 1 / 12
+DOT_TOLERANCE_PX: Final = 0.05
+"""Tolerance of the positions of dots, px."""
+ROUNDING_VARIANCE: Final = 1 / 12
 """Variance of rounding to whole grey levels, squared levels."""
 
 
@@ -111,9 +111,9 @@ class RestTest:
             raise ValueError(f"required false_alarms in (0, 0.5], got {false_alarms}")
         check_color_image(frame)
         self._shape = frame.shape
-        tile = min(max(LINES, round(max(self._shape) / TILES)), *self._shape[:2])
+        tile = min(max(MIN_LINES_PER_TILE, round(max(self._shape) / LONG_SIDE_TILES)), *self._shape[:2])
         rows, columns = self._shape[0] // tile, self._shape[1] // tile
-        lines = min(max(LINES, READ // (3 * tile * rows * columns)), tile)
+        lines = min(max(MIN_LINES_PER_TILE, READ_BYTES // (3 * tile * rows * columns)), tile)
         gray = np.asarray(frame[: rows * tile, : columns * tile, 1], np.float32)
         slopes = _slopes(gray)
         used = _used_lines(np.square(slopes).sum(axis=(0, 2)).reshape(rows, tile), lines)
@@ -122,7 +122,7 @@ class RestTest:
         self._resting: NDArray[np.uint8] = np.ascontiguousarray(frame[self._used][..., 1])
         self._pixels = tile * lines
         energy = np.square(self._slopes).reshape(2, rows, -1, columns, tile).sum(axis=(2, 4))
-        energy = _near(energy) + np.float32(ROUNDING * self._pixels)
+        energy = _near(energy) + np.float32(ROUNDING_VARIANCE * self._pixels)
         self._px_per_edge = np.asarray(1 / np.sqrt(energy), np.float32)
         self._z = np.float32(-NormalDist().inv_cdf(false_alarms / (4 * rows * columns)))
         self._light = _LightTest(self._sums(frame)[:3] / np.float32(self._pixels), repeatability, tint)
@@ -131,7 +131,7 @@ class RestTest:
         self._allowed: Floats32 | None = None
         self._followed: Floats32 | None = None
         self._steps: list[Floats32] = []
-        self._variances: deque[Floats32] = deque(maxlen=BLOCKS)
+        self._variances: deque[Floats32] = deque(maxlen=NOISE_BLOCK_COUNT)
         self._bound: Floats32 | None = None
 
     def look(self, frame: NDArray[np.uint8], *, touching: bool = False, due: bool = False) -> Look:
@@ -161,7 +161,9 @@ class RestTest:
             self._learn(now.shift - last.shift)
         elif not due:
             return Look(False, False)
-        suspect = due or bool((now.departure > np.maximum(self._allowed + np.float32(ALIKE), 1)).any())
+        suspect = due or bool(
+            (now.departure > np.maximum(self._allowed + np.float32(GROWTH_TOLERANCE), 1)).any()
+        )
         # A deviation that has crept back must not return unnoticed.
         self._allowed = now.departure if suspect else np.minimum(self._allowed, now.departure)
         moved = self._bound is None or bool((np.abs(now.shift - self._followed) > self._bound).any())
@@ -184,17 +186,19 @@ class RestTest:
     def _learn(self, step: Floats32) -> None:
         """Update the noise with the difference of displacements in two consecutive frames."""
         self._steps.append(step)
-        if len(self._steps) < (BLOCK if self._variances else BLOCK // 2):
+        if len(self._steps) < (NOISE_BLOCK_FRAMES if self._variances else NOISE_BLOCK_FRAMES // 2):
             return
         # The variance excludes a steady drag.
         variance = np.var(self._steps, axis=0) / np.float32(2)
         self._steps.clear()
         # Neighbouring tiles are alike, except for one that is much noisier.
         near = np.stack([cv2.blur(plane, (5, 5)) for plane in variance])
-        self._variances.append(np.maximum(np.maximum(near, variance / 2), np.float32(ROUNDING / NEAR**2)))
+        self._variances.append(
+            np.maximum(np.maximum(near, variance / 2), np.float32(ROUNDING_VARIANCE / WINDOW_TILES**2))
+        )
         bound = self._z * np.sqrt(2 * np.median(self._variances, axis=0))
         shifts = bound * self._px_per_edge
-        self._bound = np.asarray(bound, np.float32) if np.median(shifts) <= SHIFT else None
+        self._bound = np.asarray(bound, np.float32) if np.median(shifts) <= DOT_TOLERANCE_PX else None
 
 
 class _LightTest:
@@ -206,7 +210,7 @@ class _LightTest:
 
     def __init__(self, untouched: Floats32, repeatability: float, tint: float) -> None:
         slopes = [_slopes(plane) for plane in untouched]
-        steady = NOISE**2 + STRAY**2 * np.square(slopes).sum(axis=1)
+        steady = TILE_NOISE_GREY**2 + GEL_MOVEMENT_TILES**2 * np.square(slopes).sum(axis=1)
         self._known = Derived.of(untouched, steady, repeatability, tint)
         self._before = np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)
 
@@ -228,8 +232,8 @@ def _slopes(plane: Floats32) -> Floats32:
 
 
 def _near(sums: Floats32) -> Floats32:
-    """Means of planes (2, rows, columns) over windows of `NEAR` tiles; values outside the frame are 0."""
-    size, border = (NEAR, NEAR), cv2.BORDER_CONSTANT
+    """Means of planes (2, rows, columns) over `WINDOW_TILES` tiles a side; 0 outside the frame."""
+    size, border = (WINDOW_TILES, WINDOW_TILES), cv2.BORDER_CONSTANT
     return np.stack([cv2.blur(plane, size, borderType=border) for plane in sums])
 
 

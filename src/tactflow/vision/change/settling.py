@@ -11,53 +11,53 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import MAD_TO_SIGMA, Floats32
 
-COLUMNS: Final = 40
+COLUMN_COUNT: Final = 40
 """Cells across a picture, about. Chosen by hand: a cell is smaller than most contacts."""
-SIDE: Final = 4
+CELL_SIDE_SAMPLES: Final = 4
 """Samples along the side of a cell. Sixteen of them take the noise of a pixel down to a quarter."""
-DARK, BRIGHT = 8, 247
+BLACK_LIMIT_GREY, SATURATED_LIMIT_GREY = 8, 247
 """Grey levels below which a sample is black and above which it is saturated: it does not follow the exposure.
 Chosen by hand."""
-CLIPPED: Final = 0.1
+MAX_CLIPPED_SHARE: Final = 0.1
 """Share of such samples from which a cell is ignored. Chosen by hand."""
 
-CALM: Final = 0.4
+STEADY_SECONDS: Final = 0.4
 """Duration for which consecutive frames must be alike for the light to be steady, s. Chosen on franka_mini,
 whose first frames may show the previous grasp for up to 0.32 s."""
-FEWEST, MOST = 4, 10
+MIN_STEADY_FRAMES, MAX_STEADY_FRAMES = 4, 10
 """Minimum number of these frames, so that they reveal a trend, and maximum, because a camera sets its
 exposure from frame to frame. The minimum was chosen on every second recording of franka_mini, with two of
 three and three of four frames left out."""
-SHORT: Final = 0.4
+MIN_STATE_FRACTION: Final = 0.4
 """Minimum length of a state of the gel, as a fraction of these frames. Chosen by hand."""
-STEADY: Final = 0.02
+MAX_STEADY_CHANGE: Final = 0.02
 """Maximum relative change of a channel in steady light: less than that of a contact (`repeatability`)."""
-SCATTER: Final = 2.5
+MAX_FLICKER_STDDEVS: Final = 2.5
 """The same for flickering light, in standard deviations. Chosen by hand."""
-UNRELATED: Final = 1.0
+MIN_TRENDLESS_RATIO: Final = 1.0
 """Ratio of the squared changes from frame to frame to the squared deviations from the mean above which frames
 scatter without a trend. It is 2 for independent frames; in ten of them it falls below 1.06 by chance once in
 twenty times (J. von Neumann, Annals of Mathematical Statistics 12, 1941)."""
-LOCAL: Final = 0.06
+MIN_LOCAL_CHANGE: Final = 0.06
 """Minimum relative change of a cell against the rest of the picture if something moved there, after a mean
 over 3 x 3 cells. Chosen on franka_mini: key frames of its compression stay below."""
-MOVED: Final = 0.01
+MIN_MOVED_SHARE: Final = 0.01
 """Minimum share of cells that moved. Chosen by hand."""
-ELSEWHERE: Final = 0.5
+OTHER_GEL_SHARE: Final = 0.5
 """Share of cells that moved above which two pictures show different gels: a touch leaves some of a gel as it
 was."""
-SMOOTH: Final = 3
+LIGHT_DEGREE: Final = 3
 """Degree of the polynomial in x and y that models the light of an untouched gel. Chosen by hand."""
-MEDIAN: Final = 5
+MEDIAN_SIDE_CELLS: Final = 5
 """Side of the median filter that removes dots, cells. Chosen by hand."""
-EVENER: Final = 0.8
+EVENER_RATIO: Final = 0.8
 """Ratio of two states' unevenness below which the evener one is the untouched gel, if the light was still
 changing, or if the first state is so brief that it may be the end of a touch. Chosen on franka_mini: a
 touched gel has 1.2 to 50 times the unevenness of the same gel at rest, and for faint contacts at least
 0.9."""
-MUCH_EVENER: Final = 0.5
+MUCH_EVENER_RATIO: Final = 0.5
 """The same if there is no other reason to prefer the later state. Chosen by hand."""
-AS_EVEN: Final = 1.5
+EVEN_RATIO: Final = 1.5
 """Ratio up to which a state with steady light is preferred to one whose light was changing. Chosen on
 franka_mini, where darker pictures have less contrast."""
 
@@ -78,16 +78,16 @@ def look_at(frame: NDArray[np.uint8]) -> Look:
     >>> look_at(np.full((480, 640, 3), 100, np.uint8)).light.shape
     (30, 40, 3)
     """
-    step = max(1, max(frame.shape[:2]) // (COLUMNS * SIDE))
+    step = max(1, max(frame.shape[:2]) // (COLUMN_COUNT * CELL_SIDE_SAMPLES))
     # A line camera's frame may be thinner than a step.
     top, left = (min(step, side) // 2 for side in frame.shape[:2])
     points = np.atleast_3d(frame[top::step, left::step])
-    side = min(SIDE, *points.shape[:2])
+    side = min(CELL_SIDE_SAMPLES, *points.shape[:2])
     high, wide = points.shape[0] // side, points.shape[1] // side
     cells = points[: high * side, : wide * side].reshape(high, side, wide, side, -1)
-    clipped = ((cells < DARK) | (cells > BRIGHT)).mean(axis=(1, 3))
+    clipped = ((cells < BLACK_LIMIT_GREY) | (cells > SATURATED_LIMIT_GREY)).mean(axis=(1, 3))
     light = np.log1p(cells.mean(axis=(1, 3), dtype=np.float32))
-    return Look(light, clipped < CLIPPED)
+    return Look(light, clipped < MAX_CLIPPED_SHARE)
 
 
 def change_between(before: Look, after: Look) -> tuple[Floats32, bool]:
@@ -97,7 +97,7 @@ def change_between(before: Look, after: Look) -> tuple[Floats32, bool]:
     robust against an object that covers less than half of it; and whether cells changed relative to it.
     """
     gain, moved = _moved(before, after)
-    return gain, bool(moved.mean() > MOVED)
+    return gain, bool(moved.mean() > MIN_MOVED_SHARE)
 
 
 def _moved(before: Look, after: Look) -> tuple[Floats32, NDArray[np.bool_]]:
@@ -108,7 +108,7 @@ def _moved(before: Look, after: Look) -> tuple[Floats32, NDArray[np.bool_]]:
     visible = both.any(axis=(0, 1))
     gain[visible] = np.nanmedian(change[..., visible], axis=(0, 1))
     left = cv2.blur(np.where(both, change - gain, np.float32(0)), (3, 3))
-    return gain, np.abs(np.atleast_3d(left)).max(axis=2) > LOCAL
+    return gain, np.abs(np.atleast_3d(left)).max(axis=2) > MIN_LOCAL_CHANGE
 
 
 def unevenness(look: Look) -> float:
@@ -121,7 +121,7 @@ def unevenness(look: Look) -> float:
     basis = _polynomials(*look.light.shape[:2])
     residuals = []
     for channel in range(look.light.shape[2]):
-        plane = cv2.medianBlur(np.ascontiguousarray(look.light[..., channel]), MEDIAN).ravel()
+        plane = cv2.medianBlur(np.ascontiguousarray(look.light[..., channel]), MEDIAN_SIDE_CELLS).ravel()
         seen = look.seen[..., channel].ravel()
         if np.count_nonzero(seen) < 2 * basis.shape[1]:
             continue
@@ -132,9 +132,9 @@ def unevenness(look: Look) -> float:
 
 @lru_cache(maxsize=4)
 def _polynomials(high: int, wide: int) -> Floats32:
-    """(high * wide, terms): powers of x and y up to the degree `SMOOTH`."""
+    """(high * wide, terms): powers of x and y up to the degree `LIGHT_DEGREE`."""
     y, x = np.meshgrid(np.linspace(-1, 1, high), np.linspace(-1, 1, wide), indexing="ij")
-    terms = [x**i * y**j for i in range(SMOOTH + 1) for j in range(SMOOTH + 1 - i)]
+    terms = [x**i * y**j for i in range(LIGHT_DEGREE + 1) for j in range(LIGHT_DEGREE + 1 - i)]
     return np.stack(terms, axis=-1).reshape(high * wide, -1).astype(np.float32)
 
 
@@ -184,14 +184,18 @@ class Settling:
 
     @property
     def _calm(self) -> int:
-        """Number of consecutive frames that must be alike: those within the time `CALM`."""
+        """Number of consecutive frames that must be alike: those within the time `STEADY_SECONDS`."""
         step = float(np.median(np.diff(self._times))) if len(self) > 1 else 0.0
-        return int(np.clip(round(CALM / step), FEWEST, MOST)) if step > 0 else MOST
+        return (
+            int(np.clip(round(STEADY_SECONDS / step), MIN_STEADY_FRAMES, MAX_STEADY_FRAMES))
+            if step > 0
+            else MAX_STEADY_FRAMES
+        )
 
     @property
     def _short(self) -> int:
         """Minimum number of frames of a state."""
-        return round(SHORT * self._calm)
+        return round(MIN_STATE_FRACTION * self._calm)
 
     @property
     def steady(self) -> bool:
@@ -205,7 +209,9 @@ class Settling:
         if not later or len(first) < self._short:
             return False
         spread = np.ptp([self._gains[i] for i in first], axis=0).max()
-        return bool(spread < STEADY) and unevenness(self._looks[-1]) > AS_EVEN * self._unevenness(first)
+        return bool(spread < MAX_STEADY_CHANGE) and unevenness(
+            self._looks[-1]
+        ) > EVEN_RATIO * self._unevenness(first)
 
     @property
     def undecided(self) -> bool:
@@ -226,7 +232,9 @@ class Settling:
         if len(first) >= self._calm / 2 or not self.undecided:
             return False
         moved = _moved(self._looks[first[0]], self._looks[-1])[1]
-        return bool(moved.mean() > ELSEWHERE) or self._unevenness(last) < AS_EVEN * self._unevenness(first)
+        return bool(moved.mean() > OTHER_GEL_SHARE) or self._unevenness(last) < EVEN_RATIO * self._unevenness(
+            first
+        )
 
     @property
     def begins(self) -> int:
@@ -241,7 +249,7 @@ class Settling:
     @property
     def unrelated(self) -> bool:
         """Whether these are separate pictures rather than a video."""
-        return len(self) >= 2 * MOST and self.scattered
+        return len(self) >= 2 * MAX_STEADY_FRAMES and self.scattered
 
     @property
     def changing(self) -> bool:
@@ -291,10 +299,10 @@ class Settling:
         passing = len(calm) < self._calm / 2
         apart = np.abs(self._level(state)[0] - self._level(than)[0]).max()
         # A camera that sets its exposure does not hold one light at first, whatever a lamp does later.
-        unsettled = than is not self._states[0] or apart > STEADY
+        unsettled = than is not self._states[0] or apart > MAX_STEADY_CHANGE
         if (passing and unsettled) or calm[0] != than[0]:
-            return here < there * (AS_EVEN if self._is_steady(state) else EVENER)
-        return here < there * (EVENER if passing else MUCH_EVENER)
+            return here < there * (EVEN_RATIO if self._is_steady(state) else EVENER_RATIO)
+        return here < there * (EVENER_RATIO if passing else MUCH_EVENER_RATIO)
 
     def _unevenness(self, state: list[int]) -> float:
         calm = self._calm_frames(state)
@@ -306,14 +314,16 @@ class Settling:
             return False
         scatter = np.square(gains - gains.mean(axis=0)).sum(axis=0)
         steps = np.square(np.diff(gains, axis=0)).sum(axis=0)
-        return bool(np.all((np.ptp(gains, axis=0) < STEADY) | (steps > UNRELATED * scatter)))
+        return bool(
+            np.all((np.ptp(gains, axis=0) < MAX_STEADY_CHANGE) | (steps > MIN_TRENDLESS_RATIO * scatter))
+        )
 
     def _level(self, state: list[int]) -> tuple[Floats32, Floats32]:
         """Final light of a state, and its tolerance: (channels,) each."""
         gains = np.array([self._gains[i] for i in state[-self._calm :]])
         level = np.median(gains, axis=0)
         spread = np.float32(MAD_TO_SIGMA) * np.median(np.abs(gains - level), axis=0)
-        return level, np.maximum(np.float32(STEADY), np.float32(SCATTER) * spread)
+        return level, np.maximum(np.float32(MAX_STEADY_CHANGE), np.float32(MAX_FLICKER_STDDEVS) * spread)
 
     def _calm_frames(self, state: list[int]) -> list[int]:
         """The frames of a state in its final light."""

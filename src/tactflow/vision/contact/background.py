@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED, Floats32
+from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED_GREY, Floats32
 from tactflow.vision.contact.background_kernels import (
     CENTER_WEIGHT,
     NEIGHBOUR_WEIGHT,
@@ -113,7 +113,7 @@ class Derived:
         factor = (variance / (steady + (tint * mean) ** 2)).min(axis=0)
         length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
         scale = 1 / np.sqrt(steady.max(axis=0) + (repeatability * mean.mean()) ** 2)
-        scale = scale * (mean.max(axis=0) < SATURATED)
+        scale = scale * (mean.max(axis=0) < SATURATED_GREY)
         if gel is not None:
             weight, scale = weight * gel, scale * gel
         return cls(

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import SATURATED, Floats32
+from tactflow.vision.arrays import SATURATED_GREY, Floats32
 from tactflow.vision.compiled import kernel
 
 BLOCK_CELLS: Final = 8
@@ -197,7 +197,7 @@ def compare_blocks(
                 for x in range(column * wide // across, -(-(column + 1) * wide // across)):
                     mean += line[x] * column_weights[column, x]
                 excess[c, at] = mean - reference[c, at]
-                limit[c, at] = usual_limit[c, at] if mean < SATURATED else np.float32(0)
+                limit[c, at] = usual_limit[c, at] if mean < SATURATED_GREY else np.float32(0)
                 if per_brightness[c, at] > 0:
                     ratios[count] = excess[c, at] * per_brightness[c, at]
                     most = max(most, ratios[count])

@@ -11,27 +11,27 @@ import numpy as np
 from tactflow.vision.arrays import Floats
 from tactflow.vision.geometry.region import Contours, Moments
 
-FALSE_DIRECTION: Final = 1e-3
+FALSE_DIRECTION_RATE: Final = 1e-3
 """Rate at which regions without a direction get one by chance. Chosen by hand."""
-VERTICAL: Final = 6e-6
+VERTICAL_TOLERANCE_DEG: Final = 6e-6
 """Angle to the vertical, degrees, within which an axis has no slope. Derived: 1e-7 rad, where rounding
 decides the sign of the slope."""
 
-_GRID_NOISE: Final = 0.122
+_GRID_ANISOTROPY_VARIANCE: Final = 0.122
 """Variance of the anisotropy of a disc of radius R px on a pixel grid at random phase, along its stronger
 component, times R^3. Derived in `anisotropy_limit`."""
-_HARMONICS: Final = range(3, 10)
+_ROUGHNESS_HARMONICS: Final = range(3, 10)
 """Harmonics that measure the roughness of the outline; 0 to 2 are size, place and elongation. The end is
 chosen by hand."""
-_LINEAR_LIMIT: Final = 0.6
+_MAX_LINEAR_ANISOTROPY: Final = 0.6
 """Anisotropy up to which it is proportional to the second harmonic: axis ratio 2. Chosen by hand."""
-_LEAST_VARIANCE: Final = 1e-12
+_MIN_VARIANCE_PX2: Final = 1e-12
 """Smallest variance that is divided by, px^2: that across a line of pixels is 0."""
-_LEAST_RADIUS: Final = 1e-9
+_MIN_RELATIVE_RADIUS: Final = 1e-9
 """Smallest distance of an outline point from the centre that is divided by, 1."""
-_MEDIAN_RATIO: Final = math.sqrt(1.25 + math.sqrt(1 + 840 / FALSE_DIRECTION)) - 5.5
+_MIN_HARMONIC_POWER_RATIO: Final = math.sqrt(1.25 + math.sqrt(1 + 840 / FALSE_DIRECTION_RATE)) - 5.5
 """Power of a harmonic, over the median power of seven others, that chance exceeds at the rate
-`FALSE_DIRECTION`. Derived in `anisotropy_limit`: the t at which the product equals that rate, since
+`FALSE_DIRECTION_RATE`. Derived in `anisotropy_limit`: the t at which the product equals that rate, since
 (t + 4) (t + 5) (t + 6) (t + 7) is the square of (t + 5.5)^2 - 1.25, less 1."""
 
 
@@ -51,12 +51,12 @@ def axis_direction(theta: float) -> tuple[float, float | None]:
     angle = angle - 180 * math.floor((angle + 90) / 180)
     if angle <= -90.0:
         angle += 180.0
-    slope = None if abs(abs(angle) - 90) < VERTICAL else math.tan(theta) + 0.0
+    slope = None if abs(abs(angle) - 90) < VERTICAL_TOLERANCE_DEG else math.tan(theta) + 0.0
     return angle + 0.0, slope
 
 
 def anisotropy_limit(contours: Contours, moments: Moments, pixels: int, confidence: float) -> float:
-    """Anisotropy that a region without a direction exceeds by chance at the rate `FALSE_DIRECTION`.
+    """Anisotropy that a region without a direction exceeds by chance at the rate `FALSE_DIRECTION_RATE`.
 
     contours, moments : of the region. pixels : their number. confidence : its anisotropy, 0 to 1.
 
@@ -75,34 +75,36 @@ def anisotropy_limit(contours: Contours, moments: Moments, pixels: int, confiden
     variable exceeds t times the median of seven others is the product of j / (j + t) for j = 4 ... 7.
     """
     radius = math.sqrt(pixels / math.pi)
-    limit = math.sqrt(-2 * math.log(FALSE_DIRECTION) * _GRID_NOISE / radius**3)
-    if confidence > _LINEAR_LIMIT or confidence <= limit:
+    limit = math.sqrt(-2 * math.log(FALSE_DIRECTION_RATE) * _GRID_ANISOTROPY_VARIANCE / radius**3)
+    if confidence > _MAX_LINEAR_ANISOTROPY or confidence <= limit:
         return limit
     power = _outline_power(contours, moments)
     # Of seven numbers, `np.median` takes a hundred times as long.
-    rough = 4 * math.sqrt(_MEDIAN_RATIO * statistics.median(power.tolist()))
-    return min(max(limit, rough), _LINEAR_LIMIT)
+    rough = 4 * math.sqrt(_MIN_HARMONIC_POWER_RATIO * statistics.median(power.tolist()))
+    return min(max(limit, rough), _MAX_LINEAR_ANISOTROPY)
 
 
 def _outline_power(contours: Contours, moments: Moments) -> Floats:
-    """Power of the outlines' `_HARMONICS`, relative to the ellipse with the region's second moments."""
+    """Power of `_ROUGHNESS_HARMONICS` of the outlines, relative to the ellipse of the region's moments."""
     center_x, center_y, xx, xy, yy = moments
     # Whitening by the Cholesky factor: in these coordinates the ellipse of second moments is a circle.
     l11 = math.sqrt(xx)
     l21 = xy / l11
-    l22 = math.sqrt(max(yy - l21 * l21, _LEAST_VARIANCE))
+    l22 = math.sqrt(max(yy - l21 * l21, _MIN_VARIANCE_PX2))
     deviations = []
     turns = []
     for contour in contours:
         z = np.empty(len(contour), np.complex128)
         z.real = (contour[:, 0, 0] - center_x) / l11
         z.imag = (contour[:, 0, 1] - center_y - l21 * z.real) / l22
-        distance = np.maximum(np.abs(z), _LEAST_RADIUS)
+        distance = np.maximum(np.abs(z), _MIN_RELATIVE_RADIUS)
         turn = z / distance
         # Fraction of the full turn that each outline point stands for.
         around = np.concatenate([turn[-1:], turn, turn[:1]])
         fraction = np.imag(np.conj(around[:-2]) * around[2:]) / (4 * math.pi)
         deviations.append((distance / 2 - 1) * fraction)
         turns.append(turn)
-    powers = np.vander(np.concatenate(turns), _HARMONICS.stop, increasing=True)[:, _HARMONICS.start :]
+    powers = np.vander(np.concatenate(turns), _ROUGHNESS_HARMONICS.stop, increasing=True)[
+        :, _ROUGHNESS_HARMONICS.start :
+    ]
     return np.asarray(np.abs(np.concatenate(deviations) @ powers) ** 2)

@@ -14,9 +14,9 @@ from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
 from tactflow.vision.geometry.region import Contours, Region, measure_region
 from tactflow.vision.types import Contact, Ellipse, Evidence
 
-_FEWEST_PIXELS: Final = 5
+_MIN_ELLIPSE_PIXELS: Final = 5
 """Smallest number of pixels with an ellipse. Derived: an ellipse has five parameters."""
-_WIDTH_OF_A_LINE: Final = 1 / 12 + 1e-9
+_MAX_LINE_VARIANCE_PX2: Final = 1 / 12 + 1e-9
 """Variance across a region, px^2, up to which it has no ellipse. Derived: that of a straight line of pixels
 is at most 1/12; the rest is for rounding."""
 
@@ -153,7 +153,7 @@ def _describe(
     ):
         angle, slope = axis_direction(0.5 * math.atan2(2 * xy, xx - yy))
     center, ellipse = moments[:2], None
-    if region.pixels >= _FEWEST_PIXELS and minor > _WIDTH_OF_A_LINE:
+    if region.pixels >= _MIN_ELLIPSE_PIXELS and minor > _MAX_LINE_VARIANCE_PX2:
         ellipse = Ellipse(center, (4 * math.sqrt(major), 4 * math.sqrt(minor)), angle)
     polygon, area = _hull(contours)
     return Contact(area, center, angle, slope, polygon, ellipse, confidence, float(region.pixels), evidence)

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from tactflow.vision.arrays import Floats
 
-_DISTORTION_LENGTHS: Final = {False: (4, 5, 8, 12, 14), True: (4,)}
+_COEFFICIENT_COUNTS: Final = {False: (4, 5, 8, 12, 14), True: (4,)}
 """Numbers of coefficients of OpenCV's polynomial and fisheye models."""
-_CONVERGED: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-14)
+_STOPPING_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-14)
 """Stopping rule of the iterations of `Lens.undistort`: number of steps, or error."""
 
 # OpenCV 4 has a name of its own for the function that takes a stopping rule.
@@ -47,7 +47,7 @@ class Lens:
                 "required camera_matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with focal lengths fx, fy > 0 "
                 f"px, got {matrix.tolist()}"
             )
-        lengths, model = _DISTORTION_LENGTHS[fisheye], "fisheye" if fisheye else "polynomial"
+        lengths, model = _COEFFICIENT_COUNTS[fisheye], "fisheye" if fisheye else "polynomial"
         if len(self._distortion) not in lengths or not np.isfinite(self._distortion).all():
             raise ValueError(
                 f"required {' or '.join(map(str, lengths))} finite distortion coefficients of the {model} "
@@ -75,6 +75,11 @@ class Lens:
             return points.copy()
         undistort = cv2.fisheye.undistortPoints if self._fisheye else _undistort
         straight = undistort(
-            points[:, None], self._matrix, self._distortion, R=np.eye(3), P=self._matrix, criteria=_CONVERGED
+            points[:, None],
+            self._matrix,
+            self._distortion,
+            R=np.eye(3),
+            P=self._matrix,
+            criteria=_STOPPING_CRITERIA,
         )
         return np.asarray(straight, np.float64).reshape(-1, 2)

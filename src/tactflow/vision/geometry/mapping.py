@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 from tactflow.vision.arrays import Floats
 from tactflow.vision.geometry.lens import Lens
 
-_COLLINEAR: Final = 1e-6
+_MAX_COLLINEAR_AREA_SHARE: Final = 1e-6
 """Twice the area of a triangle, over the squared extent of the four points, up to which its corners are
 collinear. Chosen by hand."""
-_AT_HORIZON: Final = 1e-12
+_MIN_HOMOGENEOUS_DEPTH: Final = 1e-12
 """Smallest homogeneous depth that is divided by, 1. A point on the horizon has no finite image; a huge but
 finite one keeps every later number finite. Chosen by hand."""
 
@@ -105,7 +105,9 @@ def project(matrix: Floats, points: Floats) -> Floats:
     """
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     depth = homogeneous[:, 2:]
-    return np.asarray(homogeneous[:, :2] / np.where(np.abs(depth) < _AT_HORIZON, _AT_HORIZON, depth))
+    return np.asarray(
+        homogeneous[:, :2] / np.where(np.abs(depth) < _MIN_HOMOGENEOUS_DEPTH, _MIN_HOMOGENEOUS_DEPTH, depth)
+    )
 
 
 def _corners(name: str, points: ArrayLike) -> Floats:
@@ -115,7 +117,7 @@ def _corners(name: str, points: ArrayLike) -> Floats:
         raise ValueError(f"required four finite {name} points (x, y), got {corners.tolist()}")
     extent = float(np.ptp(corners, axis=0).max())
     for a, b, c in combinations(corners, 3):
-        if abs(np.linalg.det([b - a, c - a])) <= _COLLINEAR * extent**2:
+        if abs(np.linalg.det([b - a, c - a])) <= _MAX_COLLINEAR_AREA_SHARE * extent**2:
             raise ValueError(
                 f"required {name} points of which no three lie on a line, got {corners.tolist()}"
             )

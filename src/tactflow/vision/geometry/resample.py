@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Flags, Floats
 from tactflow.vision.geometry.mapping import PixelMapping
 
-_OUTSIDE: Final = -10.0
+_OUTSIDE_COORDINATE_PX: Final = -10.0
 """Coordinate, px, that stands for places outside the raw frame: far enough that no sample reaches inside."""
-_HORIZON: Final = 1e-9
+_HORIZON_DEPTH_SHARE: Final = 1e-9
 """Share of the largest homogeneous depth below which a pixel counts as beyond the horizon. Chosen by hand."""
 
 
@@ -42,7 +42,7 @@ class Resampler:
         self._small = size // self._block
         # Inside the raw frame the outermost averaged pixel extends to the frame's edge; outside stays black.
         small = np.clip((raw - (self._block - 1) / 2) / self._block, 0, self._small - 1.0)
-        small[~inside] = _OUTSIDE
+        small[~inside] = _OUTSIDE_COORDINATE_PX
         x, y = small.reshape(*mapping.size[::-1], 2).transpose(2, 0, 1).astype(np.float32)
         self._maps = cv2.convertMaps(np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.CV_16SC2)
 
@@ -61,4 +61,4 @@ def _in_front(mapping: PixelMapping, grid: Floats) -> Flags:
     depth = grid @ back[2, :2] + back[2, 2]
     center = np.array([(mapping.raw_size[0] - 1) / 2, (mapping.raw_size[1] - 1) / 2, 1.0])
     sign = np.sign(mapping.matrix[2] @ center) or 1.0
-    return np.asarray(depth * sign > _HORIZON * float(np.abs(depth).max()))
+    return np.asarray(depth * sign > _HORIZON_DEPTH_SHARE * float(np.abs(depth).max()))

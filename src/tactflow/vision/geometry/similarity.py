@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Floats
 
 Complexes = NDArray[np.complex128]
-_NO_SPREAD: Final = 1e-9
+_MIN_SPREAD: Final = 1e-9
 """Smallest mean square distance from the middle that is divided by, in squared units."""
 
 
@@ -43,7 +43,7 @@ def fit_similarity(places: Complexes, vectors: Complexes, weights: Floats) -> Si
     away = places - middle
     weighted = weights * away.conj()
     spread = float((weighted @ away).real)
-    return Similarity(middle, mean, complex(weighted @ vectors) / max(spread, _NO_SPREAD), away, spread)
+    return Similarity(middle, mean, complex(weighted @ vectors) / max(spread, _MIN_SPREAD), away, spread)
 
 
 def as_complex(pairs: Floats) -> Complexes:

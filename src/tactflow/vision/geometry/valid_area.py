@@ -14,26 +14,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import SATURATED, Mask
+from tactflow.vision.arrays import SATURATED_GREY, Mask
 
-BLACK: Final = 24
+BLACK_GREY: Final = 24
 """Grey levels below which a pixel is black: video has its black at 16 (ITU-R BT.601), and compression and
 noise add to it; the gel below the white pins of tactip_video is 17. Chosen by hand."""
-DARK: Final = 0.15
+MAX_DARK_RATIO: Final = 0.15
 """Largest brightness of a dark place, relative to that of the brightest tenth of the picture. Chosen on the
 development recordings: corners of a gel are above 0.2, visible housings below 0.12."""
-BRIGHTEST: Final = 90.0
+BRIGHT_PERCENTILE: Final = 90.0
 """Percentile of the brightness that represents the brightest part of the picture. Chosen by hand."""
-COARSE: Final = 200
+MIN_COARSE_SIDE_PX: Final = 200
 """Smallest shorter side of the examined picture, px; larger ones are shrunk by a whole factor. Chosen by
 hand: 10 ms instead of 100 for each reference."""
-SMOOTHING: Final = 5
+SMOOTHING_SIDE_PX: Final = 5
 """Side of the square over which brightness is averaged, px of that picture. Chosen by hand."""
-LEAST_RADIUS: Final = 0.05
+MIN_RADIUS_SHARE: Final = 0.05
 """Smallest radius of a disc that fits into a place without gel, over the shorter side of the picture. Smaller
 places are marks, or the gaps between bright ones. Chosen by hand: the largest marks of the development
 recordings have 0.04."""
-MOST: Final = 0.5
+MIN_LIT_SURROUNDINGS_SHARE: Final = 0.5
 """Smallest share of the surroundings of a place that is not black where the light counts. Derived: marks
 cover less than half."""
 
@@ -58,13 +58,13 @@ def valid_area(image: NDArray[np.uint8]) -> Mask:
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"required an image of uint8, got shape {image.shape} {image.dtype}")
     height, width = image.shape[:2]
-    factor = max(1, min(height, width) // COARSE)
+    factor = max(1, min(height, width) // MIN_COARSE_SIDE_PX)
     size = (math.ceil(width / factor), math.ceil(height / factor))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    smooth = np.atleast_3d(cv2.blur(small, (SMOOTHING, SMOOTHING)))
+    smooth = np.atleast_3d(cv2.blur(small, (SMOOTHING_SIDE_PX, SMOOTHING_SIDE_PX)))
     brightness = smooth.max(axis=2)
-    dark = brightness < max(BLACK, DARK * float(np.percentile(brightness, BRIGHTEST)))
-    without = _opened(dark | (smooth.min(axis=2) >= SATURATED), LEAST_RADIUS * min(size))
+    dark = brightness < max(BLACK_GREY, MAX_DARK_RATIO * float(np.percentile(brightness, BRIGHT_PERCENTILE)))
+    without = _opened(dark | (smooth.min(axis=2) >= SATURATED_GREY), MIN_RADIUS_SHARE * min(size))
     if without.all() or not without.any():
         return np.full((height, width), 255, np.uint8)
     valid = np.where(without, 0, 255).astype(np.uint8)
@@ -83,9 +83,9 @@ def lit_area(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     >>> bool(lit_area(gel).all()), bool(lit_area(gel // 10).any())
     (True, False)
     """
-    lit = (image.max(axis=2) >= BLACK).astype(np.float32)
-    side = 2 * math.ceil(LEAST_RADIUS * min(lit.shape)) + 1
-    return np.asarray(cv2.blur(lit, (side, side)) >= MOST)
+    lit = (image.max(axis=2) >= BLACK_GREY).astype(np.float32)
+    side = 2 * math.ceil(MIN_RADIUS_SHARE * min(lit.shape)) + 1
+    return np.asarray(cv2.blur(lit, (side, side)) >= MIN_LIT_SURROUNDINGS_SHARE)
 
 
 def polygon_mask(polygon: Sequence[Sequence[float]], width: int, height: int) -> Mask:
