@@ -128,22 +128,6 @@ class Surface:
         whole[window.part] = self._integrated(slope, window, rest.window)
         return whole
 
-    def normals(self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None) -> Floats32:
-        """(H, W, 3) float32: unit normals of the gel's surface, out of the gel; see `depth`.
-
-        x right, y down, z towards the object: (0, 0, 1) where the gel is at rest. They point to the middle of
-        a ball that is pressed in.
-        """
-        slope, _, window = self._slopes(image, rest, mask, gradients)
-        normals = np.zeros((*mask.shape, 3), np.float32)
-        normals[..., 2] = 1
-        size = (2 * window.width, 2 * window.height)
-        part = normals[window.whole]
-        for axis in (0, 1):
-            part[..., axis] = -cv2.resize(slope[axis], size, interpolation=cv2.INTER_LINEAR)
-        part /= np.sqrt(np.sum(part * part, axis=2, keepdims=True))
-        return normals
-
     def _slopes(
         self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None
     ) -> tuple[Floats32, float, Window]:
