@@ -24,7 +24,7 @@ import tactflow
 from lab.pose import simulated_calibration
 from tactflow.message.result import Result
 from tactflow.sim import light, shapes
-from tactflow.sim.gel import MM
+from tactflow.sim.gel import MM_PER_PX
 from tactflow.sim.recipes import SCENES, Recipe
 from tactflow.sim.truth import Truth
 
@@ -54,7 +54,7 @@ def frames(recipe: Recipe, calibration: Path) -> Iterator[tuple[Result, Truth]]:
     scene, settings = tactflow.open_scene(spec), {"calibration": str(calibration)}
     for result in tactflow.stream("markerless", source=f"sim:{spec}", settings=settings):
         truth = scene.truth(result.seq, result["mapping"])
-        if result.depth is not None and truth.sunk.max() * MM > LEAST:
+        if result.depth is not None and truth.sunk.max() * MM_PER_PX > LEAST:
             yield result, truth
 
 
@@ -64,7 +64,7 @@ def judge(recipe: Recipe, calibration: Path) -> str:
     for result, truth in frames(recipe, calibration):
         assert result.depth is not None
         assert result.depth.greatest_stderr is not None
-        true = truth.sunk * MM
+        true = truth.sunk * MM_PER_PX
         ratios.append(result.depth.greatest / true.max())
         off = (result.depth.heights - true)[truth.contact_mask]
         errors.append(np.sqrt(np.mean(off**2)) / true.max())
@@ -88,7 +88,7 @@ def cube(level: tuple[float, float, float], calibration: Path) -> str:
     finally:
         light.LIGHTS["photometric"] = usual
     assert deepest.depth is not None
-    true, found = (angle(part, truth) for part in (truth.sunk * MM, deepest.depth.heights))
+    true, found = (angle(part, truth) for part in (truth.sunk * MM_PER_PX, deepest.depth.heights))
     return f"{found:.0f} degrees between its faces, the gel's surface {true:.0f}"
 
 
@@ -103,7 +103,7 @@ def angle(heights: NDArray[np.floating], truth: Truth) -> float:
     bends = []
     for side in (-1, 1):
         face = (side * across > MIDDLE[0]) & (side * across < MIDDLE[1])
-        slope = np.polyfit(np.flatnonzero(face) * 2 * MM, profile[face], 1)[0]
+        slope = np.polyfit(np.flatnonzero(face) * 2 * MM_PER_PX, profile[face], 1)[0]
         bends.append(np.degrees(np.arctan(abs(slope))))
     return float(180 - sum(bends))
 

@@ -16,7 +16,7 @@ from tactflow.drawing.jpeg import encode_jpeg
 from tactflow.engine.contract import Recorder
 from tactflow.engine.control import Control
 from tactflow.engine.errors import StageError
-from tactflow.engine.rate import SLACK, RateLimit
+from tactflow.engine.rate import TIME_TOLERANCE_S, RateLimit
 from tactflow.message.result import Result, encode_message
 from tactflow.outputs import OutputParams, OutputSink
 from tactflow.recording import missing_packages
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tactflow")
 
-BACKLOG_SHARE = 4
+BACKLOG_FRAMES_PER_FRAME = 4
 """Frames of the ring written per new frame, so that saving them does not delay the run."""
 
 
@@ -182,7 +182,7 @@ class Record(OutputSink, Recorder):
                 self._follow(result.contact is not None, entry.time)
             if self.recording:
                 self._backlog.append(entry)
-            for _ in range(BACKLOG_SHARE):
+            for _ in range(BACKLOG_FRAMES_PER_FRAME):
                 if self._is_due():
                     self._write_entry(self._backlog.popleft())
             if self._backlog and not self._is_due():
@@ -226,7 +226,7 @@ class Record(OutputSink, Recorder):
         if touching and not self._touching:
             self.start_recording()
         if touching:
-            self._ends = time + round((self.params.after + SLACK) * 1e9)
+            self._ends = time + round((self.params.after + TIME_TOLERANCE_S) * 1e9)
         self._touching = touching
 
     def _is_due(self) -> bool:

@@ -13,7 +13,7 @@ from tactflow.engine.frame import Frame
 from tactflow.ports import ContactPorts, Unmarked, Valid
 from tactflow.vision.contact.specks import without_specks
 
-REPETITIONS: Final = 20
+LEARNING_REPETITIONS: Final = 20
 """Times that the first frame is learned: OpenCV needs seven or more until its samples are filled."""
 
 MIN_LEARNING_RATE: Final = 1e-9
@@ -64,7 +64,7 @@ class Knn(Stage):
     def process(self, unmarked: Unmarked, frame: Frame, valid: Valid | None = None) -> ContactPorts:
         """The contact mask of this frame; nothing outside of `valid` counts."""
         if not self._known or frame.reference:
-            for _ in range(1 if self._known else REPETITIONS):
+            for _ in range(1 if self._known else LEARNING_REPETITIONS):
                 self._background.apply(unmarked, learningRate=-1)
             self._known = True
         rate = max(self.params.learning_rate, MIN_LEARNING_RATE)

@@ -53,7 +53,7 @@ class Homography(StageParams):
 
 logger = logging.getLogger("tactflow")
 
-FEWEST_PIXELS = 160
+MIN_SIDE_PX = 160
 """Shorter side of a processed picture, px, below which a message warns of `downsample`. Chosen by hand: the
 smallest pictures of the sensors with shipped pipelines."""
 
@@ -109,7 +109,7 @@ class Preprocess(Stage):
         """Log the sizes once, if any step changes the picture. before, after : (width, height), px."""
         steps = self.params.model_dump(exclude_defaults=True).keys() - {"method"}
         if steps:
-            small = self.params.downsample > 1 and min(after) < FEWEST_PIXELS
+            small = self.params.downsample > 1 and min(after) < MIN_SIDE_PX
             hint = "; dots may be lost: try downsample: 1" if small else ""
             logger.info(
                 "%d x %d becomes %d x %d by %s: stages.preprocess%s",

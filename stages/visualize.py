@@ -13,7 +13,7 @@ from tactflow.ports import ContactMask, Image, Normals, Picture, Valid
 from tactflow.vision.flow import DisplacementField
 from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 
-_SHOWN = {"depth": ("depth", "scale"), "normals": ("normals",)}
+_VIEW_INPUTS = {"depth": ("depth", "scale"), "normals": ("normals",)}
 """Inputs that only one view shows, by view."""
 
 
@@ -47,11 +47,11 @@ class Visualize(Stage):
 
         def needed_inputs(self) -> Mapping[str, str]:
             """Views of the surface show heights or normals."""
-            return dict.fromkeys(_SHOWN.get(self.view, ()), "view")
+            return dict.fromkeys(_VIEW_INPUTS.get(self.view, ()), "view")
 
         def unused_inputs(self) -> set[str]:
             """Inputs that are not shown need not be computed."""
-            shown = {*_SHOWN.get(self.view, ()), *(["field"] if self.field else [])}
+            shown = {*_VIEW_INPUTS.get(self.view, ()), *(["field"] if self.field else [])}
             return {"depth", "scale", "normals", "field"} - shown
 
     def __init__(self, params: Params) -> None:

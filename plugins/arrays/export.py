@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tactflow")
 
-ROWS: Final = 1024
+CHUNK_FRAMES: Final = 1024
 """Number of frames per chunk of the arrays of numbers. Chosen by hand."""
-FILL: Final[Mapping[str, tuple[str, float]]] = {
+DTYPES_AND_FILLS: Final[Mapping[str, tuple[str, float]]] = {
     "number": ("<f8", math.nan),
     "numbers": ("<f8", math.nan),
     "points": ("<f8", math.nan),
@@ -49,7 +49,11 @@ ARRAYS: Final[Mapping[str, tuple[str, str]]] = {
         "boolean",
         "(N,): 1 where a frame shows the untouched gel that later ones are compared with",
     ),
-    **{column.name: (column.kind, column.description) for column in frame_columns() if column.kind in FILL},
+    **{
+        column.name: (column.kind, column.description)
+        for column in frame_columns()
+        if column.kind in DTYPES_AND_FILLS
+    },
     "markers_origin": ("points", "(N, M, 2): (x, y) of each marker in the reference frame, px"),
     "markers_position": ("points", "(N, M, 2): (x, y) of each marker now, px"),
     "markers_stderr": ("numbers", "(N, M): standard error of each coordinate of a position, px"),
@@ -115,7 +119,7 @@ class ArrayFile:
                 self._file.attrs.update(_file_attributes(name, result))
             self._append("frames", [result.frame.image])
             self._rows.append(_row(result))
-            if len(self._rows) == ROWS:
+            if len(self._rows) == CHUNK_FRAMES:
                 self._flush()
             frames += 1
         if not frames:
@@ -137,7 +141,7 @@ class ArrayFile:
 
     def _append(self, name: str, values: Sequence[ArrayLike]) -> None:
         """Append values; shorter ones are padded."""
-        dtype, fill = FILL[ARRAYS[name][0]]
+        dtype, fill = DTYPES_AND_FILLS[ARRAYS[name][0]]
         rows = [np.asarray(value, dtype) for value in values]
         shape = tuple(map(max, zip(*(row.shape for row in rows), strict=True)))
         block = np.full((len(rows), *shape), fill, dtype)
@@ -161,7 +165,7 @@ class ArrayFile:
             block.dtype,
             chunks=tuple(max(length, 1) for length in block.shape),
             maxshape=(None,) * block.ndim,
-            fillvalue=FILL[kind][1],
+            fillvalue=DTYPES_AND_FILLS[kind][1],
             # Every HDF5 library can unpack gzip.
             compression="gzip",
             compression_opts=1,
@@ -206,7 +210,7 @@ def _row(result: Result) -> dict[str, ArrayLike]:
     message = result.to_dict(detail=True)
     row: dict[str, ArrayLike] = {"reference": result.frame.reference}
     for column in frame_columns():
-        if column.kind in FILL:
+        if column.kind in DTYPES_AND_FILLS:
             value = column.value(message)
             row[column.name] = _missing(column.kind) if value is None else value
     markers = NO_MARKERS if result.markers is None else result.markers
@@ -217,4 +221,4 @@ def _row(result: Result) -> dict[str, ArrayLike]:
 
 def _missing(kind: str) -> ArrayLike:
     """The placeholder for a missing value, before padding."""
-    return np.empty((0, 2)) if kind == "points" else () if kind == "numbers" else FILL[kind][1]
+    return np.empty((0, 2)) if kind == "points" else () if kind == "numbers" else DTYPES_AND_FILLS[kind][1]

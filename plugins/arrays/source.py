@@ -28,9 +28,9 @@ EXPORTED = {"dataset": "/frames", "times": "/t"}
 """Written by `tactflow export`, and read by default from a file that has both."""
 EPISODE_ENDS = "episode_ends"
 """Name of an array with the index after the last frame of each episode, as replay buffers have it."""
-MOST_EPISODES = 10**6
+MAX_EPISODES = 10**6
 """Maximum number of episodes in a file."""
-BLOCK = 64 << 20
+MAX_READ_BYTES = 64 << 20
 """Maximum number of bytes read at a time. Chosen by hand."""
 
 
@@ -163,7 +163,7 @@ def _episodes(
 
 def _ends(array: Any) -> NDArray[np.int64] | None:
     """The index after the last frame of each episode; None if these are not ascending integers."""
-    if array.ndim != 1 or array.dtype.kind not in "iu" or not 0 < array.shape[0] <= MOST_EPISODES:
+    if array.ndim != 1 or array.dtype.kind not in "iu" or not 0 < array.shape[0] <= MAX_EPISODES:
         return None
     load_filters(array)
     ends = np.asarray(array[:]).astype(np.int64)
@@ -175,7 +175,7 @@ def _read(array: Any, indices: range) -> Iterator[NDArray[Any]]:
     frame_bytes = max(math.prod(array.shape[1:]) * array.dtype.itemsize, 1)
     # HDF5 keeps strings of any length outside of the chunks.
     chunk = 1 if not array.chunks or "vlen" in (array.dtype.metadata or {}) else array.chunks[0]
-    together = max(1, min(chunk, BLOCK // frame_bytes))
+    together = max(1, min(chunk, MAX_READ_BYTES // frame_bytes))
     begin = indices.start
     while begin < indices.stop:
         end = min(begin - begin % together + together, indices.stop)

@@ -33,8 +33,8 @@ log = logging.getLogger("tactflow")
 
 VERSION = "v3.0"
 """Version of the layout, which LeRobot checks."""
-PICTURES = "observation.images."
-TACTILE = "observation.tactile"
+PICTURE_PREFIX = "observation.images."
+TACTILE_FEATURE = "observation.tactile"
 NAMES = {
     "contact": ["touching", "x", "y", "area", "angle"],
     "flow": ["known", "dx", "dy"],
@@ -49,12 +49,12 @@ NAMES = {
 numbers are 0 where the first is 0."""
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
 """Integer columns that every dataset has, besides `timestamp`."""
-CHUNK = 1000
+FILES_PER_FOLDER = 1000
 """Files per folder, as in LeRobot."""
-QUALITY = {"crf": "18", "g": "2", "preset": "veryfast"}
+ENCODER_OPTIONS = {"crf": "18", "g": "2", "preset": "veryfast"}
 """Options of the encoder: hardly any visible loss, and every other picture is a key frame, for random access.
 Chosen by hand."""
-SAMPLED = 10
+STATISTICS_STEP_FRAMES = 10
 """Every 10th picture counts for the statistics. Chosen by hand."""
 
 
@@ -117,7 +117,7 @@ class DatasetWriter:
             calibration, or there is no picture. OSError : the files cannot be written.
         """
         episode = len(self._episodes)
-        file = f"chunk-{episode // CHUNK:03d}/file-{episode % CHUNK:03d}"
+        file = f"chunk-{episode // FILES_PER_FOLDER:03d}/file-{episode % FILES_PER_FOLDER:03d}"
         rows: list[dict[str, Any]] = []
         encode: Callable[[NDArray[np.uint8] | None], None] | None = None
         with ExitStack() as stack:
@@ -163,7 +163,7 @@ class DatasetWriter:
         image = result.image
         if image is None:
             raise StageError("the pipeline makes no picture: it needs a stage preprocess")
-        camera, size = f"{PICTURES}{result.sensor}", f"{image.shape[1]} x {image.shape[0]} pixels"
+        camera, size = f"{PICTURE_PREFIX}{result.sensor}", f"{image.shape[1]} x {image.shape[0]} pixels"
         calibrated = result.scale is not None
         kind = f"{camera}, {size}, with{'' if calibrated else 'out'} calibration"
         if not self._kind:
@@ -175,9 +175,11 @@ class DatasetWriter:
         return image
 
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
-        row: dict[str, Any] = {f"{TACTILE}.{name}": values for name, values in _values(result).items()}
+        row: dict[str, Any] = {
+            f"{TACTILE_FEATURE}.{name}": values for name, values in _values(result).items()
+        }
         row |= self._marker_rows(result)
-        if index % SAMPLED == 0:
+        if index % STATISTICS_STEP_FRAMES == 0:
             self._colors.add(image.reshape(-1, 3)[:, ::-1] / 255.0)
             self._sampled += 1
         if not self._is_video:
@@ -198,12 +200,13 @@ class DatasetWriter:
         ------
         StageError : this recording has markers, and those before had none.
         """
-        sensor = self._camera.removeprefix(PICTURES)
+        sensor = self._camera.removeprefix(PICTURE_PREFIX)
         if self._order.origin is not None:
             lost = _marker_features(sensor, self._order.lost())
             rows[:] = [lost | row for row in rows]
         values = [
-            {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE)} for row in rows
+            {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE_FEATURE)}
+            for row in rows
         ]
         if not self._features:
             self._features = {name: _feature(name, value) for name, value in values[0].items()}
@@ -228,7 +231,7 @@ class DatasetWriter:
         _write(pa.Table.from_pylist(rows, pa.schema(types)), path)
 
     def _episode(self, episode: int, frames: int) -> dict[str, Any]:
-        place = {"chunk_index": episode // CHUNK, "file_index": episode % CHUNK}
+        place = {"chunk_index": episode // FILES_PER_FOLDER, "file_index": episode % FILES_PER_FOLDER}
         row: dict[str, Any] = {
             "episode_index": episode,
             "tasks": [self._task],
@@ -273,7 +276,7 @@ class DatasetWriter:
             "total_episodes": len(self._episodes),
             "total_frames": self._frames,
             "total_tasks": 1,
-            "chunks_size": CHUNK,
+            "chunks_size": FILES_PER_FOLDER,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": self._fps,
@@ -306,14 +309,14 @@ def _values(result: Result) -> dict[str, list[float]]:
 
 def _marker_features(sensor: str, markers: AlignedMarkers) -> dict[str, NDArray[Any]]:
     """The features of N markers."""
-    prefix = f"{TACTILE}.{sensor}"
+    prefix = f"{TACTILE_FEATURE}.{sensor}"
     return {f"{prefix}.marker_offset": markers.offset, f"{prefix}.marker_status": markers.status}
 
 
 def _feature(name: str, value: NDArray[Any]) -> dict[str, Any]:
     """The description of a feature, from its values in a frame."""
     dtype = "float32" if value.dtype.kind == "f" else value.dtype.name
-    ending = name.removeprefix(f"{TACTILE}.")
+    ending = name.removeprefix(f"{TACTILE_FEATURE}.")
     if ending in NAMES:
         return {"dtype": dtype, "shape": [len(value)], "names": NAMES[ending]}
     is_offset = ending.endswith(".marker_offset")
@@ -354,7 +357,7 @@ def _open_video(
 
     path.parent.mkdir(parents=True, exist_ok=True)
     file = stack.enter_context(av.open(str(path), "w"))
-    stream: av.VideoStream = file.add_stream("libx264", rate=fps, options=QUALITY)
+    stream: av.VideoStream = file.add_stream("libx264", rate=fps, options=ENCODER_OPTIONS)
     stream.height, stream.width = image.shape[:2]
     stream.pix_fmt = "yuv420p"
 

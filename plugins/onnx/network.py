@@ -41,7 +41,7 @@ Floats = NDArray[np.float32]
 Side = int | None
 """Length of an axis; None if any is valid, or only a frame tells."""
 
-KNOWN: Final[dict[str, tuple[Any, int]]] = {
+KNOWN_PORTS: Final[dict[str, tuple[Any, int]]] = {
     "image": (Image, 3),
     "unmarked": (Unmarked, 3),
     "untouched": (Untouched, 3),
@@ -105,14 +105,14 @@ class InputParams(StageParams):
     def _fits(self) -> InputParams:
         if self.frames > 1 and self.layout != "chw":
             raise ValueError("several frames need the layout chw")
-        if self.background != "none" and KNOWN.get(self.port, (None, 3))[1] != 3:
+        if self.background != "none" and KNOWN_PORTS.get(self.port, (None, 3))[1] != 3:
             raise ValueError(f"background: {self.port} is not a picture, so it has none")
         return self
 
     @property
     def channels(self) -> Side:
         """Channels of one frame; None if only a frame tells."""
-        known = KNOWN.get(self.port)
+        known = KNOWN_PORTS.get(self.port)
         if known is None:
             return None
         channels = 1 if self.colour == "grey" and known[1] == 3 else known[1]
@@ -175,7 +175,9 @@ class Network(Stage):
         names = [value.port for value in params.inputs.values()]
         if any(value.background != "none" for value in params.inputs.values()):
             names.append("untouched")
-        inputs = [Port(name, KNOWN[name][0] if name in KNOWN else Any) for name in dict.fromkeys(names)]
+        inputs = [
+            Port(name, KNOWN_PORTS[name][0] if name in KNOWN_PORTS else Any) for name in dict.fromkeys(names)
+        ]
         stateful = any(value.frames > 1 for value in params.inputs.values())
         outputs = [port for name, value in params.outputs.items() for port in _ports(name, value)]
         return Declared(inputs, outputs, "stateful" if stateful else "pure")

@@ -14,9 +14,9 @@ from tactflow.sources.files import decode_image, natural_key
 from tactflow.sources.paths import find_path, listed, split_query
 
 SETTINGS = {"column": "name of a column with pictures"}
-ROWS = 16
+BATCH_ROWS = 16
 """Number of pictures read at a time."""
-BUFFER = 1 << 20
+BUFFER_BYTES = 1 << 20
 """Size of the pieces in which a column is read, bytes; by default, all row groups are kept in memory."""
 
 
@@ -72,8 +72,8 @@ class PictureColumn(FrameReader):
         import pyarrow.parquet as pq
 
         for path in self._files:
-            with pq.ParquetFile(path, buffer_size=BUFFER, pre_buffer=False) as file:
-                for batch in file.iter_batches(ROWS, columns=[self._column], use_threads=False):
+            with pq.ParquetFile(path, buffer_size=BUFFER_BYTES, pre_buffer=False) as file:
+                for batch in file.iter_batches(BATCH_ROWS, columns=[self._column], use_threads=False):
                     yield from batch.column(0).to_pylist()
 
 

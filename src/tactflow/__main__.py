@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 
-from tactflow.system.signals import ENDING, INTERRUPTED, interrupt, on_ending
+from tactflow.system.signals import ENDING_SIGNALS, INTERRUPTED_EXIT_CODE, interrupt, on_ending
 
 ENDLESS = ("run", "record", "listen")
 """Commands that run until they are stopped: one signal ends them with exit code 0."""
@@ -23,7 +23,7 @@ def entry() -> None:
     command = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
     is_endless = command in ENDLESS
     # Exit rather than raise: an import might swallow or print an exception.
-    on_ending(lambda _number, _frame: os._exit(0 if is_endless else INTERRUPTED))
+    on_ending(lambda _number, _frame: os._exit(0 if is_endless else INTERRUPTED_EXIT_CODE))
     from tactflow.cli.main import main
     from tactflow.system.files import LossyStream, discard_output
 
@@ -51,9 +51,9 @@ def entry() -> None:
     except KeyboardInterrupt:
         # The reader of our output does not read.
         discard_output(sys.stdout)
-        code = INTERRUPTED
+        code = INTERRUPTED_EXIT_CODE
     # From here on nothing changes the exit code.
-    for number in ENDING:
+    for number in ENDING_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     if code != 0 and threading.active_count() > 1:
         # Threads of an aborted run may be in OpenCV, which would abort the process while Python ends.

@@ -34,7 +34,7 @@ from tactflow.engine.run import Runner, RunResult
 from tactflow.sources.memory import MemoryFrames
 from tactflow.system.opencv import opencv_conflict
 from tactflow.system.redaction import public_address
-from tactflow.system.signals import INTERRUPTED, Interrupted, ending_handled, on_ending
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE, Interrupted, ending_handled, on_ending
 from tactflow.vision import compiled
 
 logger = logging.getLogger("tactflow")
@@ -83,7 +83,7 @@ def load(
     values = []
     frames = None if source is None or isinstance(source, str | Path) else source
     if source is not None:
-        text = _MEMORY if frames is not None else str(source)
+        text = _MEMORY_DESCRIPTION if frames is not None else str(source)
         values.append(Override("source", text, f"source {public_address(text)}"))
     if realtime:
         values.append(Override("realtime", value=True, origin="realtime"))
@@ -92,7 +92,7 @@ def load(
     return loaded if frames is None else _with_frames(loaded, frames)
 
 
-_MEMORY = "frames in memory"
+_MEMORY_DESCRIPTION = "frames in memory"
 """Name of the source in messages if the frames came from Python."""
 
 
@@ -167,7 +167,7 @@ def run(
     if not isinstance(pipeline, Pipeline):
         pipeline = load(pipeline, source=source, settings=settings, sensor=sensor, realtime=realtime)
     result = make_runner(pipeline, max_frames=max_frames).run()
-    if result.exit_code == INTERRUPTED:
+    if result.exit_code == INTERRUPTED_EXIT_CODE:
         raise KeyboardInterrupt
     if result.failure is not None:
         raise result.failure

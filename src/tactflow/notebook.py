@@ -26,7 +26,11 @@ PLOT_COLUMNS = 3
 PLOT_WIDTH, PLOT_HEIGHT = 360, 220
 """Size of a plot, px."""
 
-_WHOLE = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 1, "stages.capture.settle": 0}
+_UNCHANGED_PICTURES = {
+    "stages.preprocess.rotate": 0,
+    "stages.preprocess.downsample": 1,
+    "stages.capture.settle": 0,
+}
 """Settings of the default pipeline that use pictures unchanged and in this order."""
 _NO_COLUMN = frozenset({"changed", "evidence", "touching"})
 """Ports of built-in stages that duplicate other columns."""
@@ -60,7 +64,7 @@ def contact(image: NDArray[np.uint8], reference: NDArray[np.uint8]) -> Contact |
     """
     if image.shape != reference.shape:
         raise ValueError(f"required pictures of one shape, got {image.shape} and {reference.shape}")
-    *_, result = stream("default", source=[reference, image], settings=_WHOLE)
+    *_, result = stream("default", source=[reference, image], settings=_UNCHANGED_PICTURES)
     return result.contact
 
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from tactflow.calibration.presses import Press, Session
 from tactflow.calibration.scale import centre
 from tactflow.sim import Scene
-from tactflow.sim.gel import MM
+from tactflow.sim.gel import MM_PER_PX
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import Scale
 
-RAW_MM: Final = MM
+RAW_MM: Final = MM_PER_PX
 """Millimetres per raw pixel that the simulated gel is given."""
 BALL: Final = 95 * RAW_MM
 """Radius of the ball of the scene `ball`, mm."""

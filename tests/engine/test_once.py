@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactflow.engine.once import COMPARED_BYTES, KEPT_RESULTS, Once
+from tactflow.engine.once import KEPT_RESULTS, MAX_COMPARED_BYTES, Once
 
-BIG = np.zeros(COMPARED_BYTES + 1, np.uint8)
+BIG = np.zeros(MAX_COMPARED_BYTES + 1, np.uint8)
 SMALL = np.array([[1.0, np.nan]])
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tactflow.engine.run import Runner, RunResult
-from tactflow.system.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE
 from tests.clock import PATIENCE, until
 
 MakeRunner = Callable[..., Runner]
@@ -555,7 +555,7 @@ def test_nothing_is_closed_while_a_thread_is_in_it(
 ) -> None:
     monkeypatch.setattr("tactflow.engine.threads.LEAVE_SECONDS", 0.1)
     runner = toy_runner({"join": {"seconds": PATIENCE}, "capture": {"frames": 3}})
-    assert interrupt_in_join(runner).exit_code == INTERRUPTED
+    assert interrupt_in_join(runner).exit_code == INTERRUPTED_EXIT_CODE
     closed = {name: node.instance.closed for name, node in runner.nodes.items()}
     assert closed.pop("join") == 0
     assert set(closed.values()) == {1}
@@ -568,7 +568,7 @@ def test_an_interrupted_run_lets_its_threads_end_before_it_closes(
 ) -> None:
     monkeypatch.setattr("tactflow.engine.threads.LEAVE_SECONDS", PATIENCE)
     runner = toy_runner({"join": {"seconds": 0.2}, "capture": {"frames": 3}})
-    assert interrupt_in_join(runner).exit_code == INTERRUPTED
+    assert interrupt_in_join(runner).exit_code == INTERRUPTED_EXIT_CODE
     assert not threads_of_runs()
     assert runner.nodes["join"].instance.closed == 1
 

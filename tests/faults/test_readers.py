@@ -65,7 +65,7 @@ def test_the_reader_of_a_pipe(
         if "signal" in reader_does:
             runner.stop("signal")
 
-    monkeypatch.setattr(lines, "MOST_WAITING", 10)
+    monkeypatch.setattr(lines, "MAX_QUEUED_LINES", 10)
     pace = {"realtime": live, "fps": FAST if live else 30.0}
     sinks = {"jsonl": {"path": str(path), "flush": 0}}
     runner, seen = run(tmp_path, sinks, leave, send_signal, source=str(array(tmp_path)), **pace)

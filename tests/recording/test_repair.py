@@ -13,7 +13,7 @@ import zstandard
 from mcap.reader import make_reader
 
 from tactflow.engine.errors import SourceError
-from tactflow.recording.records import LARGEST_CHUNK
+from tactflow.recording.records import MAX_CHUNK_BYTES
 from tactflow.recording.repair import repair
 from tactflow.sources import open_source
 from tests.recording.test_recorder import opened, seqs_in, write
@@ -114,11 +114,11 @@ def test_a_chunk_that_states_too_many_bytes_is_not_unpacked(
 ) -> None:
     path = tmp_path / "a.mcap"
     whole = record(path, 1)
-    size = LARGEST_CHUNK + 1
+    size = MAX_CHUNK_BYTES + 1
     path.write_bytes(whole[:8] + chunk(compress(bytes(size)), compression, size) + whole[8:])
     tracemalloc.start()
     try:
         assert repair(path, tmp_path / "fixed.mcap").lost
-        assert tracemalloc.get_traced_memory()[1] < LARGEST_CHUNK // 8
+        assert tracemalloc.get_traced_memory()[1] < MAX_CHUNK_BYTES // 8
     finally:
         tracemalloc.stop()

@@ -67,7 +67,7 @@ def test_the_truth_about_a_contact_is_consistent(name: str) -> None:
         assert len(truth.origin) == len(truth.position) == len(truth.visible)
         assert np.isfinite(truth.position).all()
         assert np.isfinite(truth.origin).all()
-        assert truth.depth > gel.TOUCH_DEPTH
+        assert truth.depth > gel.TOUCH_DEPTH_PX
 
 
 def positions(scene: Scene, index: int) -> NDArray[np.float64]:
@@ -124,7 +124,7 @@ def test_the_direction_is_that_of_the_indenter_and_a_disc_has_none(name: str, di
     assert checked >= 3
 
 
-@pytest.mark.parametrize("sink", [0.1, gel.SINK_IN, 0.5])
+@pytest.mark.parametrize("sink", [0.1, gel.SINK_IN_RATIO, 0.5])
 def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius(sink: float) -> None:
     scene = open_scene(f"press?sink={sink}")
     index = deepest(scene)
@@ -139,7 +139,7 @@ def test_the_contact_of_a_ball_is_a_disc_of_the_stated_radius(sink: float) -> No
     assert truth.center == pytest.approx((press.x, press.y), abs=0.05)
 
 
-@pytest.mark.parametrize("rim", [0.4, gel.RIM, 1.0])
+@pytest.mark.parametrize("rim", [0.4, gel.RIM_SLOPE_RATIO, 1.0])
 def test_the_surface_follows_the_indenter_in_contact_and_decays_without_a_step_around_it(rim: float) -> None:
     scene = open_scene(f"press?rim={rim}")
     (press,) = scene.presses(deepest(scene))

@@ -14,7 +14,7 @@ import pytest
 
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import FrameReader
-from tactflow.sources.pace import LONGEST_GAP, Pace
+from tactflow.sources.pace import MAX_GAP_S, Pace
 from tactflow.stages.capture import Capture
 from tests.clock import PATIENCE, ManualClock
 
@@ -212,11 +212,11 @@ def test_a_gap_of_more_than_a_minute_is_skipped_with_a_warning(caplog: pytest.Lo
     clock = ManualClock()
     pace = Pace(threading.Event(), clock)
     shown = []
-    for t in (0.0, 0.1, 0.1 + LONGEST_GAP, 1e9, 1e9 + 0.1):
+    for t in (0.0, 0.1, 0.1 + MAX_GAP_S, 1e9, 1e9 + 0.1):
         assert pace.wait_for(t)
         shown.append(clock.now() - shown[0] if shown else clock.now())
     # 1e-6 s: rounding at 1e9 s.
-    np.testing.assert_allclose(np.diff(shown)[1:], [LONGEST_GAP, 0.0, 0.1], atol=1e-6)
+    np.testing.assert_allclose(np.diff(shown)[1:], [MAX_GAP_S, 0.0, 0.1], atol=1e-6)
     assert [record.getMessage() for record in caplog.records] == [
         "the recording pauses for 1e+09 s, which is skipped"
     ]
@@ -249,7 +249,7 @@ def test_times_that_run_back_are_counted_on_with_a_warning(caplog: pytest.LogCap
 def test_stopping_wakes_a_capture_that_waits_for_its_next_frame(
     recording: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactflow.sources.pace.LONGEST_GAP", np.inf)
+    monkeypatch.setattr("tactflow.sources.pace.MAX_GAP_S", np.inf)
     # At this rate the second frame is due after 1000 s; the test's own time limit is far shorter.
     stage = capture(recording, realtime=True, fps=0.001)
     frames = []

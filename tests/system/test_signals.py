@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from tactflow.system.signals import ENDING, ending_handled, interrupt
+from tactflow.system.signals import ENDING_SIGNALS, ending_handled, interrupt
 from tests.clock import PATIENCE, until
 
-ENDS = [number for number in ENDING if sys.platform != "win32"]
+ENDS = [number for number in ENDING_SIGNALS if sys.platform != "win32"]
 """Windows ends another process at once instead of sending it one of them."""
 
 

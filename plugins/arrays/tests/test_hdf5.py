@@ -91,7 +91,7 @@ def black(count: int, markers: int = 0) -> list[Result]:
 
 def test_what_is_missing_differs_from_every_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Several chunks, the last of which is not full.
-    monkeypatch.setattr(hdf5, "ROWS", 4)
+    monkeypatch.setattr(hdf5, "CHUNK_FRAMES", 4)
     hdf5.export(tmp_path / "out", [("black", [*black(5), *black(3, 2), *black(5, 3)])])
     found = h5py.File(tmp_path / "out" / "episode_000.h5", "r")
     assert found["frames"].shape[0] == 13

@@ -21,7 +21,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveFloa
 
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError
-from tactflow.recording.calibration import MAX_ARRAYS, stored_arrays, stored_text
+from tactflow.recording.calibration import MAX_ARRAY_BYTES, stored_arrays, stored_text
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
 from tactflow.vision.depth.darkness import DarknessModel
@@ -332,8 +332,8 @@ def _symmetric(lower: NDArray[np.floating]) -> NDArray[np.float64]:
 def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of a `.npz` file, unless they unpack to more than they may."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(member.file_size for member in archive.infolist()) > MAX_ARRAYS:
-            raise ValueError(f"its arrays unpack to more than {MAX_ARRAYS >> 20} MiB")
+        if sum(member.file_size for member in archive.infolist()) > MAX_ARRAY_BYTES:
+            raise ValueError(f"its arrays unpack to more than {MAX_ARRAY_BYTES >> 20} MiB")
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         return dict(arrays)
 

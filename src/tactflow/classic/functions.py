@@ -16,25 +16,25 @@ from numpy.typing import NDArray
 from tactflow.vision.geometry.direction import axis_direction
 from tactflow.vision.types import Contact, Ellipse, Flow, Markers
 
-MASK_THRESHOLD: Final = 120
+MASK_THRESHOLD_GREY: Final = 120
 """Amplified difference of Gaussians above which a channel votes for a marker, grey levels; from the
 script."""
 
-MARKER_AREAS: Final = (50.0, 500.0)
+MARKER_AREAS_PX2: Final = (50.0, 500.0)
 """Smallest and largest area of a marker's contour, px^2; chosen by hand for markers of 9 px diameter."""
 
-_THINNEST_AXIS: Final = 1e-3
+_MIN_AXIS_PX: Final = 1e-3
 """Axis length, px, below which `cv2.fitEllipse` has fitted a line; chosen by hand."""
 
-_SQUARE = np.ones((5, 5), np.uint8)
+_STRUCTURING_ELEMENT = np.ones((5, 5), np.uint8)
 """Structuring element with which the script erodes and dilates."""
 
 
 def mask_marker(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Mask of dark markers (H, W) uint8, 0 or 255, by a difference of Gaussians on the halved frame.
 
-    A marker is where two of three channels exceed `MASK_THRESHOLD`. Enlarging the mask shifts it by half a
-    pixel.
+    A marker is where two of three channels exceed `MASK_THRESHOLD_GREY`. Enlarging the mask shifts it by half
+    a pixel.
 
     frame : (H, W, 3) uint8, BGR.
 
@@ -46,7 +46,7 @@ def mask_marker(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     blur = cv2.GaussianBlur(small, (25, 25), 0)
     blur2 = cv2.GaussianBlur(small, (15, 15), 0)
     amplified = np.clip((blur - blur2) * np.float32(20), 0, 255)
-    blue, green, red = (amplified[..., channel] > MASK_THRESHOLD for channel in range(3))
+    blue, green, red = (amplified[..., channel] > MASK_THRESHOLD_GREY for channel in range(3))
     votes = (blue & green) | (blue & red) | (green & red)
     enlarged = cv2.resize(votes.astype(np.uint8), (width, height))
     return np.asarray(enlarged * np.uint8(255), np.uint8)
@@ -55,12 +55,12 @@ def mask_marker(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def marker_center(frame: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Centres of the markers (N, 2) float64, px, by contour moments, in OpenCV's contour order.
 
-    A contour counts if its area lies within `MARKER_AREAS` and the longer side of its bounding box is less
-    than twice the shorter one. Centres have the half-pixel shift of `mask_marker`.
+    A contour counts if its area lies within `MARKER_AREAS_PX2` and the longer side of its bounding box is
+    less than twice the shorter one. Centres have the half-pixel shift of `mask_marker`.
 
     frame : (H, W, 3) uint8, BGR.
     """
-    least_area, most_area = MARKER_AREAS
+    least_area, most_area = MARKER_AREAS_PX2
     contours, _ = cv2.findContours(mask_marker(frame), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     centers = []
     for contour in contours:
@@ -97,8 +97,8 @@ def difference(frame: NDArray[np.uint8], frame0: NDArray[np.uint8]) -> NDArray[n
     neutral = np.where(dominated, 0, 255).astype(np.uint8)
     gray = cv2.cvtColor(cv2.bitwise_and(levels, levels, mask=neutral), cv2.COLOR_BGR2GRAY)
     _, binary = cv2.threshold(gray, 50, 255, cv2.THRESH_BINARY)
-    eroded = cv2.erode(binary, _SQUARE, iterations=2)
-    return np.asarray(cv2.dilate(eroded, _SQUARE, iterations=1), np.uint8)
+    eroded = cv2.erode(binary, _STRUCTURING_ELEMENT, iterations=2)
+    return np.asarray(cv2.dilate(eroded, _STRUCTURING_ELEMENT, iterations=1), np.uint8)
 
 
 def get_all_contour(mask: NDArray[np.uint8]) -> NDArray[np.int32]:
@@ -125,7 +125,7 @@ def fit_ellipse(points: NDArray[np.int32]) -> Ellipse | None:
         (x, y), (first, second), rotation = cv2.fitEllipse(points)
     except cv2.error:
         return None
-    if not np.isfinite([x, y, first, second, rotation]).all() or min(first, second) <= _THINNEST_AXIS:
+    if not np.isfinite([x, y, first, second, rotation]).all() or min(first, second) <= _MIN_AXIS_PX:
         return None
     # OpenCV measures the angle of the first axis, clockwise on the screen.
     theta = math.radians(rotation if first >= second else rotation + 90)

@@ -19,18 +19,18 @@ MAX_VISITS: Final = 5000
 """Nodes that the search may visit per frame, about as many as Python visits in the original's time limit of
 33 ms. Unlike a time limit, it gives the same result on every machine."""
 
-_REACH: Final = 0.6
+_SEARCH_RADIUS_SPACINGS: Final = 0.6
 """Search radius around the position predicted from the neighbours, as a fraction of the spacing; chosen by
 hand: beyond a half, a centre may belong to the neighbour."""
 
 _MAX_CANDIDATES: Final = 3
 """Centres that a node tries before it stays empty; chosen by hand."""
 
-_LONGEST_LINK: Final = 1.6
+_MAX_LINK_SPACINGS: Final = 1.6
 """Maximum link length in median nearest-neighbour distances: more than the diagonal of a square, so that a
 bent grid stays linked, and less than two spacings."""
 
-_OBLIQUE: Final = 0.6
+_MAX_COMPONENT_RATIO: Final = 0.6
 """Maximum ratio of a link's shorter to its longer component: 1 for the diagonal of a square, 0.6 for a row
 tilted by 31 degrees."""
 
@@ -121,7 +121,7 @@ class Matcher:
         for index, center in enumerate(centers):
             move = center - self._places[node]
             residual = abs(move - expected)
-            if index not in used and residual < _REACH * self._spacing:
+            if index not in used and residual < _SEARCH_RADIUS_SPACINGS * self._spacing:
                 candidates.append((residual**2, index, move))
         candidates.sort(key=lambda option: option[:2])
         return [*candidates[:_MAX_CANDIDATES], (self._spacing**2, -1, expected)]
@@ -169,10 +169,10 @@ def grid_of(centers: Floats) -> tuple[Floats, float]:
         raise NoMarkersError(
             f"{len(centers)} markers found: is the sensor marker-less? then use the pipeline markerless"
         )
-    links = neighbour_graph(centers, _LONGEST_LINK * pitch_of(centers))
+    links = neighbour_graph(centers, _MAX_LINK_SPACINGS * pitch_of(centers))
     steps = centers[links[:, 1]] - centers[links[:, 0]]
     lengths = np.abs(steps)
-    straight = lengths.min(axis=1) <= _OBLIQUE * lengths.max(axis=1)
+    straight = lengths.min(axis=1) <= _MAX_COMPONENT_RATIO * lengths.max(axis=1)
     links, steps, lengths = links[straight], steps[straight], lengths[straight]
     if not len(links):
         raise NoMarkersError(

@@ -34,7 +34,7 @@ from tactflow.engine.errors import ConfigError, StageError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.message.result import Result
 from tactflow.system.arguments import number, positive
-from tactflow.system.signals import INTERRUPTED, Interrupted
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE, Interrupted
 from tactflow.system.terminal import notes, say, show, typed
 
 # Gels and balls have 1 to 100.
@@ -313,7 +313,7 @@ def _player(pipeline: Pipeline, page: Mapping[str, Node] = MappingProxyType({}))
         runner = make_runner(replace(collecting, nodes={**collecting.nodes, **page}))
         with ended_by_signals(runner):
             ended = runner.run()
-        if ended.exit_code == INTERRUPTED:
+        if ended.exit_code == INTERRUPTED_EXIT_CODE:
             raise Interrupted
         if ended.failure is not None:
             raise ended.failure

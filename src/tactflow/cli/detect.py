@@ -22,7 +22,7 @@ from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.markers import Candidate, Detection, NoMarkersError, detect_markers
 
-SHOWN: Final = 0.25
+MIN_SHOWN_SCORE_RATIO: Final = 0.25
 """Score of the runner-up, relative to that of the marks, above which it is shown."""
 
 
@@ -81,7 +81,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _near_rival(marks: Detection) -> Candidate | None:
     """The next best spots, if they are worth showing."""
-    if marks.rival is None or marks.chosen is None or marks.rival.score < SHOWN * marks.chosen.score:
+    if (
+        marks.rival is None
+        or marks.chosen is None
+        or marks.rival.score < MIN_SHOWN_SCORE_RATIO * marks.chosen.score
+    ):
         return None
     return marks.rival
 

@@ -17,7 +17,7 @@ from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
 from tactflow.system.terminal import show
 
-FAILURES = ("error", "disabled")
+FAILURE_REASONS = ("error", "disabled")
 """Reasons for not running that are failures, which save no time."""
 
 
@@ -81,7 +81,7 @@ def _cost(node: Mapping[str, Any]) -> str:
         return text
     mean = node["total_ms"] / runs
     text += f"; a run: mean {mean:.3g} ms, p50 {node['p50_ms']:.3g} ms, p99 {node['p99_ms']:.3g} ms"
-    saved = mean * sum(n for n, reason in skips if reason not in FAILURES)
+    saved = mean * sum(n for n, reason in skips if reason not in FAILURE_REASONS)
     if saved:
         text += f"; saved {saved / frames:.3g} ms of {(saved + node['total_ms']) / frames:.3g} ms a frame"
     return text

@@ -13,7 +13,7 @@ from tactflow.cli.command import Command
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.system.plugins import plugins
 from tactflow.system.redaction import public_address
-from tactflow.system.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE
 from tactflow.system.spelling import closest, did_you_mean
 from tactflow.system.terminal import printable, say
 
@@ -91,7 +91,7 @@ def main(argv: Sequence[str], before_run: Callable[[], object] = lambda: None) -
             say(public_address(mistake))
         return error.exit_code
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return INTERRUPTED_EXIT_CODE
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else 0
 

@@ -28,7 +28,7 @@ from tactflow.engine.run import Runner
 from tactflow.system.arguments import positive
 from tactflow.system.files import is_device, next_name
 from tactflow.system.redaction import public_address
-from tactflow.system.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE
 from tactflow.system.terminal import notes, say
 
 STATISTICS_BEGIN = '{\n "frames":'
@@ -156,7 +156,7 @@ def _run_one(args: argparse.Namespace, pipeline: Pipeline) -> int:
             logger.info("not run, as no sink needs it: %s", ", ".join(node.id for node in runner.plan.idle))
         with run_progress(runner, shown=not args.quiet) as on_progress:
             result = runner.run(on_progress)
-        code = 0 if result.exit_code == INTERRUPTED and len(caught) == 1 else result.exit_code
+        code = 0 if result.exit_code == INTERRUPTED_EXIT_CODE and len(caught) == 1 else result.exit_code
         if result.error is not None:
             say(f"tactflow: {result.error}")
         written = args.stats is None or _write_statistics(args.stats, result.stats)

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_WEIGHT: Final = 400
+_FONT_WEIGHT: Final = 400
 """Weight of OpenCV 5's letters: the font's regular one."""
-_STROKES: Final = cv2.FONT_HERSHEY_SIMPLEX
+_STROKE_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _STROKE_SCALE: Final = 1 / 30
 """Scale of OpenCV 4's strokes over the letters' size, 1/px: at scale 1 capitals are 22 px high; in a usual
 font seven tenths of its size."""
-_PLAIN: Final = str.maketrans({"°": " deg", "²": "2", "³": "3", "−": "-"})
+_ASCII_SPELLINGS: Final = str.maketrans({"°": " deg", "²": "2", "³": "3", "−": "-"})
 """OpenCV 4's strokes know ASCII only."""
 
 
@@ -36,10 +36,12 @@ class Lettering:
     def size(self, picture: NDArray[np.uint8], text: str, size: int) -> tuple[int, int]:
         """Width and height, px, of a text in `picture`, (H, W, 3) uint8. size : of the letters, px."""
         if self._font is None:
-            (wide, tall), _ = cv2.getTextSize(text.translate(_PLAIN), _STROKES, size * _STROKE_SCALE, 1)
+            (wide, tall), _ = cv2.getTextSize(
+                text.translate(_ASCII_SPELLINGS), _STROKE_FONT, size * _STROKE_SCALE, 1
+            )
             return wide, tall
         height, width = picture.shape[:2]
-        _, _, wide, tall = cv2.getTextSize((width, height), text, (0, 0), self._font, size, _WEIGHT)
+        _, _, wide, tall = cv2.getTextSize((width, height), text, (0, 0), self._font, size, _FONT_WEIGHT)
         return wide, tall
 
     def write(
@@ -52,7 +54,7 @@ class Lettering:
     ) -> None:
         """Write text into `picture`, (H, W, 3) uint8; `place` is the left end of its base line, px."""
         if self._font is None:
-            plain = text.translate(_PLAIN)
-            cv2.putText(picture, plain, place, _STROKES, size * _STROKE_SCALE, colour, 1, cv2.LINE_AA)
+            plain = text.translate(_ASCII_SPELLINGS)
+            cv2.putText(picture, plain, place, _STROKE_FONT, size * _STROKE_SCALE, colour, 1, cv2.LINE_AA)
         else:
-            cv2.putText(picture, text, place, colour, self._font, size, _WEIGHT)
+            cv2.putText(picture, text, place, colour, self._font, size, _FONT_WEIGHT)

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from tactflow.vision.types import Scale
 
-LAMP: Final = np.array([-0.45, -0.55, 0.7], np.float32) / np.float32(np.hypot(np.hypot(0.45, 0.55), 0.7))
+LAMP_DIRECTION: Final = np.array([-0.45, -0.55, 0.7], np.float32) / np.float32(
+    np.hypot(np.hypot(0.45, 0.55), 0.7)
+)
 """Direction towards the lamp: x right, y down, z towards the viewer. Upper left, as on maps. The lamp, the
 share below and the height are those of the live page, chosen by hand, by how pictures look."""
-AMBIENT: Final = 0.35
+AMBIENT_SHARE: Final = 0.35
 """Share of the light that comes from everywhere."""
-RISE: Final = 3.0
+HEIGHT_GAIN: Final = 3.0
 """How much higher than it is the surface is shaded: contacts are flat."""
 
 
@@ -38,10 +40,12 @@ def relief(heights: NDArray[np.float32], scale: Scale, deepest: float) -> NDArra
         return picture
     # Around the part that is not 0, there is nothing to shade.
     part = (slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1))
-    down, across = np.gradient(np.pad(heights[part], 1) * np.float32(RISE))
+    down, across = np.gradient(np.pad(heights[part], 1) * np.float32(HEIGHT_GAIN))
     down, across = down[1:-1, 1:-1] / scale.y, across[1:-1, 1:-1] / scale.x
-    lit = (LAMP[2] - across * LAMP[0] - down * LAMP[1]) / np.sqrt(across * across + down * down + 1)
-    light = AMBIENT + (1 - AMBIENT) * np.maximum(lit, 0) / LAMP[2]
+    lit = (LAMP_DIRECTION[2] - across * LAMP_DIRECTION[0] - down * LAMP_DIRECTION[1]) / np.sqrt(
+        across * across + down * down + 1
+    )
+    light = AMBIENT_SHARE + (1 - AMBIENT_SHARE) * np.maximum(lit, 0) / LAMP_DIRECTION[2]
     picture[part] = np.minimum(picture[part] * light[..., None], 255).astype(np.uint8)
     return picture
 

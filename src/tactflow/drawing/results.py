@@ -28,32 +28,33 @@ MAGENTA: Final[Colour] = (255, 120, 255)
 DARK: Final[Colour] = (25, 25, 25)
 """Colours, blue, green, red."""
 
-_SHIFT: Final = 4
+_SUBPIXEL_BITS: Final = 4
 """Binary digits after the point in drawing coordinates, which are exact to 1/16 px."""
-_FAR: Final = 1e5
-"""Largest drawing coordinate, px: far outside any picture, and within 32 bits with `_SHIFT` digits."""
-_UNIT_SIDE: Final = 300
+_MAX_COORDINATE_PX: Final = 1e5
+"""Largest drawing coordinate, px: far outside any picture, and within 32 bits with `_SUBPIXEL_BITS`
+digits."""
+_UNIT_SIDE_PX: Final = 300
 """Shorter side of a picture, px, up to which everything is drawn at the sizes below; they grow with larger
 pictures. It and all sizes below are chosen by how the pictures look."""
-_DIM: Final = 3
+_DIMMING_FACTOR: Final = 3
 """How many times darker a place without gel is shown."""
-_LINE, _DARK_LINE, _HALO = 1.2, 2.6, 1.4
+_LINE_WIDTH_PX, _DARK_LINE_WIDTH_PX, _HALO_WIDTH_PX = 1.2, 2.6, 1.4
 """Widths of a line and of the dark line below it, and by how much the dark arrow is wider, px."""
-_SHORTEST_ARROW: Final = 2.0
+_MIN_ARROW_PX: Final = 2.0
 """Length below which an arrow is a dot, px."""
-_HEAD: Final = (0.45, 5.0)
+_ARROW_HEAD: Final = (0.45, 5.0)
 """Length of an arrow's head as a fraction of the arrow, and its maximum, px."""
-_OVERHANG: Final = 14
+_AXIS_OVERHANG_PX: Final = 14
 """Length of the principal axis beyond the hull, px."""
-_CENTROID: Final = (4.0, 2.8)
+_CENTROID_RADII_PX: Final = (4.0, 2.8)
 """Radii of the dark and of the coloured dot on the centroid, px."""
-_TEXT, _LINE_SPACING = 11, 14
+_TEXT_SIZE_PX, _LINE_SPACING_PX = 11, 14
 """Size of the text, and distance of its lines, px."""
-_BAR: Final = (70, 6)
+_COLOUR_BAR_PX: Final = (70, 6)
 """Width and height of the bar that explains the colours of heights, px."""
-_MARGIN: Final = 8
+_VIEW_MARGIN_PX: Final = 8
 """How far outside the contact the "contact" view reaches, px. Chosen by hand."""
-_BETWEEN: Final = 12.0
+_MIN_ARROW_SPACING_PX: Final = 12.0
 """Minimum distance of the arrows of a field, px."""
 _STATUS_COLOURS: Final = (
     (MarkerStatus.LOST, GRAY),
@@ -75,7 +76,7 @@ def dimmed(image: NDArray[np.uint8], valid: NDArray[np.uint8]) -> NDArray[np.uin
         raise ValueError(f"required valid of shape {image.shape[:2]}, got {valid.shape}")
     if valid.all():
         return image
-    return np.where(valid[:, :, None] == 0, image // _DIM, image)
+    return np.where(valid[:, :, None] == 0, image // _DIMMING_FACTOR, image)
 
 
 class Annotator:
@@ -156,12 +157,12 @@ class Annotator:
             picture = normals_picture(flat if normals is None else normals)
         else:
             picture = (image if valid is None else dimmed(image, valid)).copy()
-        unit = max(1.0, min(image.shape[:2]) / _UNIT_SIDE)
+        unit = max(1.0, min(image.shape[:2]) / _UNIT_SIDE_PX)
         if contact is not None and len(contact.hull):
-            _strokes(picture, [contact.hull], DARK, _DARK_LINE * unit, closed=True)
-            _strokes(picture, [contact.hull], GREEN, _LINE * unit, closed=True)
+            _strokes(picture, [contact.hull], DARK, _DARK_LINE_WIDTH_PX * unit, closed=True)
+            _strokes(picture, [contact.hull], GREEN, _LINE_WIDTH_PX * unit, closed=True)
         if field is not None:
-            between = field_arrows(field, _BETWEEN * unit)
+            between = field_arrows(field, _MIN_ARROW_SPACING_PX * unit)
             if self._view == "contact":
                 between = _inside(between, shown)
             draw_arrows(picture, between, self._arrow_scale, unit)
@@ -188,14 +189,14 @@ class Annotator:
 
     def _bar(self, picture: NDArray[np.uint8], unit: float) -> None:
         """The colour scale of heights, in the lower left corner."""
-        width, height = (round(side * unit) for side in _BAR)
+        width, height = (round(side * unit) for side in _COLOUR_BAR_PX)
         left, bottom = round(6 * unit), picture.shape[0] - round(6 * unit)
         if left + width >= picture.shape[1] or bottom - height < 0:
             return
         picture[bottom - height : bottom, left : left + width] = colour_bar(width, height)
         cv2.rectangle(picture, (left - 1, bottom - height - 1), (left + width, bottom), WHITE, 1)
         place = (left + width + round(4 * unit), bottom)
-        self._letters.write(picture, f"{self._deepest:g} mm", place, WHITE, round(_TEXT * unit))
+        self._letters.write(picture, f"{self._deepest:g} mm", place, WHITE, round(_TEXT_SIZE_PX * unit))
 
     def _shown(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         """(H, W): the contact and a margin around it."""
@@ -205,7 +206,7 @@ class Annotator:
             raise ValueError(
                 f"required a contact_mask of shape {image.shape[:2]} uint8, got {mask.shape} {mask.dtype}"
             )
-        side = 2 * _MARGIN + 1
+        side = 2 * _VIEW_MARGIN_PX + 1
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         return np.asarray(cv2.dilate(mask, disc), np.uint8)
 
@@ -215,11 +216,11 @@ class Annotator:
             theta = math.radians(contact.angle)
             along = np.array([math.cos(theta), -math.sin(theta)])
             spread = (contact.hull - center) @ along
-            overhang = _OVERHANG * unit
+            overhang = _AXIS_OVERHANG_PX * unit
             ends = center + along * [[spread.min() - overhang], [spread.max() + overhang]]
-            _strokes(picture, [ends], DARK, _DARK_LINE * unit)
-            _strokes(picture, [ends], ORANGE, _LINE * unit)
-        for colour, radius in zip((DARK, ORANGE), _CENTROID, strict=True):
+            _strokes(picture, [ends], DARK, _DARK_LINE_WIDTH_PX * unit)
+            _strokes(picture, [ends], ORANGE, _LINE_WIDTH_PX * unit)
+        for colour, radius in zip((DARK, ORANGE), _CENTROID_RADII_PX, strict=True):
             _dots(picture, center[None], colour, radius * unit)
         if self._text and contact.angle is not None:
             label = _signed(contact.angle, 1) + "°"
@@ -250,8 +251,8 @@ class Annotator:
         return lines
 
     def _write(self, picture: NDArray[np.uint8], lines: Sequence[tuple[str, Colour]], unit: float) -> None:
-        size = round(_TEXT * unit)
-        step = round(_LINE_SPACING * unit)
+        size = round(_TEXT_SIZE_PX * unit)
+        step = round(_LINE_SPACING_PX * unit)
         height = picture.shape[0]
         longest = max((self._letters.size(picture, text, size)[0] for text, _ in lines), default=0)
         bar: NDArray[Any] = picture[: min(height, step * len(lines) + round(5 * unit)), : longest + step]
@@ -264,7 +265,7 @@ class Annotator:
         self, picture: NDArray[np.uint8], text: str, place: tuple[int, int], colour: Colour, unit: float
     ) -> None:
         """Text kept inside the picture, on a shade."""
-        size = round(_TEXT * unit)
+        size = round(_TEXT_SIZE_PX * unit)
         height, width = picture.shape[:2]
         wide, tall = self._letters.size(picture, text, size)
         x = min(max(place[0], 2), max(2, width - wide - 3))
@@ -323,27 +324,29 @@ def draw_arrows(picture: NDArray[np.uint8], markers: Markers, scale: float = 1.0
         tail = np.asarray(markers.origin[chosen], np.float64)
         moved = (np.asarray(markers.position[chosen], np.float64) - tail) * scale
         length = np.hypot(moved[:, 0], moved[:, 1])
-        long = length >= _SHORTEST_ARROW * unit
+        long = length >= _MIN_ARROW_PX * unit
         along = moved[long] / length[long, None]
         across = along[:, ::-1] * [-1.0, 1.0]
         tip = tail[long] + moved[long]
-        back = np.minimum(_HEAD[0] * length[long], _HEAD[1] * unit)[:, None]
+        back = np.minimum(_ARROW_HEAD[0] * length[long], _ARROW_HEAD[1] * unit)[:, None]
         neck = tip - along * back
         left, right = neck + across * back * 0.5, neck - across * back * 0.5
         shafts = np.stack([tail[long], neck], axis=1)
         heads = np.stack([tip, left, right], axis=1)
-        for paint, extra in ((DARK, _HALO * unit), (colour, 0.0)):
+        for paint, extra in ((DARK, _HALO_WIDTH_PX * unit), (colour, 0.0)):
             if status == MarkerStatus.LOST and extra:
                 continue
-            _strokes(picture, shafts, paint, _LINE * unit + extra)
+            _strokes(picture, shafts, paint, _LINE_WIDTH_PX * unit + extra)
             if extra:
                 _strokes(picture, heads, paint, extra, closed=True)
             _fill(picture, heads, paint)
-            _dots(picture, tail[~long], paint, _LINE * unit + extra / 2)
+            _dots(picture, tail[~long], paint, _LINE_WIDTH_PX * unit + extra / 2)
 
 
 def _fixed(points: NDArray[Any]) -> NDArray[np.int32]:
-    fixed: NDArray[np.int32] = np.rint(np.clip(points, -_FAR, _FAR) * 2**_SHIFT).astype(np.int32)
+    fixed: NDArray[np.int32] = np.rint(
+        np.clip(points, -_MAX_COORDINATE_PX, _MAX_COORDINATE_PX) * 2**_SUBPIXEL_BITS
+    ).astype(np.int32)
     return fixed
 
 
@@ -356,17 +359,25 @@ def _strokes(
 ) -> None:
     if len(lines):
         points = [_fixed(line) for line in lines]
-        cv2.polylines(picture, points, closed, colour, max(1, round(width)), cv2.LINE_AA, _SHIFT)
+        cv2.polylines(picture, points, closed, colour, max(1, round(width)), cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _fill(picture: NDArray[np.uint8], polygons: NDArray[Any], colour: Colour) -> None:
     for polygon in _fixed(polygons):
-        cv2.fillConvexPoly(picture, polygon, colour, cv2.LINE_AA, _SHIFT)
+        cv2.fillConvexPoly(picture, polygon, colour, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _dots(picture: NDArray[np.uint8], centers: NDArray[Any], colour: Colour, radius: float) -> None:
     for x, y in _fixed(centers).tolist():
-        cv2.circle(picture, (x, y), round(radius * 2**_SHIFT), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+        cv2.circle(
+            picture,
+            (x, y),
+            round(radius * 2**_SUBPIXEL_BITS),
+            colour,
+            cv2.FILLED,
+            cv2.LINE_AA,
+            _SUBPIXEL_BITS,
+        )
 
 
 def _signed(value: float, digits: int) -> str:

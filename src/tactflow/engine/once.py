@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 KEPT_RESULTS = 4
 """Number of results kept of each function: of stages with different settings, and of the last reference."""
-COMPARED_BYTES = 1 << 14
+MAX_COMPARED_BYTES = 1 << 14
 """Size up to which arrays are compared by value, bytes: the positions of a thousand dots, 2 us."""
 
 
@@ -76,7 +76,7 @@ def _is_equal(first: Any, second: Any) -> bool:
         return False
     if isinstance(first, np.ndarray):
         alike = first.shape == second.shape and first.dtype == second.dtype
-        return alike and first.nbytes <= COMPARED_BYTES and first.tobytes() == second.tobytes()
+        return alike and first.nbytes <= MAX_COMPARED_BYTES and first.tobytes() == second.tobytes()
     if isinstance(first, tuple):
         return _are_same(first, second)
     return isinstance(first, str | float | int) and first == second

@@ -19,7 +19,7 @@ CAPTURE = "capture"
 COMPUTE = "compute"
 Demand = frozenset[str] | None
 """Ids of the sinks that need a node; None if every tick needs it."""
-BLOCK_CAPACITY = 4
+BLOCK_CAPACITY_FRAMES = 4
 """Length of the queue before a segment of stages, frames; evens out varying durations. Chosen by hand."""
 
 
@@ -213,7 +213,7 @@ def _link(
         capacity = max(delivery.queue_capacity for delivery in sinks)
         newest = all(delivery.when_live == "latest" for delivery in sinks)
     else:
-        capacity = max([BLOCK_CAPACITY, *(delivery.queue_capacity for delivery in sinks)])
+        capacity = max([BLOCK_CAPACITY_FRAMES, *(delivery.queue_capacity for delivery in sinks)])
         newest = pipeline.source.id in members[producer]
     policy: FullPolicy = "latest" if live and newest else "block"
     return LinkPlan(producer, consumer, queue.capacity or capacity, queue.when_full or policy)

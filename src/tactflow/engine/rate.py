@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-SLACK = 5e-7
+TIME_TOLERANCE_S = 5e-7
 """Tolerance for the rounding of times in a recording, which are multiples of 1 / fps, s."""
 
 
@@ -20,7 +20,7 @@ class RateLimit:
         rate = self._rate
         if rate is None:
             return True
-        if t + SLACK < self._due:
+        if t + TIME_TOLERANCE_S < self._due:
             return False
         start = self._due if t - self._due < 1.0 / rate else t
         self._due = start + 1.0 / rate

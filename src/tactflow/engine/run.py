@@ -17,7 +17,7 @@ from tactflow.engine.node import RunningNode
 from tactflow.engine.parts import Parts
 from tactflow.engine.plan import Plan, make_plan
 from tactflow.engine.threads import Threads
-from tactflow.system.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class Runner:
             self._parts.close(self._threads.in_use, self._ending.fail)
         stats, error = self.snapshot(), self._ending.error
         if is_interrupted:
-            return RunResult(INTERRUPTED, None, stats)
+            return RunResult(INTERRUPTED_EXIT_CODE, None, stats)
         if error is not None:
             return RunResult(error.exit_code, str(error), stats, error)
         return RunResult(0, None, stats)

@@ -12,11 +12,11 @@ from typing import Any
 
 _BINS_PER_E = 50
 """Bins per factor e: a quantile is exact to +-1 %."""
-_SMALLEST = 1e-7
-_BINS = 26 * _BINS_PER_E
+_MIN_DURATION_S = 1e-7
+_BIN_COUNT = 26 * _BINS_PER_E
 """Shortest duration that is resolved, s, and the number of bins from there on: 26 factors of e, 5 h."""
 
-_OFFSET = -log(_SMALLEST) * _BINS_PER_E
+_BIN_OFFSET = -log(_MIN_DURATION_S) * _BINS_PER_E
 
 
 class Durations:
@@ -27,14 +27,14 @@ class Durations:
 
     def __init__(self) -> None:
         self.total = 0.0
-        self._bins = [0] * _BINS
+        self._bins = [0] * _BIN_COUNT
         self._lock = threading.Lock()
 
     def add(self, seconds: float) -> None:
         """Count one duration, s."""
-        index = int(log(seconds) * _BINS_PER_E + _OFFSET) if seconds > _SMALLEST else 0
+        index = int(log(seconds) * _BINS_PER_E + _BIN_OFFSET) if seconds > _MIN_DURATION_S else 0
         with self._lock:
-            self._bins[index if index < _BINS else -1] += 1
+            self._bins[index if index < _BIN_COUNT else -1] += 1
             self.total += seconds
 
     @property
@@ -49,7 +49,7 @@ class Durations:
         if not counts[-1]:
             return None
         index = bisect_left(counts, max(1, ceil(q * counts[-1])))
-        return _SMALLEST * exp((index + 0.5) / _BINS_PER_E)
+        return _MIN_DURATION_S * exp((index + 0.5) / _BINS_PER_E)
 
     def milliseconds(self, q: float) -> float | None:
         """`quantile` in ms, rounded to 4 decimals."""

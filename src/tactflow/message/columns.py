@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 from tactflow.message.fields import Markers, Message, Part, SeparateContact
 from tactflow.message.schema import message_schema, resolved
 
-LEFT_OUT = ("schema", "contacts", "markers", "field")
+KEYS_WITHOUT_COLUMN = ("schema", "contacts", "markers", "field")
 """Keys without a column in `frames`: the first is constant, two have their own tables, and a displacement
 field has thousands of numbers per frame."""
-XYZ = ("x", "y", "z")
+AXIS_NAMES = ("x", "y", "z")
 """Names of the elements of a tuple that the description does not name."""
 
 
@@ -62,7 +62,7 @@ def frame_columns() -> Sequence[Column]:
     >>> [column.name for column in frame_columns()][:6]
     ['sensor', 'seq', 't', 'size_width', 'size_height', 'contact_area']
     """
-    return tuple(column for column in _columns(Message) if column.path[0] not in LEFT_OUT)
+    return tuple(column for column in _columns(Message) if column.path[0] not in KEYS_WITHOUT_COLUMN)
 
 
 @cache
@@ -143,7 +143,7 @@ def _columns(part: type[Part], path: tuple[str, ...] = ()) -> Iterator[Column]:
         if key.part is not None:
             yield from _columns(key.part, place)
         elif "prefixItems" in form:
-            names = (*key.sending.elements, *XYZ[len(key.sending.elements) :])
+            names = (*key.sending.elements, *AXIS_NAMES[len(key.sending.elements) :])
             for index, element in enumerate(form["prefixItems"]):
                 suffix = names[index] if index < len(names) else str(index + 1)
                 kind = element.get("type", "number")

@@ -24,22 +24,22 @@ from tactflow.system.files import discard_output, expanded, is_device
 
 log = logging.getLogger("tactflow")
 
-LOOK_EVERY = 0.1
+POLL_SECONDS = 0.1
 """Poll interval while waiting for a reader, s."""
-LINGER = 1.0
+LINGER_SECONDS = 1.0
 """Time to deliver the last lines when the run no longer waits for the reader, s; as for the ZeroMQ sink."""
-MOST_WAITING = 1000
+MAX_QUEUED_LINES = 1000
 """Length of the queue for a slow reader, lines: 17 s at 60 Hz, 6 MB with 60 markers each."""
-AT_ONCE = getattr(select, "PIPE_BUF", 512)
+ATOMIC_BYTES = getattr(select, "PIPE_BUF", 512)
 """Bytes that a pipe takes without blocking when it is ready."""
-LONGEST_LINE = 1 << 24
+MAX_LINE_BYTES = 1 << 24
 """Upper bound of a line, bytes: one with a displacement field has some 100 kB."""
 
 
 class LineStream:
     """Writes complete lines to a pipe or standard output, at the pace of the reader.
 
-    In a live run, the oldest of more than `MOST_WAITING` lines are dropped; otherwise it waits for the
+    In a live run, the oldest of more than `MAX_QUEUED_LINES` lines are dropped; otherwise it waits for the
     reader.
 
     path : a named pipe or device, whose reader the constructor waits for; "-" is standard output.
@@ -75,7 +75,7 @@ class LineStream:
             if not waits:
                 log.info("%s: waits for a reader", path)
             waits = True
-            time.sleep(LOOK_EVERY)
+            time.sleep(POLL_SECONDS)
             self.ended = self._is_hurried()
         return -1
 
@@ -90,7 +90,7 @@ class LineStream:
         """Add a line without its line end; for a recording, wait while the queue is full."""
         self._lines.append(line + b"\n")
         self._write(0)
-        while len(self._lines) > MOST_WAITING and not self.ended:
+        while len(self._lines) > MAX_QUEUED_LINES and not self.ended:
             if self._is_live() or self._is_hurried():
                 # The first line may be written in part.
                 del self._lines[1]
@@ -98,14 +98,14 @@ class LineStream:
                     log.warning("%s: its reader is too slow: lines are dropped", self._name)
                 self.dropped += 1
             else:
-                self._write(LOOK_EVERY)
+                self._write(POLL_SECONDS)
 
     def _write(self, seconds: float) -> None:
         """Write lines while the reader takes them; wait up to `seconds` for it."""
         try:
             while self._lines and not self.ended and self._is_ready(seconds):
                 line = self._lines[0]
-                self._begun += os.write(self._descriptor, line[self._begun : self._begun + AT_ONCE])
+                self._begun += os.write(self._descriptor, line[self._begun : self._begun + ATOMIC_BYTES])
                 if self._begun == len(line):
                     self._lines.popleft()
                     self._begun = 0
@@ -126,13 +126,13 @@ class LineStream:
         return sys.platform == "win32" or bool(select.select([], [self._descriptor], [], seconds)[1])
 
     def close(self) -> None:
-        """Write the rest, for at most `LINGER` if the run does not wait for the reader, and close the file.
+        """Write the rest and close the file; wait `LINGER_SECONDS` at most if the run does not wait for the reader.
 
         Raises StageError also if the reader did not take all lines of a recording.
         """
-        until = time.monotonic() + LINGER
+        until = time.monotonic() + LINGER_SECONDS
         while self._lines and not self.ended:
-            self._write(LOOK_EVERY)
+            self._write(POLL_SECONDS)
             if (self._is_live() or self._is_hurried()) and time.monotonic() > until:
                 break
         if self._descriptor >= 0 and self._name != "standard output":
@@ -254,7 +254,7 @@ def _continuation(
         raise StageError(
             f"{path}: cannot be continued: its columns are not those of this run; give another path"
         )
-    file.seek(max(0, end - LONGEST_LINE))
+    file.seek(max(0, end - MAX_LINE_BYTES))
     rest = file.read().rpartition(b"\n")[2]
     if header is None and rest:
         try:

@@ -24,7 +24,7 @@ log = logging.getLogger("tactflow")
 
 POLL_MS = 200
 """Poll interval of the thread, ms. Chosen by hand."""
-LINGER = 0.2
+LINGER_SECONDS = 0.2
 """Time to deliver the last answer at the end of a run, s. Chosen by hand."""
 REQUESTS = {
     "take_reference": ("reference", True),
@@ -134,7 +134,7 @@ class ControlSocket(BoundSocket):
         self._thread = threading.Thread(target=self._serve, name="tactflow-control", daemon=True)
         self._thread.start()
 
-    def close(self, linger: float = LINGER) -> None:
+    def close(self, linger: float = LINGER_SECONDS) -> None:
         """Stop serving, and free the address."""
         self._closing.set()
         self._thread.join()

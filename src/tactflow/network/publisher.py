@@ -23,7 +23,7 @@ from tactflow.system.files import expanded
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
-BOUND: dict[int, int] = {
+SERVER_OPTIONS: dict[int, int] = {
     # Largest subscription or command, bytes; usual ones have some twenty. ZeroMQ keeps subscriptions in a
     # tree and recurses once per byte: a subscription of a megabyte overflows the stack.
     zmq.MAXMSGSIZE: 4096,
@@ -33,7 +33,7 @@ BOUND: dict[int, int] = {
     zmq.TCP_KEEPALIVE: 1,
     zmq.TCP_KEEPALIVE_IDLE: 10,
 }
-SEND_BUFFER = 65_536
+SEND_BUFFER_BYTES = 65_536
 """Kernel send buffer per subscriber, bytes: one segment of the loopback device, as messages longer than the
 buffer wait for delayed acknowledgements (depth maps took 0.3 s each with 32 kB). Larger ones hold more stale
 messages."""
@@ -67,7 +67,7 @@ class BoundSocket:
         try:
             address = Address.parse(endpoint)
             # ZeroMQ accepts an IPv6 address only with this option.
-            for option, value in {zmq.IPV6: ":" in str(address.host), **BOUND, **options}.items():
+            for option, value in {zmq.IPV6: ":" in str(address.host), **SERVER_OPTIONS, **options}.items():
                 self.socket.setsockopt(option, value)
             if keys is not None:
                 self._authenticator = require_keys(self.socket, self._context, expanded(keys))
@@ -116,7 +116,9 @@ class Publisher(BoundSocket):
         self._lock = threading.Lock()
         self._topics: Counter[bytes] = Counter()
         self.subscriptions = 0
-        super().__init__(zmq.XPUB, endpoint, _HINT, {zmq.SNDHWM: backlog, zmq.SNDBUF: SEND_BUFFER}, keys)
+        super().__init__(
+            zmq.XPUB, endpoint, _HINT, {zmq.SNDHWM: backlog, zmq.SNDBUF: SEND_BUFFER_BYTES}, keys
+        )
 
     def next_event(self) -> bytes | None:
         """The next subscription (1 and the prefix) or its end (0 and the prefix), or None; never waits."""

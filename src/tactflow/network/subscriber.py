@@ -24,23 +24,23 @@ log = logging.getLogger("tactflow")
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5556"
 """Default address of the sink `zmq`."""
-LONGEST_WAIT = 1e6
+MAX_TIMEOUT_S = 1e6
 """Longest timeout, s (11 days): ZeroMQ counts milliseconds in 31 bits."""
-OPTIONS: dict[int, int | bytes] = {
+CLIENT_OPTIONS: dict[int, int | bytes] = {
     # Interval and timeout of heartbeats, to detect a publisher without power, ms. Chosen by hand.
     zmq.HEARTBEAT_IVL: 2000,
     zmq.HEARTBEAT_TIMEOUT: 6000,
 }
-BACKLOG = 10_000
+MAX_QUEUED_MESSAGES = 10_000
 """Length of the receive queue, messages: nearly three minutes at 60 Hz, some 140 MB. Further ones are lost
 and counted. Chosen by hand."""
-BEHIND_SECONDS = 1.0
+REPORTED_DELAY_S = 1.0
 """Delay of a subscriber that is reported, s: a control loop would act on a contact long gone."""
-REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+REJECTION_EVENTS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """The server rejected our keys; ZeroMQ does not retry."""
-HUNG_UP = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+HANG_UP_EVENT = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 """The server closed the connection during the handshake; ZeroMQ retries."""
-MOST_HANG_UPS = 5
+MAX_HANG_UPS = 5
 """Consecutive hang-ups that count as a rejection; a server that ends causes one or two. Chosen by hand."""
 
 
@@ -64,7 +64,9 @@ class Connection:
         self._hang_ups = 0
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(kind)
-        self._handshakes = self._socket.get_monitor_socket(REFUSED | HUNG_UP | zmq.EVENT_HANDSHAKE_SUCCEEDED)
+        self._handshakes = self._socket.get_monitor_socket(
+            REJECTION_EVENTS | HANG_UP_EVENT | zmq.EVENT_HANDSHAKE_SUCCEEDED
+        )
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(self._handshakes, zmq.POLLIN)
@@ -85,16 +87,16 @@ class Connection:
 
         Raises PermissionError if the server rejects us.
         """
-        while self._hang_ups < MOST_HANG_UPS:
+        while self._hang_ups < MAX_HANG_UPS:
             seconds = max(until - time.monotonic(), 0.0)
             ready = dict(self._poller.poll(None if math.isinf(seconds) else math.ceil(seconds * 1000)))
             if self._handshakes not in ready:
                 return bool(ready)
             event = recv_monitor_message(self._handshakes)["event"]
-            if event & REFUSED:
-                self._hang_ups = MOST_HANG_UPS
+            if event & REJECTION_EVENTS:
+                self._hang_ups = MAX_HANG_UPS
             else:
-                self._hang_ups = self._hang_ups + 1 if event == HUNG_UP else 0
+                self._hang_ups = self._hang_ups + 1 if event == HANG_UP_EVENT else 0
         reason = (
             "does not admit these keys, or requires none"
             if self._has_keys
@@ -157,8 +159,8 @@ class Subscriber(Connection):
         timeout: float | None = None,
         keys: str | Path | None = None,
     ) -> None:
-        if timeout is not None and not 0 <= timeout <= LONGEST_WAIT:
-            raise ValueError(f"timeout: required None or 0 to {LONGEST_WAIT:g} seconds, got {timeout}")
+        if timeout is not None and not 0 <= timeout <= MAX_TIMEOUT_S:
+            raise ValueError(f"timeout: required None or 0 to {MAX_TIMEOUT_S:g} seconds, got {timeout}")
         self.timeout = timeout
         self.lost = 0
         self.received = 0
@@ -170,10 +172,10 @@ class Subscriber(Connection):
         self._was_behind = False
         self._current_age: dict[str, float] = {}
         # With zmq.CONFLATE, a multipart message would abort the process.
-        self._skipped_at_most = BACKLOG if latest else 0
+        self._skipped_at_most = MAX_QUEUED_MESSAGES if latest else 0
         options: dict[int, int | bytes] = {
-            **OPTIONS,
-            zmq.RCVHWM: BACKLOG,
+            **CLIENT_OPTIONS,
+            zmq.RCVHWM: MAX_QUEUED_MESSAGES,
             # The space ends the topic: `main` must not match `main2`.
             zmq.SUBSCRIBE: b"tactflow." if sensor is None else f"tactflow.{sensor} ".encode(),
         }
@@ -216,7 +218,7 @@ class Subscriber(Connection):
         raise TimeoutError(self._timeout_message())
 
     def _watch_delay(self, result: Result) -> None:
-        """Say once if the queued messages are older by `BEHIND_SECONDS` than the last one that we waited for.
+        """Warn once if queued messages are older by `REPORTED_DELAY_S` than the last one that we waited for.
 
         This compares neither the clocks of two machines nor the time of a recording with ours.
         """
@@ -225,7 +227,7 @@ class Subscriber(Connection):
         has_restarted = result.seq <= self._last_seq.get(result.sensor, -1)
         if not self._was_queued or has_restarted or age < current:
             self._current_age[result.sensor] = age
-        elif age - current >= BEHIND_SECONDS and not (self._is_latest or self._was_behind):
+        elif age - current >= REPORTED_DELAY_S and not (self._is_latest or self._was_behind):
             self._was_behind = True
             log.warning(
                 "Subscriber: reads more slowly than tactflow publishes, and is %.1f s behind; "

@@ -20,13 +20,13 @@ from __future__ import annotations
 
 from tactflow.system.extras import missing
 
-NEEDED = ("mcap", "zstandard", "mcap_protobuf", "foxglove_schemas_protobuf")
+REQUIRED_PACKAGES = ("mcap", "zstandard", "mcap_protobuf", "foxglove_schemas_protobuf")
 
 
-CALIBRATION = frozenset({"calibration.yaml", "calibration.npz"})
+CALIBRATION_ATTACHMENTS = frozenset({"calibration.yaml", "calibration.npz"})
 """Attachments of a recording with a calibration."""
 
 
 def missing_packages() -> str | None:
     """A message about missing packages for recordings, with the remedy, or None."""
-    return missing("recordings", "record", NEEDED)
+    return missing("recordings", "record", REQUIRED_PACKAGES)

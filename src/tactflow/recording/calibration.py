@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from tactflow.recording import CALIBRATION
+from tactflow.recording import CALIBRATION_ATTACHMENTS
 
-MAX_ARRAYS: Final = 1 << 20
+MAX_ARRAY_BYTES: Final = 1 << 20
 """Size limit of the arrays, packed and unpacked, bytes; ours have some thousands."""
-MAX_TEXT: Final = 1 << 17
+MAX_TEXT_BYTES: Final = 1 << 17
 """Size limit of the YAML file, bytes; ours have some thousands. PyYAML takes 4 s for so many."""
 
 
@@ -18,12 +18,12 @@ def stored_text(path: Path) -> bytes:
 
     Raises OSError or ValueError if it is missing, or larger than any calibration.
     """
-    return _stored(path, "calibration.yaml", MAX_TEXT)
+    return _stored(path, "calibration.yaml", MAX_TEXT_BYTES)
 
 
 def stored_arrays(path: Path) -> bytes:
     """The `.npz` file of a calibration; as `stored_text`."""
-    return _stored(path, "calibration.npz", MAX_ARRAYS)
+    return _stored(path, "calibration.npz", MAX_ARRAY_BYTES)
 
 
 def _stored(path: Path, name: str, limit: int) -> bytes:
@@ -31,7 +31,7 @@ def _stored(path: Path, name: str, limit: int) -> bytes:
         from tactflow.recording.reader import attachments
 
         attached = attachments(path)
-        if not attached.keys() >= CALIBRATION:
+        if not attached.keys() >= CALIBRATION_ATTACHMENTS:
             raise ValueError("the recording was made without a calibration")
         data = attached[name]
     else:

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-SAMPLES: Final = (48, 64)
+MIN_SAMPLED_SHAPE: Final = (48, 64)
 """Rows and columns of a picture that are sampled, at least, if it has as many."""
-BLACK_LEVEL: Final = 4
+BLACK_GREY: Final = 4
 """Highest grey level of the black surround of the gel."""
-CLIPPED_LEVEL: Final = 254
+CLIPPED_GREY: Final = 254
 """Lowest grey level that counts as clipped: compression takes one from 255."""
 LARGEST_DOT_SAMPLES: Final = 20
 """Area of the largest clipped spot that is not counted, samples: of a disc a 13th of the picture's width
@@ -21,17 +21,17 @@ across. White dots and pins are clipped without harm, as only their positions ar
 LOCAL_INTERVALS: Final = 31
 """Intervals around each one whose median is the local interval, so that a camera that changes its rate in the
 dark loses no frames by that."""
-HALF_AN_INTERVAL: Final = 0.5
+IRREGULAR_DEVIATION_INTERVALS: Final = 0.5
 """Deviation from which an interval is irregular, local intervals: a frame that is further off belongs to
 another one of evenly spaced moments."""
-NEIGHBOURS: Final = 4
+NEIGHBOUR_FRAMES: Final = 4
 """Frames on each side of a wide interval that tell whether one is missing in it, or was only late."""
 CONTACT_SECONDS: Final = 0.2
 """Duration of a short tap, s: a pause of this length may hide a contact."""
-CODEC_REPEATS: Final = 0.1
+CODEC_REPEAT_SHARE: Final = 0.1
 """Share of identical successive frames in a good recording: compression produces them in still scenes
 (measured)."""
-CHANCE: Final = 1e-3
+FALSE_FREEZE_PROBABILITY: Final = 1e-3
 """Probability that a run of identical frames which counts as frozen occurs by chance in a recording."""
 
 
@@ -78,7 +78,9 @@ class Watcher:
         damaged: bool = False,
     ) -> Glance:
         """The next frame. image : (H, W, 3) uint8, not modified later. The others are as in `Glance`."""
-        down, across = (max(1, side // most) for side, most in zip(image.shape, SAMPLES, strict=False))
+        down, across = (
+            max(1, side // most) for side, most in zip(image.shape, MIN_SAMPLED_SHAPE, strict=False)
+        )
         picture = image[::down, ::across]
         samples = picture.astype(np.int16)
         change, repeated = 0.0, False
@@ -93,7 +95,7 @@ class Watcher:
 def clipped_share(picture: NDArray[np.uint8]) -> float:
     """Share of the gel with a saturated channel, 0 to 1, without spots of the size of dots.
 
-    picture : (H, W, 3) uint8, about `SAMPLES`.
+    picture : (H, W, 3) uint8, about `MIN_SAMPLED_SHAPE`.
 
     >>> white_pin = np.full((48, 64, 3), 20, np.uint8)
     >>> white_pin[20:24, 30:34] = 255
@@ -101,12 +103,12 @@ def clipped_share(picture: NDArray[np.uint8]) -> float:
     (0.0, 1.0)
     """
     brightest = np.maximum(np.maximum(picture[..., 0], picture[..., 1]), picture[..., 2])
-    clipped = (brightest >= CLIPPED_LEVEL).astype(np.uint8)
+    clipped = (brightest >= CLIPPED_GREY).astype(np.uint8)
     if not clipped.any():
         return 0.0
     areas = cv2.connectedComponentsWithStats(clipped, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
     large = areas[areas > LARGEST_DOT_SAMPLES]
-    return float(large.sum() / np.count_nonzero(brightest > BLACK_LEVEL))
+    return float(large.sum() / np.count_nonzero(brightest > BLACK_GREY))
 
 
 class Pause(NamedTuple):
@@ -226,7 +228,7 @@ class Course:
             return None
         if longest.repeats > self.frames / 2:
             return longest
-        if chance > CODEC_REPEATS or self.frames * chance**longest.repeats > CHANCE:
+        if chance > CODEC_REPEAT_SHARE or self.frames * chance**longest.repeats > FALSE_FREEZE_PROBABILITY:
             return None
         return longest
 
@@ -258,11 +260,11 @@ def timing_of(times: NDArray[np.float64]) -> Timing | None:
         return None
     local = _local_intervals(np.where(gaps > 0, gaps, np.median(forwards)))
     ratio = gaps / local
-    wide = np.flatnonzero(ratio - 1 > HALF_AN_INTERVAL)
+    wide = np.flatnonzero(ratio - 1 > IRREGULAR_DEVIATION_INTERVALS)
     missing = _missing(times, local, wide)
     lost = int(missing.sum())
     # A late frame has a wide interval before it and a narrow one behind it.
-    narrow = np.count_nonzero(1 - ratio > HALF_AN_INTERVAL)
+    narrow = np.count_nonzero(1 - ratio > IRREGULAR_DEVIATION_INTERVALS)
     irregular = max(np.count_nonzero(missing == 0), narrow) / len(gaps)
     long = np.flatnonzero((gaps >= CONTACT_SECONDS) & (np.rint(ratio) > 1))
     return Timing(
@@ -288,8 +290,8 @@ def _missing(
     borders = np.concatenate([[-1], wide, [len(times) - 1]])
     for index, gap in enumerate(wide):
         interval = float(local[gap])
-        before = times[max(borders[index] + 1, gap + 1 - NEIGHBOURS) : gap + 1][::-1]
-        after = times[gap + 1 : min(borders[index + 2], gap + NEIGHBOURS) + 1]
+        before = times[max(borders[index] + 1, gap + 1 - NEIGHBOUR_FRAMES) : gap + 1][::-1]
+        after = times[gap + 1 : min(borders[index + 2], gap + NEIGHBOUR_FRAMES) + 1]
         start = (before + interval * np.arange(len(before))).min()
         end = (after - interval * np.arange(len(after))).min()
         missing[index] = max(round((end - start) / interval) - 1, 0)

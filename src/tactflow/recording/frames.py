@@ -19,14 +19,14 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from tactflow.engine.frame import MOST_PIXELS, Frame
+from tactflow.engine.frame import MAX_PIXELS, Frame
 
 TYPE_NAME = "tactflow.RawFrame"
 CODEC = "up+zstd"
 ENCODING = "bgr8"
-LATEST = 2.0**62 / 1e9
+MAX_TIME_S = 2.0**62 / 1e9
 """Largest absolute time of a frame, s: in ns, it fits into 64 bits."""
-LEVEL = 1
+COMPRESSION_LEVEL = 1
 """zstd's fastest level that still does entropy coding."""
 _FIELDS = {
     "timestamp": "MESSAGE",
@@ -102,7 +102,7 @@ def encode_frame(frame: Frame) -> bytes:
         height=image.shape[0],
         encoding=ENCODING,
         codec=CODEC,
-        data=zstandard.compress(differences.data, LEVEL),
+        data=zstandard.compress(differences.data, COMPRESSION_LEVEL),
     )
     return bytes(raw.SerializeToString())
 
@@ -122,15 +122,15 @@ def parse_frame(message: bytes) -> RawFrame:
                 f"required pixels stored as {required}, got {stored or None}; "
                 "was it recorded by a newer tactflow?"
             )
-    if not abs(raw.t) < LATEST:
-        raise ValueError(f"required a frame's time within {LATEST:g} s, got {raw.t}")
+    if not abs(raw.t) < MAX_TIME_S:
+        raise ValueError(f"required a frame's time within {MAX_TIME_S:g} s, got {raw.t}")
     return raw
 
 
 def decode_pixels(raw: RawFrame) -> NDArray[np.uint8]:
     """The pixels of a frame, (H, W, 3) uint8 BGR, exactly as captured. Raises ValueError if damaged."""
-    if not 0 < raw.width * raw.height <= MOST_PIXELS:
-        raise ValueError(f"required 1 to {MOST_PIXELS} pixels, got {raw.width} x {raw.height}")
+    if not 0 < raw.width * raw.height <= MAX_PIXELS:
+        raise ValueError(f"required 1 to {MAX_PIXELS} pixels, got {raw.width} x {raw.height}")
     size = raw.height * raw.width * 3
     try:
         # Check first, because zstd allocates the announced size whatever limit it is given.

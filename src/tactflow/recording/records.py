@@ -28,7 +28,7 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 
-DAMAGE = (
+DAMAGE_ERRORS = (
     *(McapError, struct.error, zstandard.ZstdError),
     *(ValueError, KeyError, OverflowError, RuntimeError, MemoryError),
 )
@@ -37,13 +37,13 @@ DAMAGE = (
 MAGIC = b"\x89MCAP0\r\n"
 """First bytes of every MCAP file."""
 
-LARGEST_CHUNK = 256 << 20
+MAX_CHUNK_BYTES = 256 << 20
 """Maximum size of an unpacked chunk, bytes: twice a raw 8K picture. Larger ones count as damaged."""
 
 _FOOTER = struct.Struct("<QQI")
 """Offsets of the index and of its offset section, and checksum: the last bytes of a file before `MAGIC`."""
 
-_DATA = (Attachment, Channel, Header, Message, Metadata, Schema)
+_DATA_RECORDS = (Attachment, Channel, Header, Message, Metadata, Schema)
 """All records outside chunks except the index, which can be derived from the rest."""
 
 
@@ -75,7 +75,7 @@ def read_summary(file: BinaryIO) -> Summary | None:
                     return None
         file.seek(0)
         return SeekingReader(file, record_size_limit=size).get_summary()
-    except (*DAMAGE, OSError):
+    except (*DAMAGE_ERRORS, OSError):
         # The file is shorter than a footer, or does not end with one.
         return None
 
@@ -116,12 +116,12 @@ def intact_records(file: BinaryIO) -> Iterator[McapRecord | Damage]:
                     described = []
                 if isinstance(record, Chunk):
                     yield from _unpacked(record, Damage(start, at))
-                elif isinstance(record, _DATA):
+                elif isinstance(record, _DATA_RECORDS):
                     yield record
                 elif isinstance(record, Footer):
                     yield from [] if summary is None else [record]
                     return
-        except DAMAGE:
+        except DAMAGE_ERRORS:
             after = _first_behind(at, chunks, size)
             if at < after:
                 yield Damage(at, after)
@@ -138,10 +138,10 @@ def _unpacked(chunk: Chunk, place: Damage) -> Iterator[McapRecord | Damage]:
     """The records of a chunk, or its location if it is damaged."""
     try:
         # Before memory is allocated.
-        if chunk.uncompressed_size > LARGEST_CHUNK:
-            raise ValueError(f"required a chunk of {LARGEST_CHUNK} bytes at most")
+        if chunk.uncompressed_size > MAX_CHUNK_BYTES:
+            raise ValueError(f"required a chunk of {MAX_CHUNK_BYTES} bytes at most")
         records = breakup_chunk(chunk, validate_crc=True)
-    except DAMAGE:
+    except DAMAGE_ERRORS:
         yield place
     else:
         yield from records

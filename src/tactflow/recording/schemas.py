@@ -25,17 +25,17 @@ from tactflow.message.schema import message_schema, resolved
 from tactflow.recording.frames import RawFrame, timestamp
 from tactflow.vision.types import Markers, MarkerStatus
 
-CORNER = 0.5
+PIXEL_CORNER_PX = 0.5
 """Foxglove's origin is the corner of the first pixel, tactflow's is its centre, px."""
 ARROW_SCALE = 3.0
 """Length of an arrow relative to the displacement, as in `visualize`."""
-HEAD = 0.2
+ARROW_HEAD_SHARE = 0.2
 """Length of an arrow's head relative to the arrow. Chosen by hand."""
-LINE, DOT = 2.0, 4.0
+LINE_WIDTH_PX, DOT_DIAMETER_PX = 2.0, 4.0
 """Width of lines, diameter of dots, px. Chosen by hand."""
-CONTACT = Color(r=0.2, g=0.9, b=1.0, a=1.0)
-ARROWS = Color(r=1.0, g=0.85, b=0.1, a=1.0)
-DOTS = {
+CONTACT_COLOUR = Color(r=0.2, g=0.9, b=1.0, a=1.0)
+ARROW_COLOUR = Color(r=1.0, g=0.85, b=0.1, a=1.0)
+DOT_COLOURS = {
     MarkerStatus.TRACKED: Color(r=0.2, g=1.0, b=0.3, a=1.0),
     MarkerStatus.INFERRED: Color(r=1.0, g=0.6, b=0.0, a=1.0),
     MarkerStatus.LOST: Color(r=1.0, g=0.1, b=0.1, a=1.0),
@@ -82,19 +82,22 @@ def encode_annotations(result: Result, nanoseconds: int) -> bytes:
     def drawn(
         kind: PointsAnnotation.Type.ValueType, points: NDArray[np.float64], colour: Color, thickness: float
     ) -> PointsAnnotation:
-        places = [Point2(x=x, y=y) for x, y in (points + CORNER).tolist()]
+        places = [Point2(x=x, y=y) for x, y in (points + PIXEL_CORNER_PX).tolist()]
         return PointsAnnotation(
             timestamp=stamp, type=kind, points=places, outline_color=colour, thickness=thickness
         )
 
-    parts = [drawn(PointsAnnotation.LINE_LOOP, part.hull, CONTACT, LINE) for part in result.contacts]
+    parts = [
+        drawn(PointsAnnotation.LINE_LOOP, part.hull, CONTACT_COLOUR, LINE_WIDTH_PX)
+        for part in result.contacts
+    ]
     markers = result.markers
     if markers is not None:
-        parts.append(drawn(PointsAnnotation.LINE_LIST, _arrows(markers), ARROWS, LINE))
-        for status, colour in DOTS.items():
+        parts.append(drawn(PointsAnnotation.LINE_LIST, _arrows(markers), ARROW_COLOUR, LINE_WIDTH_PX))
+        for status, colour in DOT_COLOURS.items():
             chosen = markers.position[markers.status == status]
             if len(chosen):
-                parts.append(drawn(PointsAnnotation.POINTS, chosen, colour, DOT))
+                parts.append(drawn(PointsAnnotation.POINTS, chosen, colour, DOT_DIAMETER_PX))
     return bytes(ImageAnnotations(timestamp=stamp, points=parts).SerializeToString())
 
 
@@ -103,7 +106,7 @@ def _arrows(markers: Markers) -> NDArray[np.float64]:
     known = markers.status != MarkerStatus.LOST
     tail, moved = markers.origin[known], ARROW_SCALE * markers.displacement[known]
     tip, across = tail + moved, np.column_stack([-moved[:, 1], moved[:, 0]])
-    left, right = tip - HEAD * (moved - across), tip - HEAD * (moved + across)
+    left, right = tip - ARROW_HEAD_SHARE * (moved - across), tip - ARROW_HEAD_SHARE * (moved + across)
     ends: NDArray[np.float64] = np.stack([tail, tip, tip, left, tip, right], axis=1).reshape(-1, 2)
     return ends
 

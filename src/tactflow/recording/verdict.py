@@ -10,22 +10,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
-from tactflow.recording.course import CODEC_REPEATS, CONTACT_SECONDS, Course, Pause, Timing, seconds_text
+from tactflow.recording.course import CODEC_REPEAT_SHARE, CONTACT_SECONDS, Course, Pause, Timing, seconds_text
 
 Grade = Literal["good", "warning", "fault", "unknown"]
 
-OF_THE_RECORDING: Final = ("drop-outs", "timing", "frozen", "damage", "clipping", "step")
+RECORDING_FINDINGS: Final = ("drop-outs", "timing", "frozen", "damage", "clipping", "step")
 """Findings about the recording itself. Their warnings make it `usable`; those about the sensor do not."""
-TENTH: Final = 10.0
+BAD_LOSS_PERCENT: Final = 10.0
 """Share of a recording without which it is bad, %: one contact in ten is not in it."""
-NOTICED: Final = 1.0
+MENTIONED_LOSS_PERCENT: Final = 1.0
 """Share of a recording whose loss is mentioned, %."""
-MOST_LOST: Final = 50.0
+BAD_EVEN_LOSS_PERCENT: Final = 50.0
 """Share of evenly lost frames from which a recording is bad, %: every other frame and more."""
-IRREGULAR: Final = 5.0
+MENTIONED_IRREGULAR_PERCENT: Final = 5.0
 """Share of irregular intervals that is mentioned, %: two standard deviations of a normal distribution are
 beyond half an interval."""
-RATE_CHANGE: Final = 1.5
+MENTIONED_RATE_RATIO: Final = 1.5
 """Ratio of the longest to the shortest local interval that is mentioned: half an interval."""
 
 
@@ -125,7 +125,7 @@ def verdict_of(findings: Sequence[Finding], text: str = "") -> Verdict:
     flaws = [
         finding.says
         for finding in findings
-        if finding.verdict == "warning" and finding.name in OF_THE_RECORDING
+        if finding.verdict == "warning" and finding.name in RECORDING_FINDINGS
     ]
     word: Literal["good", "usable", "bad"] = "bad" if faults else "usable" if flaws else "good"
     return Verdict(word, (*faults, *flaws), text)
@@ -147,7 +147,7 @@ def _drop_outs(recorded: Recorded, timing: Timing | None) -> Finding:
     total = course.frames + missing
     # A picture that stands still is a finding of its own.
     stutters = course.repeated - (course.frozen.repeats if course.frozen else 0)
-    repeated = 100.0 * stutters / max(total, 1) - (0.0 if recorded.live else 100.0 * CODEC_REPEATS)
+    repeated = 100.0 * stutters / max(total, 1) - (0.0 if recorded.live else 100.0 * CODEC_REPEAT_SHARE)
     says = f"{missing} of {total} frames missing, {course.repeated} repeated{_pauses_text(pauses)}"
     found = Finding(
         100.0 * (missing if recorded.live else late) / max(total, 1) + max(0.0, repeated),
@@ -157,13 +157,13 @@ def _drop_outs(recorded: Recorded, timing: Timing | None) -> Finding:
     )
     if recorded.live:
         return replace(found, number=100.0 if recorded.stopped else found.number).graded(
-            "drop-outs", "%", (NOTICED, TENTH)
+            "drop-outs", "%", (MENTIONED_LOSS_PERCENT, BAD_LOSS_PERCENT)
         )
-    graded = found.graded("drop-outs", "%", (NOTICED, MOST_LOST))
+    graded = found.graded("drop-outs", "%", (MENTIONED_LOSS_PERCENT, BAD_EVEN_LOSS_PERCENT))
     paused = sum(pause.seconds for pause in pauses)
-    if pauses and 100.0 * paused >= TENTH * course.seconds:
+    if pauses and 100.0 * paused >= BAD_LOSS_PERCENT * course.seconds:
         return replace(graded, verdict="fault", effect=found.effect, advice=found.advice)
-    if graded.verdict == "good" and (pauses or 100.0 * course.missing >= NOTICED * total):
+    if graded.verdict == "good" and (pauses or 100.0 * course.missing >= MENTIONED_LOSS_PERCENT * total):
         return replace(graded, verdict="warning", effect=found.effect, advice=found.advice)
     return graded
 
@@ -184,9 +184,9 @@ def _timing(recorded: Recorded, timing: Timing | None) -> Finding:
         return Finding(None, why, name="timing", unit="%")
     says = f"a frame every {seconds_text(timing.interval)}"
     share, ratio = 100.0 * timing.irregular, timing.slowest / timing.fastest
-    if share >= NOTICED:
+    if share >= MENTIONED_LOSS_PERCENT:
         says += f", {share:.0f} % of them more than half of that too early or late"
-    if ratio >= RATE_CHANGE:
+    if ratio >= MENTIONED_RATE_RATIO:
         says += f"; the rate changes between {1 / timing.slowest:.3g} and {1 / timing.fastest:.3g} frames/s"
     if timing.backwards:
         says += f"; the clock goes back {timing.backwards} times"
@@ -196,8 +196,8 @@ def _timing(recorded: Recorded, timing: Timing | None) -> Finding:
         "speeds are wrong where frames are counted instead of their times",
         "use the times of the frames; a fixed exposure; less load on the processor",
     )
-    graded = found.graded("timing", "%", (IRREGULAR, 100.0 + IRREGULAR))
-    if graded.verdict == "good" and (ratio >= RATE_CHANGE or timing.backwards):
+    graded = found.graded("timing", "%", (MENTIONED_IRREGULAR_PERCENT, 100.0 + MENTIONED_IRREGULAR_PERCENT))
+    if graded.verdict == "good" and (ratio >= MENTIONED_RATE_RATIO or timing.backwards):
         return replace(graded, verdict="warning", effect=found.effect, advice=found.advice)
     return graded
 
@@ -209,7 +209,9 @@ def _frozen(recorded: Recorded, timing: Timing | None) -> Finding:
         return Finding(None, f"{course.frames} frames are too few", name="frozen", unit="%")
     seconds = run.repeats * timing.interval if run and timing else 0.0
     if run is None or (timing is not None and seconds < CONTACT_SECONDS and run.repeats < course.frames / 2):
-        return Finding(0.0, "the picture never stands still").graded("frozen", "%", (NOTICED, TENTH))
+        return Finding(0.0, "the picture never stands still").graded(
+            "frozen", "%", (MENTIONED_LOSS_PERCENT, BAD_LOSS_PERCENT)
+        )
     last = run.first + run.repeats
     if run.repeats == course.frames - 1:
         says = f"all {course.frames} pictures are the same"
@@ -221,12 +223,12 @@ def _frozen(recorded: Recorded, timing: Timing | None) -> Finding:
         says = f"the picture stands still for {seconds_text(seconds)} from {begin:.1f} s {rest}"
     share = 100.0 * run.repeats / (course.frames - 1)
     found = Finding(
-        max(share, NOTICED),
+        max(share, MENTIONED_LOSS_PERCENT),
         says,
         "contacts of that time are missing, or last too long",
         "record it again; another cable and port, and no other program that uses the camera",
     )
-    return found.graded("frozen", "%", (NOTICED, TENTH))
+    return found.graded("frozen", "%", (MENTIONED_LOSS_PERCENT, BAD_LOSS_PERCENT))
 
 
 def _damage(recorded: Recorded) -> Finding:
@@ -250,8 +252,8 @@ def _damage(recorded: Recorded) -> Finding:
     if recorded.stopped and not recorded.live:
         found = replace(found, number=100.0)
     elif texts:
-        found = replace(found, number=max(share, NOTICED))
-    return found.graded("damage", "%", (NOTICED, TENTH))
+        found = replace(found, number=max(share, MENTIONED_LOSS_PERCENT))
+    return found.graded("damage", "%", (MENTIONED_LOSS_PERCENT, BAD_LOSS_PERCENT))
 
 
 # In a recording, clipping can no longer be repaired: with three quarters of its gel it can still be used.

@@ -17,7 +17,7 @@ from tactflow.recording.course import Glance
 from tactflow.recording.schemas import channel_types
 
 MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".npz": "application/octet-stream"}
-NEVER = 1 << 62
+UNLIMITED_CHUNK_BYTES = 1 << 62
 """Size limit of chunks, bytes: never reached, because each chunk ends with a frame."""
 
 
@@ -66,7 +66,7 @@ class RecordingWriter:
         self._files = files or {}
         self._channels: dict[str, int] = {}
         self._file = open_output(path, overwrite=overwrite)
-        self._writer = Writer(self._file, chunk_size=NEVER, compression=CompressionType.NONE)
+        self._writer = Writer(self._file, chunk_size=UNLIMITED_CHUNK_BYTES, compression=CompressionType.NONE)
 
     def begin(self) -> None:
         """Empty a file that is replaced, and write what precedes the frames. Called once, or by the first

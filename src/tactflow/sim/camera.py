@@ -27,7 +27,7 @@ HALF_DIAGONAL = math.hypot(*SIZE) / 2.0
 """Centre of a frame, (x, y), and distance of its corners from it, px."""
 NOISE_UNIT = 4096.0
 """Integer steps of the noise bank per standard deviation."""
-_APERTURE_EDGE = 3.0
+_APERTURE_EDGE_PX = 3.0
 """Width of the blurred edge of the aperture, px. Chosen by hand."""
 _NEWTON_STEPS = 12
 """Newton steps to invert the distortion, enough for machine precision."""
@@ -105,7 +105,7 @@ class Camera:
         """Fraction of light (N,), 0 to 1, at raw pixel positions (N, 2): 0 in the black frame."""
         radius = self.aperture_radius * SIZE[1] / 2.0 if self.aperture_radius else np.inf
         inside = radius - np.hypot(raw[..., 0] - CENTER[0], raw[..., 1] - CENTER[1])
-        return np.asarray(0.5 + 0.5 * np.tanh(inside / _APERTURE_EDGE), dtype=np.float64)
+        return np.asarray(0.5 + 0.5 * np.tanh(inside / _APERTURE_EDGE_PX), dtype=np.float64)
 
     def sees(self, raw: Points) -> NDArray[np.bool_]:
         """(...) bool: whether raw positions (..., 2) lie in the frame and are lit."""

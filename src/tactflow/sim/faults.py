@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from tactflow.sim.settings import Settings
 
 Picture = NDArray[np.uint8]
-_EMPTY = {"black": (0, 0, 0), "green": (0, 135, 0)}
+_EMPTY_COLOURS = {"black": (0, 0, 0), "green": (0, 135, 0)}
 """Blue, green and red of an empty RGB buffer and of an empty YUV buffer."""
-_OVEREXPOSED = 2.0
+_OVEREXPOSURE_GAIN = 2.0
 """Gain of the first picture of a camera that then lowers it frame by frame."""
-_DISPLACEMENT = 8
+_DISPLACEMENT_PX = 8
 """Distance by which rows are displaced, px: four pixel pairs of YUYV."""
 
 
@@ -30,9 +30,9 @@ def delivered(index: int, settings: Settings, render: Callable[[int], Picture]) 
 
 
 def _first(index: int, settings: Settings, render: Callable[[int], Picture]) -> Picture:
-    if settings.first in _EMPTY:
+    if settings.first in _EMPTY_COLOURS:
         picture = render(0)
-        picture[:] = _EMPTY[settings.first]
+        picture[:] = _EMPTY_COLOURS[settings.first]
     elif settings.first == "leftover":
         # Another gel: seen from the other side, in the middle of a recording.
         picture = np.ascontiguousarray(render(settings.frames // 3)[::-1, ::-1])
@@ -40,7 +40,7 @@ def _first(index: int, settings: Settings, render: Callable[[int], Picture]) -> 
         picture = render(index)
         _damage(picture, 0, settings.seed)
     else:
-        gain = _OVEREXPOSED ** (1 - index / settings.late)
+        gain = _OVEREXPOSURE_GAIN ** (1 - index / settings.late)
         picture = np.asarray(cv2.convertScaleAbs(render(index), alpha=gain), np.uint8)
     return picture
 
@@ -53,4 +53,4 @@ def _damage(picture: Picture, number: int, seed: int) -> None:
     elif number % 3 == 1:
         lower[:] = np.random.default_rng([seed, 0x6461, number]).integers(0, 256, lower.shape, np.uint8)
     else:
-        lower[:] = np.roll(lower, _DISPLACEMENT, axis=1)
+        lower[:] = np.roll(lower, _DISPLACEMENT_PX, axis=1)

@@ -4,10 +4,10 @@ Contact is where the indenter lies below the surface of the untouched gel. It ne
 since a soft surface sinks: when a ball of radius R is pressed by d into a deep gel, that region has a radius
 of sqrt(2 R d), but the gel clings to the ball only up to sqrt(R d), where the surface has sunk by d / 2
 (Hertz); a thin layer on a plate sinks only where it is touched, so the two regions are the same (Johnson,
-Contact Mechanics, 1985, ch. 4 and 5.8). A sensor's gel is in between: here it sinks by s = SINK_IN d where it
-leaves the indenter, for every shape. Deeper parts have the surface of the indenter and carry the force.
-Around them, the surface decays as s exp(RIM (reached / s - 1)), a closed form of the Gaussian pyramid of
-Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022).
+Contact Mechanics, 1985, ch. 4 and 5.8). A sensor's gel is in between: here it sinks by s = SINK_IN_RATIO d where
+it leaves the indenter, for every shape. Deeper parts have the surface of the indenter and carry the force.
+Around them, the surface decays as s exp(RIM_SLOPE_RATIO (reached / s - 1)), a closed form of the Gaussian
+pyramid of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022).
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from numpy.typing import NDArray
 
 from tactflow.sim.shapes import Array, Shape
 
-SINK_IN = 0.3
+SINK_IN_RATIO = 0.3
 """Depth of the surface where it leaves the indenter, relative to full depth. Chosen by hand, between a thin
 layer (0) and a deep gel (0.5)."""
-RIM = 0.6
+RIM_SLOPE_RATIO = 0.6
 """Slope of the surface just outside that border relative to just inside; below 1 there is a crease. Chosen by
 hand."""
-TOUCH_DEPTH = 0.25
+TOUCH_DEPTH_PX = 0.25
 """Depth below which an indenter does not count as touching, px. Chosen by hand."""
-_MAX_STICK = 0.999
+_MAX_STICK_RADIUS = 0.999
 """Maximum relative radius of the stick region: with full stick, traction at the edge would be infinite."""
 _BISECTIONS = 20
 """Bisection steps for the radius of a contact: to a millionth of an indenter's reach."""
-SHEAR_SPREAD = 110.0
+SHEAR_SPREAD_PX = 110.0
 """Standard deviation of the Gaussian decay of shear and twist around a contact, px. Chosen by hand: four to
 five marker pitches."""
-MM = 0.025
+MM_PER_PX = 0.025
 """Millimetres per raw pixel of the simulated gel: its balls have a radius of 2.375 mm."""
-_STIFFNESS = 1.0
+_STIFFNESS_N_PER_MM3 = 1.0
 """Pressure per depth, N/mm^3: a 3 mm layer with a constrained modulus of 3 N/mm^2. Chosen by hand."""
-_SHEAR_STIFFNESS = 0.1
+_SHEAR_STIFFNESS_N_PER_MM3 = 0.1
 """Traction per displacement along the gel, N/mm^3. Chosen by hand."""
-_FORCE_STEP = 3.0
+_FORCE_STEP_PX = 3.0
 """Grid spacing for pressure and traction, px: halving it changes the force by less than 0.2 %."""
 
 
@@ -51,8 +51,8 @@ class Press:
 
     x, y : its origin in gel coordinates, px. angle : rotation, radians, clockwise on the screen (y down).
     depth : px, 0 off the gel. shear : (sx, sy), displacement of the gel under it, px. twist : rotation of the
-    gel under it, radians. dilation : maximum outward displacement of the gel, px. sink, rim : `SINK_IN` and
-    `RIM`.
+    gel under it, radians. dilation : maximum outward displacement of the gel, px. sink, rim :
+    `SINK_IN_RATIO` and `RIM_SLOPE_RATIO`.
     stick : for a ball, radius of the stick region relative to `radius`, 0 to 1, with slip around it
     (Mindlin). None: no slip. sliding : whether the indenter moves relative to the gel under it.
     tilt : rotation vector (x, y) about the indenter's centre before it was turned by `angle`, radians;
@@ -67,8 +67,8 @@ class Press:
     shear: tuple[float, float] = (0.0, 0.0)
     twist: float = 0.0
     dilation: float = 0.0
-    sink: float = SINK_IN
-    rim: float = RIM
+    sink: float = SINK_IN_RATIO
+    rim: float = RIM_SLOPE_RATIO
     stick: float | None = None
     sliding: bool = False
     tilt: tuple[float, float] = (0.0, 0.0)
@@ -93,7 +93,7 @@ class Press:
     @property
     def touching(self) -> bool:
         """Whether it is pressed deep enough to count."""
-        return self.depth > TOUCH_DEPTH
+        return self.depth > TOUCH_DEPTH_PX
 
 
 def reached(press: Press, x: Array, y: Array) -> Array:
@@ -147,7 +147,7 @@ def displacement(presses: Sequence[Press], rest: NDArray[np.float64]) -> NDArray
             away = local[:, None, :] - press.shape.sources[None, :, :]
             distance = np.sqrt(np.min(np.sum(away * away, axis=-1), axis=1))
             beyond = np.maximum(distance - press.shape.spread, 0.0)
-            spread = max(SHEAR_SPREAD, 1.2 * float(np.hypot(*shear)))
+            spread = max(SHEAR_SPREAD_PX, 1.2 * float(np.hypot(*shear)))
             weight = np.exp(-(beyond**2) / (2.0 * spread**2))
             if press.stick is not None:
                 weight = partial_slip(distance / max(press.radius, 1e-6), press.stick)
@@ -175,7 +175,7 @@ def partial_slip(distance: NDArray[np.float64], stick: float) -> NDArray[np.floa
     >>> partial_slip(np.array([0.0, 0.5, 1.0]), 0.0).tolist()
     [1.0, 0.875, 0.5]
     """
-    stick = min(stick, _MAX_STICK)
+    stick = min(stick, _MAX_STICK_RADIUS)
     return np.asarray((_hertz(distance, 1.0) - _hertz(distance, stick)) / (2 * (1 - stick * stick)))
 
 
@@ -200,17 +200,17 @@ def force(presses: Sequence[Press]) -> tuple[float, float, float]:
     (0.0, 0.0, 0.0)
     """
     total = np.zeros(3)
-    area = (_FORCE_STEP * MM) ** 2
+    area = (_FORCE_STEP_PX * MM_PER_PX) ** 2
     for press in presses:
         if not press.touching:
             continue
-        side = np.arange(-press.shape.reach, press.shape.reach + _FORCE_STEP, _FORCE_STEP)
+        side = np.arange(-press.shape.reach, press.shape.reach + _FORCE_STEP_PX, _FORCE_STEP_PX)
         x, y = (part.astype(np.float32) for part in np.meshgrid(press.x + side, press.y + side))
         depth = reached(press, x, y)
         touched = depth > press.sink * press.depth
         points = np.stack([x[touched], y[touched]], axis=1).astype(np.float64)
         # First-order inverse of the displacement.
         moved = displacement(presses, points - displacement(presses, points))
-        total[:2] += _SHEAR_STIFFNESS * MM * area * moved.sum(axis=0)
-        total[2] += _STIFFNESS * MM * area * float(surface(press, depth)[touched].sum())
+        total[:2] += _SHEAR_STIFFNESS_N_PER_MM3 * MM_PER_PX * area * moved.sum(axis=0)
+        total[2] += _STIFFNESS_N_PER_MM3 * MM_PER_PX * area * float(surface(press, depth)[touched].sum())
     return float(total[0]), float(total[1]), float(total[2])

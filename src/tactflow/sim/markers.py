@@ -1,8 +1,8 @@
 """Markers on the gel: their layout, and drawing with exact sub-pixel centres.
 
 A marker is drawn by evaluating its blurred shape at each pixel's centre. Its edge is a logistic ramp of
-`EDGE` px standard deviation, similar to a Gaussian point spread function, and so smooth that sampling shifts
-the centroid by less than 1e-3 px.
+`EDGE_BLUR_PX` standard deviation, similar to a Gaussian point spread function, and so smooth that sampling
+shifts the centroid by less than 1e-3 px.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from tactflow.sim.settings import Settings
 
-EDGE = 0.8
+EDGE_BLUR_PX = 0.8
 """Standard deviation of the lens blur at a marker's edge, px. Chosen by hand."""
-DARK_MARKER = 0.88
+DARK_MARKER_ABSORPTION = 0.88
 """Fraction of light that a fresh dark marker absorbs. Chosen by hand."""
-FIXED_POINT = 64.0
+FIXED_POINT_STEPS = 64.0
 """Fixed-point steps per grey level: much finer than the noise, and 255 levels fit into 16 bits."""
 
 
@@ -61,7 +61,7 @@ def layout(settings: Settings, size: tuple[int, int]) -> Layout:
 
 def _ramp(inside: NDArray[np.float32]) -> NDArray[np.float32]:
     """Opacity at a distance inside a marker's edge, px; negative outside."""
-    ramp = np.float32(0.5) + np.float32(0.5) * np.tanh(inside * np.float32(0.851 / EDGE))
+    ramp = np.float32(0.5) + np.float32(0.5) * np.tanh(inside * np.float32(0.851 / EDGE_BLUR_PX))
     return np.asarray(ramp, np.float32)
 
 
@@ -82,7 +82,7 @@ def _coverage(
 def half_patch(radius: float, shape: str, scale: float = 1.0) -> int:
     """Half the side of the square, px, outside which a marker is invisible."""
     extent = {"round": 1.0, "square": 1.4143, "doubled": 1.45}[shape]
-    return int(np.ceil(radius * extent * scale + 5.0 * EDGE)) + 1
+    return int(np.ceil(radius * extent * scale + 5.0 * EDGE_BLUR_PX)) + 1
 
 
 def draw(
@@ -99,8 +99,8 @@ def draw(
 ) -> None:
     """Paint markers onto a padded canvas, in place.
 
-    canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT`. centers : (N, 2) positions
-    without the padding, px. strength : (N,) opacity, 0 to 1. radii : (N,), px. half : see `half_patch`.
+    canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT_STEPS`. centers : (N, 2)
+    positions without the padding, px. strength : (N,) opacity, 0 to 1. radii : (N,), px. half : see `half_patch`.
     bright : grey level of bright markers; None for dark ones. deform : (N, 2, 2), Jacobian from the image to
     the gel; None for the identity.
     """
@@ -131,7 +131,7 @@ def draw(
         opaque = opaque.reshape(-1, 1)
         under = flat[index].astype(np.float32)
         if bright is None:
-            under *= np.float32(1.0) - np.float32(DARK_MARKER) * opaque
+            under *= np.float32(1.0) - np.float32(DARK_MARKER_ABSORPTION) * opaque
         else:
-            under += (np.float32(bright * FIXED_POINT) - under) * opaque
+            under += (np.float32(bright * FIXED_POINT_STEPS) - under) * opaque
         flat[index] = np.rint(under, out=under).astype(np.int16)

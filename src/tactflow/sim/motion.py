@@ -16,17 +16,17 @@ from tactflow.sim.gel import Press
 from tactflow.sim.settings import Settings
 from tactflow.sim.shapes import Shape
 
-_REST, _LONGEST_REST = 0.1, 120
+_REST_FRACTION, _MAX_REST_FRAMES = 0.1, 120
 """Initial part of a recording without contact: its fraction, and its maximum, frames (2 s)."""
-_LAST_REST = 30
+_FRAMES_PER_LAST_REST = 30
 """Length of a recording per untouched frame at its end."""
-_FULL_LOAD = 0.75
+_FULL_LOAD_FRACTION = 0.75
 """Fraction of a hold after which partial slip becomes full slip."""
-_LARGEST_CREEP = 60.0
+_MAX_CREEP_PX = 60.0
 """Amplitude of creep before it reverses, px."""
-_LARGEST_STROKE = 110.0
+_MAX_STROKE_PITCH_PX = 110.0
 """Maximum marker pitch, px, to which displacements of the gel are proportional."""
-_LARGEST_JUMP = 0.45
+_MAX_JUMP_PITCHES = 0.45
 """Maximum displacement of a jumping gel from its rest position, pitches: jumps of up to 0.9 pitches."""
 
 
@@ -94,8 +94,8 @@ class _Timing:
 
 def _timing(programme: Programme, moment: int, frames: int) -> _Timing | None:
     """The contact at a frame; None between contacts. frames : length of the recording."""
-    start = min(max(1, round(_REST * frames)), _LONGEST_REST)
-    usable = frames - start - max(1, frames // _LAST_REST)
+    start = min(max(1, round(_REST_FRACTION * frames)), _MAX_REST_FRAMES)
+    usable = frames - start - max(1, frames // _FRAMES_PER_LAST_REST)
     if moment < start or usable < 1:
         return None
     cycles = programme.contacts or max(1, usable // programme.period)
@@ -142,19 +142,19 @@ def _dragged(
     farthest = settings.shear * pitch
     if programme.jumps:
         draw = np.random.default_rng([settings.seed, timing.cycle, int(timing.phase // 3), 0x6A75])
-        angle, radius = draw.uniform(0, 2 * np.pi), _LARGEST_JUMP * pitch * np.sqrt(draw.uniform(0.3, 1))
+        angle, radius = draw.uniform(0, 2 * np.pi), _MAX_JUMP_PITCHES * pitch * np.sqrt(draw.uniform(0.3, 1))
         drag = radius * np.array([np.cos(angle), np.sin(angle)])
         return drag, drag, None, False
     if programme.creep:
         # Back and forth.
-        distance = programme.creep * max(timing.phase - timing.rise, 0.0) % (2 * _LARGEST_CREEP)
-        drag = (_LARGEST_CREEP - abs(distance - _LARGEST_CREEP)) * ahead
+        distance = programme.creep * max(timing.phase - timing.rise, 0.0) % (2 * _MAX_CREEP_PX)
+        drag = (_MAX_CREEP_PX - abs(distance - _MAX_CREEP_PX)) * ahead
         return drag, drag, None, False
     if programme.partial:
-        load = timing.progress / _FULL_LOAD
+        load = timing.progress / _FULL_LOAD_FRACTION
         stick = max(1.0 - load, 0.0) ** (1 / 3)
         drag = farthest * (1 - stick**2) * ahead
-        beyond = programme.travel * max(timing.progress - _FULL_LOAD, 0.0)
+        beyond = programme.travel * max(timing.progress - _FULL_LOAD_FRACTION, 0.0)
         return drag, drag + beyond * ahead, stick, load > 1 and timing.progress < 1
     if programme.travel:
         # Stick up to the largest drag that friction allows, then slip.
@@ -181,7 +181,7 @@ def presses(
     timing = _timing(programme, moment, settings.frames)
     if timing is None:
         return (), -1
-    pitch = min(pitch, _LARGEST_STROKE)
+    pitch = min(pitch, _MAX_STROKE_PITCH_PX)
     x, y, angle, ahead = _place(programme, settings.seed, timing.cycle, size)
     drag, travelled, stick, sliding = _dragged(programme, timing, ahead, settings, pitch)
     turning = timing.swing if programme.holds is None else timing.progress

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from tactflow.sim import camera as optics
 from tactflow.sim import gel, light, markers
 from tactflow.sim.camera import CENTER, FPS, HALF_DIAGONAL, SIZE, Camera
+from tactflow.sim.markers import FIXED_POINT_STEPS
 from tactflow.sim.settings import Settings
 
-FIXED_POINT = markers.FIXED_POINT
 Canvas = NDArray[np.int16]
-"""(H, W, 3) grey levels times `FIXED_POINT`."""
+"""(H, W, 3) grey levels times `FIXED_POINT_STEPS`."""
 
-_STEP = 2
+_GRID_STEP_PX = 2
 """Grid spacing of the gel's surface, raw px; its shading is smooth. Chosen by hand."""
-_LAMP_AT = 0.475
+_LAMP_FRACTION = 0.475
 """Fraction of a recording after which the lamp is on: between the two contacts."""
-_BRIGHT_MARKER = 225.0
+_BRIGHT_MARKER_GREY = 225.0
 """Grey level of a bright marker; chosen by hand, below saturation."""
 
 
@@ -46,7 +46,7 @@ class Painter:
         """
         settings = self._settings
         canvas = self._canvas(index, pressed, shown)
-        scale = self._gain(index) / FIXED_POINT
+        scale = self._gain(index) / FIXED_POINT_STEPS
         if shown is None:
             return np.asarray(cv2.addWeighted(canvas, scale, canvas, 0.0, 0.0, dtype=cv2.CV_8U), np.uint8)
         # Drawing the noise of a seed takes 0.3 s; without any, the canvas takes its place with weight 0.
@@ -96,7 +96,7 @@ class Painter:
             wave = np.sin(2 * np.pi * (2.0 * rows - 0.37 * index)).astype(np.float32)
             banded = canvas * (np.float32(1.0) + np.float32(settings.gain) * wave)[:, None, None]
             canvas = np.rint(banded, out=banded).astype(np.int16)
-        if settings.lamp and index >= _LAMP_AT * settings.frames:
+        if settings.lamp and index >= _LAMP_FRACTION * settings.frames:
             lamp = light.lamp(SIZE, settings.lamp)
             canvas = np.asarray(cv2.multiply(canvas, lamp, dtype=cv2.CV_16S), np.int16)
         return canvas
@@ -111,8 +111,8 @@ class Painter:
 
     @cached_property
     def _coarse(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Gel coordinates x and y of the centres of blocks of `_STEP` x `_STEP` raw pixels."""
-        mapped = self._gel_blocks(_STEP).astype(np.float32)
+        """Gel coordinates x and y of the centres of blocks of `_GRID_STEP_PX` raw pixels a side."""
+        mapped = self._gel_blocks(_GRID_STEP_PX).astype(np.float32)
         return np.ascontiguousarray(mapped[..., 0]), np.ascontiguousarray(mapped[..., 1])
 
     @cached_property
@@ -133,7 +133,7 @@ class Painter:
         if settings.aperture:
             image *= self._aperture[..., None]
         np.clip(image, 0, 500, out=image)
-        fixed = np.rint(image * np.float32(FIXED_POINT)).astype(np.int16)
+        fixed = np.rint(image * np.float32(FIXED_POINT_STEPS)).astype(np.int16)
         half = self._half
         return np.asarray(cv2.copyMakeBorder(fixed, half, half, half, half, cv2.BORDER_REPLICATE), np.int16)
 
@@ -177,7 +177,7 @@ class Painter:
             layout.group,
             layout.radii,
             shape=settings.shape,
-            bright=_BRIGHT_MARKER if settings.polarity == "bright" else None,
+            bright=_BRIGHT_MARKER_GREY if settings.polarity == "bright" else None,
             half=self._half,
             deform=None if camera.identity else camera.local_inverse(now),
         )
@@ -201,7 +201,7 @@ class Painter:
             away = center - self._camera.to_raw(np.array([[press.x, press.y]]))[0]
             away /= max(float(np.hypot(*away)), 1.0)
             x, y = center + away * (320.0, 220.0)
-            level = 90.0 * self._settings.stray * press.depth / press.shape.depth * FIXED_POINT
+            level = 90.0 * self._settings.stray * press.depth / press.shape.depth * FIXED_POINT_STEPS
             streak = np.float32(level) * light.spot(SIZE, (x, y), (16.0, 48.0))
             canvas = np.asarray(cv2.add(canvas, cv2.merge([streak] * 3), dtype=cv2.CV_16S), np.int16)
         return canvas
@@ -215,15 +215,17 @@ class Painter:
         x, y = self._coarse
         depth = gel.reached(press, x[window], y[window])
         sunk = gel.surface(press, depth)
-        fine = tuple(slice(_STEP * part.start, _STEP * part.stop) for part in (rows, columns))
+        fine = tuple(slice(_GRID_STEP_PX * part.start, _GRID_STEP_PX * part.stop) for part in (rows, columns))
         half = self._half
         region = padded[half:-half, half:-half][fine]
         full = (region.shape[1], region.shape[0])
-        shading = cv2.resize(light.shading(self._light, sunk, _STEP), full, interpolation=cv2.INTER_LINEAR)
+        shading = cv2.resize(
+            light.shading(self._light, sunk, _GRID_STEP_PX), full, interpolation=cv2.INTER_LINEAR
+        )
         lit = cv2.multiply(region, shading, dtype=cv2.CV_32F)
         if self._light.brightening:
             added = light.brightness(self._light, press, depth)
-            wide = cv2.resize(added, full, interpolation=cv2.INTER_LINEAR) * np.float32(FIXED_POINT)
+            wide = cv2.resize(added, full, interpolation=cv2.INTER_LINEAR) * np.float32(FIXED_POINT_STEPS)
             if self._settings.aperture:
                 wide *= self._aperture[fine]
             lit = cv2.add(lit, cv2.merge([wide, wide, wide]))
@@ -237,8 +239,11 @@ class Painter:
         ring = np.stack([press.x + reach * np.cos(turn), press.y + reach * np.sin(turn)], axis=1)
         if not self._camera.identity:
             ring = self._camera.to_raw(np.clip(ring, (-60.0, -60.0), (SIZE[0] + 60.0, SIZE[1] + 60.0)))
-        low = np.floor(ring.min(axis=0) / _STEP).astype(int) - 2
-        high = np.ceil(ring.max(axis=0) / _STEP).astype(int) + 3
+        low = np.floor(ring.min(axis=0) / _GRID_STEP_PX).astype(int) - 2
+        high = np.ceil(ring.max(axis=0) / _GRID_STEP_PX).astype(int) + 3
         left, top = max(int(low[0]), 0), max(int(low[1]), 0)
-        right, bottom = min(int(high[0]), SIZE[0] // _STEP), min(int(high[1]), SIZE[1] // _STEP)
+        right, bottom = (
+            min(int(high[0]), SIZE[0] // _GRID_STEP_PX),
+            min(int(high[1]), SIZE[1] // _GRID_STEP_PX),
+        )
         return None if right - left < 3 or bottom - top < 3 else (slice(top, bottom), slice(left, right))

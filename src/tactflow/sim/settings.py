@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from tactflow.sim.gel import RIM, SINK_IN
+from tactflow.sim.gel import RIM_SLOPE_RATIO, SINK_IN_RATIO
 from tactflow.system.spelling import closest, did_you_mean
 
 
@@ -93,9 +93,11 @@ class Settings(BaseModel):
     shear: float = _number(0.12, 0, 1.5, "largest drag of the gel by a contact, pitches")
     twist: float = _number(0, -60, 60, "largest turn of the gel by a contact, degrees")
     sink: float = _number(
-        SINK_IN, 0.1, 0.6, "depth of the gel at a contact's edge, relative to full depth; 0.5: deep gel"
+        SINK_IN_RATIO, 0.1, 0.6, "depth of the gel at a contact's edge, relative to full depth; 0.5: deep gel"
     )
-    rim: float = _number(RIM, 0.4, 1, "slope just outside a contact relative to just inside; 1: no crease")
+    rim: float = _number(
+        RIM_SLOPE_RATIO, 0.4, 1, "slope just outside a contact relative to just inside; 1: no crease"
+    )
 
 
 def setting_descriptions() -> dict[str, str]:

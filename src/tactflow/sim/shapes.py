@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
-_ROUNDS = 4
+_FIXED_POINT_ITERATIONS = 4
 """Fixed-point steps to the surface of a rotated shape: to 0.01 px."""
-_BUMPS = 25.0
+_BUMPS_PER_CIRCUMFERENCE = 25.0
 """Waves of the bumps of a ball per circumference."""
 
 
@@ -109,8 +109,8 @@ def bumpy_ball(radius: float = 95.0, depth: float = 26.0, relief: float = 2.5) -
             squared = x * x + y * y
             below = np.float32(radius) - smooth.gap(x, y)
             inside = squared < np.float32((0.9 * radius) ** 2)
-            for _ in range(_ROUNDS):
-                scale = np.float32(_BUMPS) / np.sqrt(squared + below * below)
+            for _ in range(_FIXED_POINT_ITERATIONS):
+                scale = np.float32(_BUMPS_PER_CIRCUMFERENCE) / np.sqrt(squared + below * below)
                 waves = [np.sin((x * axis[0] + y * axis[1] - below * axis[2]) * scale) for axis in axes.T]
                 outer = np.float32(radius) + np.float32(relief / 3) * sum(waves)
                 below = np.where(inside, np.sqrt(np.maximum(outer * outer - squared, 1)), below)
@@ -129,7 +129,7 @@ def tilt_surface(shape: Shape, rotation: NDArray[np.float64]) -> Shape:
     def gap(x: Array, y: Array) -> Array:
         # Where the point of the untilted surface lies that is now above (x, y); z points out of the gel.
         from_x, from_y = x, y
-        for _ in range(_ROUNDS):
+        for _ in range(_FIXED_POINT_ITERATIONS):
             height = shape.gap(from_x, from_y) - center
             now_x = turn[0, 0] * from_x + turn[0, 1] * from_y + turn[0, 2] * height
             now_y = turn[1, 0] * from_x + turn[1, 1] * from_y + turn[1, 2] * height

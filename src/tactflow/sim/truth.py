@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim.camera import Camera, Points
-from tactflow.sim.gel import MM, Press, displacement, force, in_contact, reached, surface
+from tactflow.sim.gel import MM_PER_PX, Press, displacement, force, in_contact, reached, surface
 from tactflow.vision.geometry import PixelMapping
 
 FLOW_POINTS: Final = 1500
-"""Points around a contact between which the displacement is interpolated. With FLOW_FINE, the mean over a
-contact is accurate to 0.01 px (five scenes, against four times the points)."""
-FLOW_FINE: Final = 0.5
+"""Points around a contact between which the displacement is interpolated. With FLOW_SPACING_PX, the mean
+over a contact is accurate to 0.01 px (five scenes, against four times the points)."""
+FLOW_SPACING_PX: Final = 0.5
 """Spacing of the points tested for contact, processed px."""
-NO_DIRECTION: Final = 0.02
+MIN_ANISOTROPY: Final = 0.02
 """Anisotropy (difference over sum of the principal second moments) below which a region has no direction:
 an axis ratio of 1.02. Chosen by hand."""
 
@@ -96,7 +96,7 @@ class Truth:
         coarse = self.displacement(rest)
         raw = self._mapping.to_raw(rest + coarse)
         gel = self._camera.to_gel(raw)
-        parts = round(step / FLOW_FINE)
+        parts = round(step / FLOW_SPACING_PX)
         fine = (len(x) * parts, len(y) * parts)
         moved, raw, gel = (
             np.asarray(cv2.resize(grid.reshape(len(y), len(x), 2), fine), np.float64)
@@ -137,8 +137,10 @@ class Truth:
         axes[:2, :2] /= scale
         turn, _ = cv2.Rodrigues(np.array([0.0, 0.0, press.angle]))
         tilt, _ = cv2.Rodrigues(np.array([*press.tilt, 0.0]))
-        across = (center - (np.array(self._mapping.size) - 1) / 2) * MM / scale
-        return axes @ turn @ tilt @ axes.T, np.array([*across, (press.shape.center - press.depth) * MM])
+        across = (center - (np.array(self._mapping.size) - 1) / 2) * MM_PER_PX / scale
+        return axes @ turn @ tilt @ axes.T, np.array(
+            [*across, (press.shape.center - press.depth) * MM_PER_PX]
+        )
 
     @cached_property
     def force(self) -> tuple[float, float, float]:
@@ -160,7 +162,7 @@ def _principal_angle(columns: NDArray[np.int64], rows: NDArray[np.int64]) -> flo
     """Principal direction of pixels x, y (n,) by second moments, degrees in (-90, 90]; None if isotropic."""
     x, y = columns - columns.mean(), rows - rows.mean()
     xx, yy, xy = float(np.mean(x * x)), float(np.mean(y * y)), float(np.mean(x * y))
-    if np.hypot(xx - yy, 2 * xy) <= NO_DIRECTION * (xx + yy):
+    if np.hypot(xx - yy, 2 * xy) <= MIN_ANISOTROPY * (xx + yy):
         return None
     # Negative because y points down and angles are counter-clockwise on the screen.
     angle = -0.5 * float(np.degrees(np.arctan2(2 * xy, xx - yy)))

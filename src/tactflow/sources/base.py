@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import MOST_PIXELS
+from tactflow.engine.frame import MAX_PIXELS
 from tactflow.system.extras import missing
 
 log = logging.getLogger("tactflow")
@@ -26,9 +26,9 @@ if "OPENCV_LOG_LEVEL" not in os.environ:
 
 DEFAULT_FPS = 30.0
 """Rate of images, arrays and videos without one, frames per second. Chosen by hand."""
-SPARSE_PEAK = 4096
+TWELVE_BIT_LEVELS = 4096
 """A 16-bit frame with only smaller values is from a sensor with 12 bits or fewer, grey levels."""
-SHORTEST_SIDE = 2
+MIN_SIDE_PX = 2
 """Minimum number of rows and columns, px, because stages halve the picture."""
 
 BgrImage = NDArray[np.uint8]
@@ -153,10 +153,10 @@ class FrameReader:
                 size = (bgr.shape[1], bgr.shape[0])
                 if first is None:
                     check_pixel_count(place, *size)
-                    if min(size) < SHORTEST_SIDE:
+                    if min(size) < MIN_SIDE_PX:
                         raise SourceError(
-                            f"{place}: its pictures are {size[0]} x {size[1]}; required {SHORTEST_SIDE} x "
-                            f"{SHORTEST_SIDE} pixels or more"
+                            f"{place}: its pictures are {size[0]} x {size[1]}; required {MIN_SIDE_PX} x "
+                            f"{MIN_SIDE_PX} pixels or more"
                         )
                     self.size = first = size
                 if size != first:
@@ -230,7 +230,7 @@ def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> BgrImage:
         image = image.astype(np.uint16, copy=False)
         if note:
             log.info("%s: 16-bit values are scaled to 8 bit (divided by 257)", name)
-            if 0 < (peak := int(image.max(initial=0))) < SPARSE_PEAK:
+            if 0 < (peak := int(image.max(initial=0))) < TWELVE_BIT_LEVELS:
                 text = "%s: no value above %d: a sensor with fewer bits? It will be dark; scale it to 16 bits"
                 log.warning(text, name, peak)
         image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
@@ -244,7 +244,7 @@ def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> BgrImage:
 def check_array(array: Any, name: str) -> None:
     """Raise SourceError unless an array, of NumPy, HDF5 or Zarr, holds frames.
 
-    They are uint8 or uint16, N x H x W or N x H x W x C with C in 1, 3, 4, of `MOST_PIXELS` at most.
+    They are uint8 or uint16, N x H x W or N x H x W x C with C in 1, 3, 4, of `MAX_PIXELS` at most.
     """
     required = "required uint8 or uint16 of N x H x W x 3 (BGR) or N x H x W (gray)"
     got = f"got {array.dtype} of shape {' x '.join(map(str, array.shape)) or '()'}"
@@ -261,10 +261,10 @@ def check_array(array: Any, name: str) -> None:
 
 
 def check_pixel_count(name: str, width: int, height: int) -> None:
-    """Raise SourceError for pictures of more than `MOST_PIXELS`, before memory is allocated for them."""
-    if width * height > MOST_PIXELS:
+    """Raise SourceError for pictures of more than `MAX_PIXELS`, before memory is allocated for them."""
+    if width * height > MAX_PIXELS:
         raise SourceError(
-            f"{name}: its pictures are {width} x {height}, more than {MOST_PIXELS} pixels; if that is right, "
+            f"{name}: its pictures are {width} x {height}, more than {MAX_PIXELS} pixels; if that is right, "
             "set the environment variable OPENCV_IO_MAX_IMAGE_PIXELS"
         )
 

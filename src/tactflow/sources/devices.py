@@ -18,15 +18,15 @@ from tactflow.sources.base import CaptureReader, log
 from tactflow.system.clock import SYSTEM
 from tactflow.system.redaction import public_address
 
-HIGHEST_INDEX = 2**31 - 1
+MAX_CAMERA_INDEX = 2**31 - 1
 """OpenCV takes the index of a camera as an `int` of C."""
-READ_TIMEOUT = 2.0
+READ_TIMEOUT_S = 2.0
 """Timeout for a frame, s; OpenCV's defaults are 10 for Linux's video driver and 30 for FFmpeg."""
-OPEN_TIMEOUT = 10.0
+OPEN_TIMEOUT_S = 10.0
 """Timeout for opening a stream, s."""
-EPOCH = SYSTEM.unix() - SYSTEM.now()
+MONOTONIC_EPOCH_S = SYSTEM.unix() - SYSTEM.now()
 """Unix time when the monotonic clock was 0, s; determined once, so that times of frames never decrease."""
-TOLERANCE = 0.01
+SETTING_TOLERANCE = 0.01
 """Relative tolerance of a requested size or rate: 29.97 is 30."""
 
 
@@ -56,9 +56,9 @@ class Camera(CaptureReader):
     def __init__(self, device: str, request: CameraRequest | None = None) -> None:
         name = f"camera {device}"
         # OpenCV reads this once, at its first camera.
-        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", f"{READ_TIMEOUT:.0f}")
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", f"{READ_TIMEOUT_S:.0f}")
         failure = f"{name}: cannot be opened; {_camera_hint(device)}"
-        if device.isdecimal() and int(device) > HIGHEST_INDEX:
+        if device.isdecimal() and int(device) > MAX_CAMERA_INDEX:
             raise SourceError(failure)
         backend = cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY
         address = int(device) if device.isdecimal() else os.path.realpath(device)
@@ -91,7 +91,7 @@ class Camera(CaptureReader):
         ignored = [
             f"{name} {value:g} -> {chosen:g}"
             for name, (number, value) in properties.items()
-            if value is not None and abs(value - (chosen := capture.get(number))) > TOLERANCE * value
+            if value is not None and abs(value - (chosen := capture.get(number))) > SETTING_TOLERANCE * value
         ]
         if request.format is not None and form and form.upper() != request.format.upper():
             ignored.append(f"format {request.format} -> {form}")
@@ -100,7 +100,7 @@ class Camera(CaptureReader):
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
         while (image := self._grab()) is not None:
-            yield image, EPOCH + SYSTEM.now()
+            yield image, MONOTONIC_EPOCH_S + SYSTEM.now()
         raise SourceError(f"{self.name}: delivers no more frames; unplugged, or in use by another program?")
 
 
@@ -135,8 +135,8 @@ class Stream(CaptureReader):
     def __init__(self, url: str) -> None:
         name = public_address(url)
         options = [
-            *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(OPEN_TIMEOUT * 1000)),
-            *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, int(READ_TIMEOUT * 1000)),
+            *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(OPEN_TIMEOUT_S * 1000)),
+            *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, int(READ_TIMEOUT_S * 1000)),
         ]
         failure = f"{name}: no stream can be opened there; {_stream_hint(url)}"
         super().__init__(name, failure, url, cv2.CAP_FFMPEG, options)
@@ -146,7 +146,7 @@ class Stream(CaptureReader):
         if (image := self._grab()) is None:
             raise SourceError(f"{self.name}: the stream was opened but delivers no frames")
         while image is not None:
-            yield image, EPOCH + SYSTEM.now()
+            yield image, MONOTONIC_EPOCH_S + SYSTEM.now()
             image = self._grab()
 
 

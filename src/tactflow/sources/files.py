@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
-from tactflow.engine.frame import MOST_PIXELS
+from tactflow.engine.frame import MAX_PIXELS
 from tactflow.sources.base import DEFAULT_FPS, BgrImage, FrameReader, check_array, damaged, to_bgr
 from tactflow.sources.paths import find_path, locate
 from tactflow.sources.video import open_video
@@ -72,7 +72,7 @@ def decode_image(data: bytes, name: str) -> NDArray[Any]:
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise SourceError(
-                f"{name}: has more than {MOST_PIXELS} pixels; if that is right, set the environment variable "
+                f"{name}: has more than {MAX_PIXELS} pixels; if that is right, set the environment variable "
                 "OPENCV_IO_MAX_IMAGE_PIXELS"
             ) from None
     if image is None:

@@ -9,14 +9,14 @@ from pathlib import Path
 from tactflow.engine.errors import SourceError
 from tactflow.recording.frames import RawFrame, decode_pixels, nanoseconds, parse_frame
 from tactflow.recording.reader import look_into, messages
-from tactflow.recording.records import DAMAGE, NotARecordingError
+from tactflow.recording.records import DAMAGE_ERRORS, NotARecordingError
 from tactflow.sources.base import BgrImage, FrameReader, damaged, log
 from tactflow.sources.paths import describe_settings, find_path, split_query
 
 SETTINGS = {"start": "SECONDS (from the beginning)"}
-FIRST_UNIX_TIME = 1e9
+MIN_UNIX_TIME_S = 1e9
 """Times of this and more are Unix times, s: those of a recording of a recording begin at 0."""
-LATEST_START = 1e9
+MAX_START_S = 1e9
 """Maximum start, s: 30 years, longer than any recording."""
 
 
@@ -48,7 +48,7 @@ class Recording(FrameReader):
         length = "" if contents.end is None else f"; it is {seconds:g} s long"
         self._read_first(f"there is no frame {f'after {start:g} s{length}' if start else 'in it'}")
         first = self.peek()
-        self.begins = 0.0 if first is not None and first[1] >= FIRST_UNIX_TIME else None
+        self.begins = 0.0 if first is not None and first[1] >= MIN_UNIX_TIME_S else None
         if contents.frames is not None:
             self.fps = (contents.frames - 1) / seconds if seconds > 0 else None
             self.total = contents.frames if self._start is None else None
@@ -70,7 +70,7 @@ class Recording(FrameReader):
                 self._picture = f"{self._path}, frame {frame.seq}"
                 image = decode_pixels(frame)
                 yield image, frame.t, frame.seq, frame.reference, frame.epoch, paced
-        except DAMAGE as error:
+        except DAMAGE_ERRORS as error:
             raise SourceError(
                 f"{self._picture}: is damaged ({error or type(error).__name__}); "
                 "tactflow repair keeps all that is intact"
@@ -102,6 +102,6 @@ def _parse(spec: str, directory: Path | None) -> tuple[str, float]:
         start = float(settings.get("start", 0))
     except ValueError:
         start = -1.0
-    if not 0 <= start <= LATEST_START:
+    if not 0 <= start <= MAX_START_S:
         raise SourceError(f"{spec}: required {describe_settings(SETTINGS)}")
     return name, start

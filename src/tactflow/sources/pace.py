@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from tactflow.sources.base import Arrival
 from tactflow.system.clock import SYSTEM, Clock
 
-REST = 0.5
+READ_DELAY_FRACTION = 0.5
 """Fraction of the time between frames after which the next one is read: reading, unpacking or rendering it
 earlier would compete with the processing of the last one. Chosen by hand."""
-MAX_BACKLOG = 0.5
+MAX_BACKLOG_S = 0.5
 """Delay after which the recording does not catch up but continues from there, s. Chosen by hand."""
-LONGEST_GAP = 60.0
+MAX_GAP_S = 60.0
 """Longest gap that is waited for, s; longer ones are skipped. Chosen by hand."""
 
 logger = logging.getLogger("tactflow")
@@ -45,16 +45,16 @@ class Pace:
         """Wait until the next frame should be read; False if stopped."""
         if self._start is None or self._interval == math.inf:
             return not self._stop.is_set()
-        due = self._start + self._last + REST * self._interval
+        due = self._start + self._last + READ_DELAY_FRACTION * self._interval
         return not self._clock.sleep(max(due - self._clock.now(), 0.0), self._stop)
 
     def wait_for(self, t: float) -> bool:
         """Wait until time t of the recording, s; False if stopped. Skips gaps of a minute."""
         now = self._clock.now()
-        if self._start is not None and t - self._last > LONGEST_GAP:
+        if self._start is not None and t - self._last > MAX_GAP_S:
             logger.warning("the recording pauses for %.3g s, which is skipped", t - self._last)
             self._start = now - t
-        elif self._start is None or self._start + t - now < -MAX_BACKLOG:
+        elif self._start is None or self._start + t - now < -MAX_BACKLOG_S:
             self._start = now - t
         elif t > self._last:
             # The shortest so far, because dropped frames leave gaps.

@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl
 from tactflow.engine.errors import SourceError
 from tactflow.system.files import expanded, is_device
 
-MOST_LISTED = 20
+MAX_LISTED_NAMES = 20
 """Maximum number of names in a message. Chosen by hand."""
 
 
@@ -85,8 +85,8 @@ def split_query(spec: str, directory: Path | None, known: Mapping[str, str]) -> 
 
 def listed(names: Sequence[str]) -> str:
     """The first names, for a message: "a, b and 3 more"; "none" if there are none."""
-    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
-    return (", ".join(names[:MOST_LISTED]) or "none") + more
+    more = f" and {len(names) - MAX_LISTED_NAMES} more" if len(names) > MAX_LISTED_NAMES else ""
+    return (", ".join(names[:MAX_LISTED_NAMES]) or "none") + more
 
 
 def describe_settings(known: Mapping[str, str]) -> str:

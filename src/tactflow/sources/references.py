@@ -14,15 +14,15 @@ from tactflow.sources.base import Arrival, BgrImage, FrameReader, log
 from tactflow.sources.files import ImageFiles
 from tactflow.vision.change import DamageTest, Settling, shows_gel
 
-MEMORY: Final = 128_000_000
+MAX_HELD_BYTES: Final = 128_000_000
 """Maximum size of the frames held back while they are examined, bytes. Chosen by hand."""
 BLANK_SECONDS: Final = 3.0
 """Time after which a live source that shows no gel is taken as it is, s; a camera's first second is over."""
-PAIRS: Final = 3
+NOISE_PAIR_COUNT: Final = 3
 """Pairs of frames that show whether a source has noise: an outlier among them has no effect."""
-BLOCK: Final = 16
+BLOCK_SIDE_PX: Final = 16
 """Side of the blocks that are searched for noise, px: those of video compression."""
-NOISY: Final = 0.9
+MIN_NOISY_SHARE: Final = 0.9
 """Minimum share of blocks that differ between two frames of a source with noise. A codec repeats most of a
 still picture, a drawn one is repeated everywhere."""
 
@@ -57,14 +57,14 @@ class _FirstFrames:
             if not self._keep_blank:
                 return bool(self.held) or arrival.t - self._began < max(self._settle, BLANK_SECONDS)
             self._hold(arrival)
-            return self._bytes <= MEMORY
+            return self._bytes <= MAX_HELD_BYTES
         self._hold(arrival)
         self.shown.append(len(self.held) - 1)
         if self.frozen is None:
             self.frozen = self._repeated()
         self._examine()
         lasts = arrival.t - self.held[self.shown[0]].t < self._settle
-        return not self.decided and lasts and self._bytes <= MEMORY
+        return not self.decided and lasts and self._bytes <= MAX_HELD_BYTES
 
     def end(self) -> None:
         """Examine what has not been examined; without any gel, all frames."""
@@ -107,10 +107,12 @@ class _FirstFrames:
         same = next((index for index, image in enumerate(images) if image is not images[0]), len(images))
         if same == 1 and len(images) > 1:
             return 0
-        if len(images) < same + PAIRS + 1:
+        if len(images) < same + NOISE_PAIR_COUNT + 1:
             return None
-        shares = [_changed_blocks(*images[index : index + 2]) for index in range(same, same + PAIRS)]
-        return same if np.median(shares) > NOISY else 0
+        shares = [
+            _changed_blocks(*images[index : index + 2]) for index in range(same, same + NOISE_PAIR_COUNT)
+        ]
+        return same if np.median(shares) > MIN_NOISY_SHARE else 0
 
     def _examine(self) -> None:
         """Show frames to `settling` until it has seen enough."""
@@ -335,6 +337,6 @@ class References:
 def _changed_blocks(before: BgrImage, after: BgrImage) -> float:
     """Share of blocks in which two pictures differ."""
     differs = (before != after).any(axis=2)
-    high, wide = (max(1, side // BLOCK) for side in differs.shape)
-    rows = np.logical_or.reduceat(differs, np.arange(high) * BLOCK, axis=0)
-    return float(np.logical_or.reduceat(rows, np.arange(wide) * BLOCK, axis=1).mean())
+    high, wide = (max(1, side // BLOCK_SIDE_PX) for side in differs.shape)
+    rows = np.logical_or.reduceat(differs, np.arange(high) * BLOCK_SIDE_PX, axis=0)
+    return float(np.logical_or.reduceat(rows, np.arange(wide) * BLOCK_SIDE_PX, axis=1).mean())

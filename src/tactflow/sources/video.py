@@ -23,13 +23,13 @@ from tactflow.sources.base import (
 )
 from tactflow.system.extras import missing
 
-HIGHEST_FPS = 1e4
+MAX_FPS = 1e4
 """Maximum rate of a video file, frames per second; larger ones are ignored. Chosen by hand."""
-PLAYLISTS = (b"#EXTM3U", b"ffconcat")
+PLAYLIST_MAGICS = (b"#EXTM3U", b"ffconcat")
 """First bytes of playlists, whose files FFmpeg would open."""
-UNDECODED = {"AV01": "AV1"}
+UNDECODED_CODECS = {"AV01": "AV1"}
 """Four characters of a codec -> its name, where OpenCV's wheels have no decoder without a graphics card."""
-LONGEST_TAIL = 1.5
+MAX_TAIL_GAPS = 1.5
 """Longest time from the last frame to the stated end of a complete video, in its longest gaps between frames:
 the last frame lasts for one, and half of one is for rounding, so that a single lost frame is reported."""
 PTS = getattr(cv2, "CAP_PROP_PTS", -1)
@@ -64,7 +64,7 @@ def refuse_playlist(path: Path) -> None:
         raise damaged(str(path), error) from error
     if not head:
         raise SourceError(f"{path}: the file is empty")
-    if head.lstrip(b"\xef\xbb\xbf \r\n").startswith(PLAYLISTS):
+    if head.lstrip(b"\xef\xbb\xbf \r\n").startswith(PLAYLIST_MAGICS):
         raise SourceError(f"{path}: a list of other files, not a video; name one of them")
 
 
@@ -82,7 +82,7 @@ class VideoFile(CaptureReader):
         )
         super().__init__(str(path), failure, str(path), cv2.CAP_FFMPEG)
         stated = self._property(cv2.CAP_PROP_FPS)
-        self.fps = stated if 0 < stated < HIGHEST_FPS else fps or DEFAULT_FPS
+        self.fps = stated if 0 < stated < MAX_FPS else fps or DEFAULT_FPS
         # Of containers that state only the duration, such as Matroska, this is an estimate.
         self.total = max(int(self._property(cv2.CAP_PROP_FRAME_COUNT)), 0) or None
         self._read_first(_no_frame(path, int(self._property(cv2.CAP_PROP_FOURCC))))
@@ -108,7 +108,7 @@ class PyAvVideo(FrameReader):
         with _opened(path) as file:
             (stream, *_) = file.streams.video
             stated = float(stream.average_rate or 0)
-            self.fps = stated if 0 < stated < HIGHEST_FPS else fps or DEFAULT_FPS
+            self.fps = stated if 0 < stated < MAX_FPS else fps or DEFAULT_FPS
             seconds = (file.duration or 0) / 1e6
         self.total = stream.frames or round(seconds * self.fps) or None
         self._read_first()
@@ -148,8 +148,8 @@ def _opened(path: Path) -> Any:
 def _no_frame(path: Path, fourcc: int) -> str:
     """Message for a video without a frame that OpenCV can decode. fourcc : its codec."""
     name = fourcc.to_bytes(4, "little", signed=fourcc < 0).decode("latin-1").upper()
-    problem = missing(f"{UNDECODED.get(name)} videos", "video", ["av"])
-    if name in UNDECODED and problem is not None:
+    problem = missing(f"{UNDECODED_CODECS.get(name)} videos", "video", ["av"])
+    if name in UNDECODED_CODECS and problem is not None:
         return f"{problem}; or convert it: ffmpeg -i {path.name} -c:v libx264 -crf 10 {path.stem}-h264.mp4"
     codec = f" ({name})" if name.isalnum() else ""
     return f"the video{codec} holds no frame that can be decoded; is it damaged?"
@@ -173,7 +173,7 @@ def _timed(pictures: Iterator[Stamped], video: FrameReader) -> Iterator[tuple[ND
     # The stated count may be an estimate from rate and duration, but not that duration.
     if video.total is not None and 0 < count < video.total:
         lost = video.total * usual - end
-        if lost > LONGEST_TAIL * longest:
+        if lost > MAX_TAIL_GAPS * longest:
             video.lacking = round(lost / usual) - 1
             text = "%s: ended after %d frames, %.3g s before its stated end; the file may be damaged"
             log.warning(text, video.name, count, lost)

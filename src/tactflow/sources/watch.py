@@ -19,13 +19,13 @@ from tactflow.engine.errors import SourceError
 from tactflow.sources.base import Arrival, BgrImage, FrameReader, log
 from tactflow.system.clock import SYSTEM, Clock
 
-BLACK_LEVEL = 4.0
+MAX_BLACK_MEAN_GREY = 4.0
 """Maximum mean gray level of a black picture; a lit gel has 30 and more."""
-BLACK_STEP = 8
+SAMPLING_STEP_PX = 8
 """Sampling step for that mean, px. Chosen by hand."""
 FIRST_FRAME_SECONDS = 3.0
 """Stall timeout for the first frame, s. Chosen by hand."""
-SILENT_FRAMES = 3.0
+MIN_STALL_FRAMES = 3.0
 """Minimum stall timeout of a slow camera, frames. Chosen by hand."""
 CLOSE_SECONDS = 3.0
 """Longest time that `close` waits for a pending read, s. Chosen by hand."""
@@ -157,7 +157,7 @@ class Watched(FrameReader):
     def _check_time(self, now: float) -> None:
         """Detect stalls and timeouts."""
         watch = self._watch
-        usual = SILENT_FRAMES / self.fps if self.fps else 0.0
+        usual = MIN_STALL_FRAMES / self.fps if self.fps else 0.0
         longest = max(FIRST_FRAME_SECONDS if self._seq < 0 else 0.0, watch.silent_after, usual)
         if self._fault is None and now - self._arrived_at >= longest:
             self._report("no frames", self._arrived_at, now)
@@ -195,7 +195,7 @@ class Watched(FrameReader):
         """
         watch = self._watch
         if watch.black_after is not None:
-            if float(image[::BLACK_STEP, ::BLACK_STEP].mean()) > BLACK_LEVEL:
+            if float(image[::SAMPLING_STEP_PX, ::SAMPLING_STEP_PX].mean()) > MAX_BLACK_MEAN_GREY:
                 self._lit_at, self._lit = now, True
             lasts = now - self._lit_at >= watch.black_after
             if self._lit_at != now and (lasts or not self._lit):

@@ -48,17 +48,17 @@ def is_device(text: str) -> bool:
     return file is not None and not stat.S_ISREG(file.st_mode) and not stat.S_ISDIR(file.st_mode)
 
 
-MAX_BYTES = 1 << 20
+MAX_TEXT_FILE_BYTES = 1 << 20
 """Size limit of files of code or YAML, far above usual sizes."""
 
 
 def read_limited(path: Path) -> bytes:
-    """Read a file of code or YAML. Raises OSError if it is larger than `MAX_BYTES`."""
+    """Read a file of code or YAML. Raises OSError if it is larger than `MAX_TEXT_FILE_BYTES`."""
     with path.open("rb") as stream:
         # A device such as /dev/zero has no end.
-        data = stream.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise OSError(errno.EFBIG, f"larger than {MAX_BYTES >> 10} KiB")
+        data = stream.read(MAX_TEXT_FILE_BYTES + 1)
+    if len(data) > MAX_TEXT_FILE_BYTES:
+        raise OSError(errno.EFBIG, f"larger than {MAX_TEXT_FILE_BYTES >> 10} KiB")
     return data
 
 

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Final
 
-OURS: Final = "opencv-contrib-python-headless"
+REQUIRED_PACKAGE: Final = "opencv-contrib-python-headless"
 """The package that tactflow depends on; the others are subsets of it, or have windows."""
 
 
@@ -22,12 +22,12 @@ def opencv_conflict(packages: Path, *, has_contrib: bool) -> str | None:
     pattern = re.compile(r"(opencv_(?:contrib_)?python(?:_headless)?)-([^-]+)\.dist-info")
     found = filter(None, map(pattern.fullmatch, os.listdir(packages)))
     versions = {match[1].replace("_", "-"): match[2] for match in found}
-    others = {name: version for name, version in versions.items() if name != OURS}
-    agree = len(set(versions.values())) == 1 and (has_contrib or OURS not in versions)
+    others = {name: version for name, version in versions.items() if name != REQUIRED_PACKAGE}
+    agree = len(set(versions.values())) == 1 and (has_contrib or REQUIRED_PACKAGE not in versions)
     if len(versions) < 2 or agree:
         return None
     listed = ", ".join(f"{name} {version}" for name, version in sorted(versions.items()))
     return (
         f"{len(versions)} packages of OpenCV have overwritten each other: {listed}; make them agree: pip "
-        f"install --force-reinstall --no-deps {OURS}=={min(others.values())}"
+        f"install --force-reinstall --no-deps {REQUIRED_PACKAGE}=={min(others.values())}"
     )

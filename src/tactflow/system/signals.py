@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+ENDING_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 """Ctrl-C, a service manager, a terminal that is closed."""
 
-INTERRUPTED = 130
+INTERRUPTED_EXIT_CODE = 130
 """Exit code of a program that was interrupted before it had finished pending work."""
 
 Handler = Callable[[int, FrameType | None], object]
@@ -36,7 +36,7 @@ def on_ending(handler: Handler | signal.Handlers) -> dict[int, object]:
     Ignored signals remain ignored, as nohup requires. So do signals handled by a host program in C, whose
     handler Python could not restore.
     """
-    handled = [number for number in ENDING if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    handled = [number for number in ENDING_SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
     return {number: signal.signal(number, handler) for number in handled}
 
 

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-MISSPELLED: Final = 0.75
+MIN_SIMILARITY: Final = 0.75
 """Minimum similarity (`difflib`, 0 to 1) of a misspelled word: one wrong letter of four, or two in the wrong
 order. Different words are less similar: threads and radius 0.62, depth and path 0.67."""
 
@@ -18,7 +18,7 @@ def closest(word: str, candidates: Iterable[str]) -> str | None:
     ('min_area', 'hull', None)
     """
     lowered = {candidate.lower(): candidate for candidate in candidates}
-    matches = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=MISSPELLED)
+    matches = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=MIN_SIMILARITY)
     return lowered[matches[0]] if matches else None
 
 

@@ -26,11 +26,11 @@ STATUS_LETTERS: Final = np.array([ord(name[0]) for name in STATUS_NAMES], np.uin
 """The first letter of the word for each value of `MarkerStatus`."""
 MAX_CELLS: Final = 96
 """Maximum number of cells along the longer side of a surface: its panel is about 600 px wide."""
-MIN_CELL: Final = 2.0
+MIN_CELL_PX: Final = 2.0
 """Minimum side of a cell, px: heights are computed at half the resolution of the picture."""
-LEVELS: Final = 65535
+HEIGHT_LEVELS: Final = 65535
 """Quantisation steps from 0 to the greatest height; 255 would show as terraces on the shaded surface."""
-FIELD_ARROWS = 14.0
+FIELD_ARROW_SPACING_PX = 14.0
 """Spacing of the arrows of a displacement field in a picture of 400 px, px. Chosen by hand."""
 
 
@@ -56,7 +56,7 @@ def encode_packet(
     image = result.frame.image if result.image is None else result.image
     arrows, surface, heights = b"null", b"null", b""
     if result.field is not None:
-        spacing = FIELD_ARROWS * max(1.0, max(image.shape) / 400)
+        spacing = FIELD_ARROW_SPACING_PX * max(1.0, max(image.shape) / 400)
         arrows = compact_markers(field_arrows(result.field, spacing))
     if result.depth is not None:
         surface, heights = compact_surface(result.depth)
@@ -123,11 +123,11 @@ def compact_surface(depth: Depth) -> tuple[bytes, bytes]:
     x, y, width, height = cv2.boundingRect((depth.heights > 0).view(np.uint8))
     if not width:
         return b"null", b""
-    side = max(MIN_CELL, max(width, height) / MAX_CELLS)
+    side = max(MIN_CELL_PX, max(width, height) / MAX_CELLS)
     columns, rows = math.ceil(width / side), math.ceil(height / side)
     part = depth.heights[y : y + height, x : x + width]
     cells = cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
-    step = float(cells.max()) / LEVELS
+    step = float(cells.max()) / HEIGHT_LEVELS
     data = np.rint(cells * np.float32(1 / step)).astype("<u2").tobytes()
     header = b'{"box":[%d,%d,%d,%d],"size":[%d,%d],"step":%.8g,"bytes":%d}'
     return header % (x, y, width, height, columns, rows, step, len(data)), data

@@ -26,7 +26,7 @@ from tactflow.view.server import Server
 HOST: Final = "127.0.0.1"
 SENSOR: Final = "setup"
 """Name of the tab of the page."""
-SHOW_SECONDS: Final = 1 / 30
+MIN_FRAME_INTERVAL_S: Final = 1 / 30
 """Shortest interval between frames on the page, s."""
 
 Choices = Mapping[str, str]
@@ -140,7 +140,7 @@ class Questions:
         self.begin(text, choices, notes=notes)
         while (answer := self.poll()) is None:
             if still or self.reader is None:
-                time.sleep(SHOW_SECONDS)
+                time.sleep(MIN_FRAME_INTERVAL_S)
                 if self._shown is not None:
                     self.show(self._shown)
             elif (arrival := self.reader.read_arrival()) is not None:
@@ -158,7 +158,7 @@ class Questions:
         now = SYSTEM.now()
         if not self._hub.wanted or now < self._due:
             return
-        self._due = now + SHOW_SECONDS
+        self._due = now + MIN_FRAME_INTERVAL_S
         packet = encode_packet(
             self._shown, None, latency_ms=-1.0, guide=self._state, quality=85, max_size=1280
         )

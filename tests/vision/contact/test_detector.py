@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.sim import open_scene
-from tactflow.sim.gel import RIM, SINK_IN
+from tactflow.sim.gel import RIM_SLOPE_RATIO, SINK_IN_RATIO
 from tactflow.vision.contact import ContactDetector, ContactResult, chi_square_threshold
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.markers.inpaint import remove_markers
@@ -37,7 +37,9 @@ def _pressed(
     y, x = np.mgrid[0 : gel.shape[0], 0 : gel.shape[1]].astype(float)
     dx, dy = (x - center[0]) / radius, (y - center[1]) / radius
     reached = 1 - (dx**2 + dy**2)
-    fade = np.where(reached > SINK_IN, 1, RIM * np.exp(RIM * (reached / SINK_IN - 1)))
+    fade = np.where(
+        reached > SINK_IN_RATIO, 1, RIM_SLOPE_RATIO * np.exp(RIM_SLOPE_RATIO * (reached / SINK_IN_RATIO - 1))
+    )
     angles = np.radians([90.0, 210.0, 330.0])
     return gel * np.stack([1 + strength * fade * (dx * np.cos(a) + dy * np.sin(a)) for a in angles], axis=-1)
 
@@ -46,7 +48,11 @@ def _sunk(shape: tuple[int, ...], center: tuple[float, float], radius: float) ->
     """(H, W): depth of the same surface, 1 in the middle."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
     reached = 1 - ((x - center[0]) ** 2 + (y - center[1]) ** 2) / radius**2
-    return np.where(reached > SINK_IN, reached, SINK_IN * np.exp(RIM * (reached / SINK_IN - 1)))
+    return np.where(
+        reached > SINK_IN_RATIO,
+        reached,
+        SINK_IN_RATIO * np.exp(RIM_SLOPE_RATIO * (reached / SINK_IN_RATIO - 1)),
+    )
 
 
 def _noisy(gel: NDArray[np.float64], seed: int, noise: float = 1.5) -> Image:

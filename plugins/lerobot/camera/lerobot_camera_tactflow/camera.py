@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 READ_TIMEOUT_MS = 10_000
 """Longest wait of `read` for a frame, ms: that of LeRobot's own cameras."""
-UNCHANGED = 128
+UNCHANGED_GREY = 128
 """Grey level of `difference` where nothing has changed."""
 
 
@@ -170,7 +170,7 @@ class TactflowCamera(Camera):
             case Output.DIFFERENCE:
                 unmarked = _required(result, "unmarked", "a stage inpaint").astype(np.int16)
                 change = unmarked - _required(result, "untouched", "a stage untouched")
-                return self._in_order((UNCHANGED + change // 2).clip(0, 255).astype(np.uint8))
+                return self._in_order((UNCHANGED_GREY + change // 2).clip(0, 255).astype(np.uint8))
             case Output.DEPTH:
                 _required(result, "scale", "a stage scale, and settings with a calibration")
                 heights = np.zeros(result.size[::-1]) if result.depth is None else result.depth.heights

@@ -29,13 +29,13 @@ from std_srvs.srv import Trigger
 from tactflow_ros import messages
 from tactflow_ros.link import Link, LinkError, send_command
 
-DEPTH = 10
+QUEUE_DEPTH = 10
 """Queue length of a topic."""
 ANSWER_SECONDS = 2.0
 """Timeout of the service, s. Chosen by hand."""
-LIVE = 1e9
+MIN_UNIX_TIME_S = 1e9
 """Times above this are Unix times of a live source; those of a recording start at 0, s."""
-MOST_LOST = 0.5
+MAX_LOST_SHARE = 0.5
 """Share of lost markers above which /diagnostics warns. Chosen by hand."""
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
@@ -94,7 +94,7 @@ class Counts:
         seq, t = message["seq"], message["t"]
         self.missing += 0 if self._seq is None else max(0, seq - self._seq - 1)
         self._seq = seq
-        self.latency_s = time.time() - t if t > LIVE else math.nan
+        self.latency_s = time.time() - t if t > MIN_UNIX_TIME_S else math.nan
         self.lost_markers = status.count("lost") / len(status) if status else math.nan
         self.frames += 1
         self.last = time.monotonic()
@@ -191,7 +191,7 @@ class Bridge(LifecycleNode):
         if word not in ("best_effort", "reliable"):
             raise ValueError(f"reliability: required best_effort or reliable, got {word!r}")
         reliability = QoSReliabilityPolicy[word.upper()]
-        qos = QoSProfile(depth=DEPTH, reliability=reliability, durability=QoSDurabilityPolicy.VOLATILE)
+        qos = QoSProfile(depth=QUEUE_DEPTH, reliability=reliability, durability=QoSDurabilityPolicy.VOLATILE)
         kinds = dict(UNITLESS)
         for name, (kind, _) in GEOMETRY.items():
             kinds |= {name: kind, f"{name}_pixels": kind}
@@ -199,7 +199,7 @@ class Bridge(LifecycleNode):
             self._topics[name] = self.create_lifecycle_publisher(kind, f"~/{name}", qos)
         if self.value("publish_clock"):
             self._topics["/clock"] = self.create_lifecycle_publisher(Clock, "/clock", qos)
-        self._topics["/diagnostics"] = self.create_publisher(DiagnosticArray, "/diagnostics", DEPTH)
+        self._topics["/diagnostics"] = self.create_publisher(DiagnosticArray, "/diagnostics", QUEUE_DEPTH)
 
     # -- messages -----------------------------------------------------------------------------------------
 
@@ -238,7 +238,7 @@ class Bridge(LifecycleNode):
                 publisher.publish(message)
 
     def _warn_replay(self, t: float) -> None:
-        if t > LIVE or self._warned_replay or self.value("use_sim_time"):
+        if t > MIN_UNIX_TIME_S or self._warned_replay or self.value("use_sim_time"):
             return
         self._warned_replay = True
         self.get_logger().warning(
@@ -273,7 +273,7 @@ class Bridge(LifecycleNode):
             "frames dropped by the run": self._run.get("dropped", math.nan),
             "latency of the run, p99, ms": latency.get("p99") or math.nan,
         }
-        if level == DiagnosticStatus.OK and self._counts.lost_markers > MOST_LOST:
+        if level == DiagnosticStatus.OK and self._counts.lost_markers > MAX_LOST_SHARE:
             level, words = DiagnosticStatus.WARN, "most markers are lost: take a new reference"
         status = DiagnosticStatus(
             level=level,

@@ -14,17 +14,17 @@ from zmq.utils.monitor import recv_monitor_message
 
 POLL_MS = 100
 """Interval at which the thread checks for closing and for changed subscriptions, ms. Chosen by hand."""
-BACKLOG = 120
+MAX_QUEUED_MESSAGES = 120
 """Messages queued while this process is blocked: two seconds at 60 Hz. Chosen by hand."""
 MAX_MESSAGE_BYTES = 16 << 20
 """Maximum size of a message. Chosen by hand."""
-REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+REJECTION_EVENTS = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
 """Handshake failures after which ZeroMQ does not reconnect."""
-HUNG_UP = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+HANG_UP_EVENT = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 """The server closed the connection during the handshake; ZeroMQ reconnects."""
-MOST_HANG_UPS = 5
+MAX_HANG_UPS = 5
 """Consecutive hang-ups that count as a rejection; a server that ends causes one or two. Chosen by hand."""
-REQUIRED = frozenset(["sensor", "seq", "t", "contact", "flow", "markers"])
+REQUIRED_KEYS = frozenset(["sensor", "seq", "t", "contact", "flow", "markers"])
 """Keys that a result message must have."""
 
 
@@ -111,10 +111,12 @@ class Link:
         self._closing = threading.Event()
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
-        self._socket.rcvhwm = BACKLOG
+        self._socket.rcvhwm = MAX_QUEUED_MESSAGES
         # Heartbeats detect a publisher that disappeared without closing its connection, and reconnect.
         self._socket.setsockopt(zmq.HEARTBEAT_IVL, 2000)
-        self._monitor = self._socket.get_monitor_socket(REFUSED | HUNG_UP | zmq.EVENT_HANDSHAKE_SUCCEEDED)
+        self._monitor = self._socket.get_monitor_socket(
+            REJECTION_EVENTS | HANG_UP_EVENT | zmq.EVENT_HANDSHAKE_SUCCEEDED
+        )
         self._hang_ups = 0
         try:
             connect(self._socket, endpoint, keys, "endpoint")
@@ -154,8 +156,8 @@ class Link:
                 self._pass_on(self._socket.recv())
 
     def _note_handshake(self, event: int) -> None:
-        self._hang_ups = self._hang_ups + 1 if event == HUNG_UP else 0
-        if event & REFUSED or self._hang_ups >= MOST_HANG_UPS:
+        self._hang_ups = self._hang_ups + 1 if event == HANG_UP_EVENT else 0
+        if event & REJECTION_EVENTS or self._hang_ups >= MAX_HANG_UPS:
             self.refused = f"{self._endpoint} requires other keys, or any: set the parameter keys"
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self.refused = None
@@ -176,7 +178,7 @@ class Link:
         try:
             message = json.loads(text)
             ours = message["sensor"] == self._sensor
-            if name == "tactflow" and not message.keys() >= REQUIRED:
+            if name == "tactflow" and not message.keys() >= REQUIRED_KEYS:
                 raise ValueError("not a result message")
             if ours:
                 self._on_message(name, message, rest)

@@ -25,9 +25,9 @@ from std_msgs.msg import Header
 
 Message = dict[str, Any]
 
-MM = 1e-3
+METRES_PER_MM = 1e-3
 """Metres per millimetre."""
-NANOSECONDS = 1_000_000_000
+NANOSECONDS_PER_SECOND = 1_000_000_000
 """Nanoseconds per second."""
 
 STATUS = {"tracked": 0, "inferred": 1, "lost": 2}
@@ -79,14 +79,14 @@ def units(message: Message) -> list[Unit]:
     if scale is None:
         return [PIXELS]
     x, y = scale["mm_per_px"]
-    return [PIXELS, Unit((x * MM, y * MM), tuple(scale["origin"]), "")]
+    return [PIXELS, Unit((x * METRES_PER_MM, y * METRES_PER_MM), tuple(scale["origin"]), "")]
 
 
 def stamp(t: float) -> Time:
     """Convert a capture time, s."""
     # A double cannot hold a Unix time in nanoseconds, so split it first.
-    nanoseconds = math.floor(t) * NANOSECONDS + round(t % 1 * NANOSECONDS)
-    return Time(sec=nanoseconds // NANOSECONDS, nanosec=nanoseconds % NANOSECONDS)
+    nanoseconds = math.floor(t) * NANOSECONDS_PER_SECOND + round(t % 1 * NANOSECONDS_PER_SECOND)
+    return Time(sec=nanoseconds // NANOSECONDS_PER_SECOND, nanosec=nanoseconds % NANOSECONDS_PER_SECOND)
 
 
 def header(message: Message, frame_id: str) -> Header:
@@ -123,7 +123,7 @@ def object_pose(message: Message, head: Header) -> PoseStamped | None:
     result = PoseStamped(header=head)
     place, turn = result.pose.position, result.pose.orientation
     moved = zip(found["center"], found["translation"], strict=True)
-    place.x, place.y, place.z = ((start + way) * MM for start, way in moved)
+    place.x, place.y, place.z = ((start + way) * METRES_PER_MM for start, way in moved)
     angle = math.radians(math.hypot(*found["rotation"]))
     # The sine of half of the angle over the angle in degrees, which has a limit at 0.
     part = math.sin(angle / 2) / math.degrees(angle) if angle else math.radians(0.5)
@@ -206,7 +206,7 @@ def picture(message: Message, data: bytes, frame_id: str) -> CompressedImage:
 def depth(message: Message, data: bytes, frame_id: str) -> Image:
     """Depth of the indentation, m. data : (height, width) float32, little-endian, mm."""
     width, height = message["size"]
-    metres = np.frombuffer(data, "<f4", width * height) * np.float32(MM)
+    metres = np.frombuffer(data, "<f4", width * height) * np.float32(METRES_PER_MM)
     return Image(
         header=header(message, frame_id),
         height=height,

@@ -24,7 +24,7 @@ from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.arguments import positive
-from tactflow.system.signals import INTERRUPTED, ending_handled
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE, ending_handled
 from tactflow.system.terminal import progress_bar, say
 from tactflow.tools.batch.recordings import Recording, find_recordings
 from tactflow.tools.batch.report import chosen_format, write_page, write_runs
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
             page = write_page(store, runs, f"{file.stem}: {len(runs)} recordings")
         tell(f"report: {page}")
     if signals and result.undone:
-        return INTERRUPTED
+        return INTERRUPTED_EXIT_CODE
     return StageError.exit_code if result.undone or result.failed else 0
 
 

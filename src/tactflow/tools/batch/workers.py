@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.children import starting_children
 from tactflow.system.extras import missing
-from tactflow.system.signals import ENDING
+from tactflow.system.signals import ENDING_SIGNALS
 from tactflow.tools.batch.store import Outcome
 from tactflow.tools.batch.work import Task, work
 
@@ -68,7 +68,7 @@ class LocalProcesses:
     def submit(self, task: Task) -> Future[Outcome]:
         """See `Workers.submit`."""
         # Not SIGTERM, with which the pool terminates its processes.
-        with starting_children([number for number in ENDING if number != signal.SIGTERM]):
+        with starting_children([number for number in ENDING_SIGNALS if number != signal.SIGTERM]):
             try:
                 return self._pool.submit(work, task)
             except BrokenProcessPool:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.recording.course import BLACK_LEVEL
+from tactflow.recording.course import BLACK_GREY
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.markers import Detection
 from tactflow.vision.markers.lattice import corners
@@ -109,7 +109,7 @@ def exposure(image: ColorImage) -> float:
     255.0
     """
     brightest = image.max(axis=2)
-    gel = brightest[brightest > BLACK_LEVEL]
+    gel = brightest[brightest > BLACK_GREY]
     return float(np.percentile(gel, 95.0)) if gel.size else 0.0
 
 

@@ -13,7 +13,7 @@ from typing import IO, NamedTuple, TextIO
 
 from tactflow.engine.errors import ConfigError, StageError
 from tactflow.system.files import discard_output
-from tactflow.system.signals import INTERRUPTED
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE
 from tactflow.tools.fleet.sinks import WatchedSink
 
 FIRST_PAUSE = 1.0
@@ -94,7 +94,7 @@ class Supervisor:
         for reader in self._readers:
             reader.join(5)
         if self._signals > 1:
-            return INTERRUPTED
+            return INTERRUPTED_EXIT_CODE
         return next(filter(None, codes.values()), StageError.exit_code if self._unwritten else 0)
 
     @property
@@ -111,7 +111,7 @@ class Supervisor:
         while not self._ends:
             started = self._clock()
             code = yield from self._watch(self._start(member))
-            if code in (0, ConfigError.exit_code, INTERRUPTED) or self._ends:
+            if code in (0, ConfigError.exit_code, INTERRUPTED_EXIT_CODE) or self._ends:
                 # A wrong command line or file is wrong for the whole run: end the others.
                 self._refused |= code == ConfigError.exit_code
                 return self._last_code(member, code)
@@ -149,7 +149,11 @@ class Supervisor:
 
     def _last_code(self, member: Member, code: int) -> int:
         """Exit code of a sensor that is not restarted."""
-        if self._ends and self._signals < 2 and code in (-signal.SIGINT, -signal.SIGTERM, INTERRUPTED):
+        if (
+            self._ends
+            and self._signals < 2
+            and code in (-signal.SIGINT, -signal.SIGTERM, INTERRUPTED_EXIT_CODE)
+        ):
             # The signal came before the process had installed its handler.
             return 0
         if code < 0:

@@ -20,7 +20,7 @@ from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.cameras import list_cameras
 from tactflow.system.files import completed
 from tactflow.system.redaction import public_address
-from tactflow.system.signals import INTERRUPTED, ending_handled, interrupt
+from tactflow.system.signals import INTERRUPTED_EXIT_CODE, ending_handled, interrupt
 from tactflow.system.terminal import notes, say, typed
 from tactflow.tools.doctor import Observation, examine
 from tactflow.tools.doctor.observation import watch
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
                 _set_up(args, source, reader, questions)
     except KeyboardInterrupt:
         say("stopped; nothing was written")
-        return INTERRUPTED
+        return INTERRUPTED_EXIT_CODE
     say(f"{args.out} is written. From now on: {typed('tactflow', 'run', str(args.out))}")
     if args.no_run:
         return 0

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.recording.course import BLACK_LEVEL
+from tactflow.recording.course import BLACK_GREY
 from tactflow.sim import Truth, open_scene
 from tactflow.sim.camera import SIZE
 from tactflow.tools.bench.scenes import Case, Rendered
@@ -86,7 +86,7 @@ def _dots(observation: Observation, scale: float) -> str:
 
 def _levels(image: ColorImage) -> NDArray[np.float64]:
     """Median grey levels (3,) of the gel, BGR."""
-    gel = image[image.max(axis=2) > BLACK_LEVEL]
+    gel = image[image.max(axis=2) > BLACK_GREY]
     return np.asarray(np.median(gel, axis=0) if len(gel) else np.ones(3), np.float64)
 
 
