@@ -26,7 +26,7 @@ from tactflow.stages.capture import Capture
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.change import DamageTest
 
-FRAMES = 400
+EXAMINED_FRAMES = 400
 """Frames of a source that are examined."""
 VIDEOS = (".avi", ".mp4", ".m4v")
 
@@ -60,7 +60,7 @@ def judge(source: str, found: Counter[str], total: Counter[str]) -> tuple[int, i
     stage.open()
     frames, bad, reference = 0, [], -1
     with closing(stage):
-        for frame in islice(stage.frames(), FRAMES):
+        for frame in islice(stage.frames(), EXAMINED_FRAMES):
             if frame.reference:
                 reference, first = frame.seq, frame.image
                 continue

@@ -20,7 +20,7 @@ from tactflow.calibration.file import Calibration, ScaleEntry, raw_corners, smal
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.samples import press_errors, summary
 
-LEARNED = {
+TRAINING_SETS = {
     "mini": (
         "gelslam",
         "GelSight Mini",
@@ -34,7 +34,7 @@ KIND_SCALE = 0.05
 21.1 pixels per mm on two DIGITs."""
 KIND_ERRORS = {"normal_error": 2.6, "depth_stderr": 0.102}
 """Additional errors on another sensor of the kind, measured on two other Minis by this program."""
-OTHERS = {"mini": ("mini_ball", "mini_ball_9mm")}
+OTHER_SETS = {"mini": ("mini_ball", "mini_ball_9mm")}
 """File -> sets of other sensors of the kind."""
 
 
@@ -44,11 +44,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--keep", type=Path, help="folder with the presses of an earlier run")
     args = parser.parse_args()
-    names = [learned for learned, _, _ in LEARNED.values()] + [
-        name for sets in OTHERS.values() for name in sets
+    names = [learned for learned, _, _ in TRAINING_SETS.values()] + [
+        name for sets in OTHER_SETS.values() for name in sets
     ]
     sessions = sessions_of(names, args.data, args.keep)
-    for file, (learned, kind, origin) in LEARNED.items():
+    for file, (learned, kind, origin) in TRAINING_SETS.items():
         session, pictures = sessions[learned]
         scale = scale_of(SETS[learned], session)
         fitted = fit_photometry(session, scale, radii_of(SETS[learned], pictures))
@@ -67,7 +67,7 @@ def main() -> None:
         for_kind(made, kind).save(KINDS / f"{file}.yaml")
         own = fitted.found.model_dump()
         print(f"{file}: {words(own)} on its own sensor")
-        if others := OTHERS.get(file, ()):
+        if others := OTHER_SETS.get(file, ()):
             errors = []
             for other in others:
                 presses, pictures = sessions[other]

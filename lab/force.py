@@ -32,11 +32,11 @@ from tactflow.vision.types import Scale
 
 SESSIONS = ("wedge_grip", "wedge_grasp")
 """Folders of recordings, by day. Recordings that are in both count for the first."""
-WIDTH = 18.6
+GEL_WIDTH_MM = 18.6
 """Of the gel, mm. It only gives the stiffnesses their unit."""
-TOUCHING = 0.75
+MIN_TOUCH_FORCE_N = 0.75
 """Minimum force at which a contact should be found, N."""
-RIDGE = 1.0
+RIDGE_PENALTY = 1.0
 """Weight of the squared coefficients of features between 0 and 1."""
 
 
@@ -60,9 +60,9 @@ class Grasp:
         return np.interp(self.watched.times, seconds, self.reference.force[:, 2])
 
     def missed(self) -> Floats:
-        """Forces of `TOUCHING` or more, N, in frames in which no contact is found."""
+        """Forces of `MIN_TOUCH_FORCE_N` or more, N, in frames in which no contact is found."""
         force = self.force()
-        return force[(force >= TOUCHING) & ~self.watched.touched]
+        return force[(force >= MIN_TOUCH_FORCE_N) & ~self.watched.touched]
 
     def usable(self) -> bool:
         """Whether `calibrate force` takes it."""
@@ -87,7 +87,7 @@ def watch(path: Path) -> Watched:
     watcher = Watcher()
     for result in tactflow.stream(pipeline, images=True):
         assert result.image is not None
-        mm = WIDTH / result.image.shape[1]
+        mm = GEL_WIDTH_MM / result.image.shape[1]
         watcher.add(Result(result.frame, {**result, "scale": Scale(mm, mm, (0.0, 0.0), (0.0, 0.0))}))
     return watcher.watched()
 
@@ -118,7 +118,7 @@ def ridge(features: Floats, force: Floats, tried: Floats) -> Floats:
     middle = features.mean(axis=0)
     centred = features - middle
     weights = np.linalg.solve(
-        centred.T @ centred + RIDGE * np.eye(len(size)), centred.T @ (force - force.mean())
+        centred.T @ centred + RIDGE_PENALTY * np.eye(len(size)), centred.T @ (force - force.mean())
     )
     return np.asarray(force.mean() + (tried - middle) @ weights)
 
@@ -169,8 +169,8 @@ def r2(force: Floats, said: Floats) -> float:
 
 
 def agreeing(grasps: Sequence[Grasp], day: str) -> float:
-    """Share of a day's frames in which a contact is found just where the force is `TOUCHING` or more, %."""
-    agrees = [(one.force() >= TOUCHING) == one.watched.touched for one in grasps if one.day == day]
+    """Share of a day's frames, %, with a contact if and only if the force is `MIN_TOUCH_FORCE_N` or more."""
+    agrees = [(one.force() >= MIN_TOUCH_FORCE_N) == one.watched.touched for one in grasps if one.day == day]
     return 100 * float(np.concatenate(agrees).mean())
 
 
@@ -205,14 +205,14 @@ def main() -> None:
         show(["", *table([[title, "RMSE, R2", "of ridge", "one, two", "frames"], *rows])])
     missed = {grasp.name: grasp.missed() for grasp in grasps}
     worst = max(grasps, key=lambda grasp: missed[grasp.name].max(initial=0))
-    pressed = sum(int(np.count_nonzero(grasp.force() >= TOUCHING)) for grasp in grasps)
+    pressed = sum(int(np.count_nonzero(grasp.force() >= MIN_TOUCH_FORCE_N)) for grasp in grasps)
     show(
         [
             "",
-            f"no contact found in {sum(map(len, missed.values()))} of {pressed} frames with {TOUCHING} N or "
-            f"more, up to {missed[worst.name].max(initial=0):.1f} N ({worst.name})",
+            f"no contact found in {sum(map(len, missed.values()))} of {pressed} frames with "
+            f"{MIN_TOUCH_FORCE_N} N or more, up to {missed[worst.name].max(initial=0):.1f} N ({worst.name})",
             *(
-                f"{day}: contact agrees with {TOUCHING} N in {agreeing(grasps, day):.0f} %"
+                f"{day}: contact agrees with {MIN_TOUCH_FORCE_N} N in {agreeing(grasps, day):.0f} %"
                 for day in SESSIONS
             ),
         ]

@@ -31,11 +31,11 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ("press", "cable", "dense")
-FRAMES = 240
+SCENE_FRAMES = 240
 """Frames of each scene: several presses, about half of the frames with contact."""
-BLOCK = 20
+TURN_FRAMES = 20
 """Frames per turn, read before the clock starts: they are in memory, but not in the CPU's cache."""
-START = {
+START_COMMANDS = {
     "import tactflow": "-c 'import tactflow'",
     "tactflow run, 2 frames": "-m tactflow run --max-frames 2 --quiet --set sinks.jsonl.path=/dev/null",
 }
@@ -64,7 +64,9 @@ class Stopwatch:
         def frames(source: Any) -> Iterator[Any]:
             pending = original(source)
             # Copy, to avoid page faults of a mapped file while the clock runs.
-            while block := [replace(frame, image=frame.image.copy()) for frame in islice(pending, BLOCK)]:
+            while block := [
+                replace(frame, image=frame.image.copy()) for frame in islice(pending, TURN_FRAMES)
+            ]:
                 print("ready", flush=True)
                 sys.stdin.readline()
                 for frame in block:
@@ -120,7 +122,7 @@ def python(tree: Path, *arguments: str | Path) -> list[str]:
 
 
 def measure_scene(trees: dict[str, Path], file: str, recording: Path) -> Samples:
-    """Run all checkouts on a recording, taking turns of `BLOCK` frames."""
+    """Run all checkouts on a recording, taking turns of `TURN_FRAMES` frames."""
     children: dict[str, Any] = {}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with tempfile.TemporaryDirectory() as folder:
@@ -141,10 +143,10 @@ def measure_scene(trees: dict[str, Path], file: str, recording: Path) -> Samples
 
 
 def measure_start(trees: dict[str, Path]) -> Samples:
-    """Wall time of the commands of `START`, ms."""
+    """Wall time of the commands of `START_COMMANDS`, ms."""
     samples: Samples = {name: [{}] for name in trees}
     for name, tree in trees.items():
-        for title, arguments in START.items():
+        for title, arguments in START_COMMANDS.items():
             began = time.perf_counter()
             subprocess.run(python(tree, *shlex.split(arguments)), cwd=tree, capture_output=True, check=True)
             samples[name][0][title] = 1e3 * (time.perf_counter() - began)
@@ -194,7 +196,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for scene in args.scene or SCENES:
             recording = Path(folder) / f"{scene}.npy".replace("?", "-")
-            options = f"{'&' if '?' in scene else '?'}frames={FRAMES}"
+            options = f"{'&' if '?' in scene else '?'}frames={SCENE_FRAMES}"
             command = ("sim", f"{scene}{options}", "--out", recording)
             subprocess.run(python(ROOT, "-m", "tactflow", *command), capture_output=True, check=True)
             turns = [measure_scene(trees, args.pipeline, recording) for _ in range(args.turns)]

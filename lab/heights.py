@@ -42,11 +42,11 @@ OBJECTS: Mapping[str, tuple[str, str]] = {
     "ball of 9.5 mm": ("mini_ball_9mm", "mini_plain"),
 }
 """Name -> recording and pipeline."""
-SETTLED = 30
+SETTLING_FRAMES = 30
 """Frames of a video in which the camera may still change its exposure."""
-DEEPEST = 1.5
+MAX_DEPTH_MM = 1.5
 """Depth of the brightest colour, mm."""
-TILE = (240, 180)
+TILE_SIZE_PX = (240, 180)
 """Width and height of a picture, px."""
 
 
@@ -58,7 +58,7 @@ def largest(source: str, pipeline: str) -> tuple[Press, Picture, Picture]:
         settings["stages.capture.reference"] = str(untouched)
     for result in tactflow.stream(pipeline, source=source, settings=settings, images=True):
         mask, contact, image = result.contact_mask, result.contact, result.image
-        settling = source.endswith(".avi") and result.seq < SETTLED
+        settling = source.endswith(".avi") and result.seq < SETTLING_FRAMES
         if contact is None or mask is None or image is None or settling:
             continue
         radius = float(np.sqrt(np.count_nonzero(mask) / np.pi))
@@ -98,15 +98,15 @@ def tiles(data: Path) -> Iterator[NDArray[np.uint8]]:
         print(f"{name:20} greatest depth, mm: {ours.max():5.2f} {theirs.max():5.2f}", flush=True)
         outline = cv2.findContours(press.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
         cv2.drawContours(image, outline, -1, (255, 255, 255), 1)
-        column = [cv2.resize(part, TILE) for part in (image, coloured(ours), coloured(theirs))]
+        column = [cv2.resize(part, TILE_SIZE_PX) for part in (image, coloured(ours), coloured(theirs))]
         for part, words in zip(column, (name, "tactflow", "pixel network"), strict=True):
             cv2.putText(part, words, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
         yield np.vstack(column)
 
 
 def coloured(heights: NDArray[np.floating]) -> Picture:
-    """(H, W, 3) uint8, from 0 to `DEEPEST`."""
-    grey = np.clip(255 * heights / DEEPEST, 0, 255).astype(np.uint8)
+    """(H, W, 3) uint8, from 0 to `MAX_DEPTH_MM`."""
+    grey = np.clip(255 * heights / MAX_DEPTH_MM, 0, 255).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), np.uint8)
 
 

@@ -1,8 +1,9 @@
 """What each compiled loop gains a frame: `python -m lab.kernels [--scene press] [--frames 90]`.
 
-Every call of a loop is timed; every `EVERY`-th one is repeated as plain Python on copies of its arguments. A
-loop earns its place with 0.1 ms a frame (`tactflow.vision.compiled`); one whose plain version is this near
-should be NumPy, OpenCV or SciPy. Loops that the pipeline does not call are listed with no time."""
+Every call of a loop is timed; every `PLAIN_CALL_STEP`-th one is repeated as plain Python on copies of its
+arguments. A loop earns its place with 0.1 ms a frame (`tactflow.vision.compiled`); one whose plain version
+is this near should be NumPy, OpenCV or SciPy. Loops that the pipeline does not call are listed with no
+time."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ import numpy as np
 import tactflow
 from tactflow.vision import compiled
 
-EVERY = 25
+PLAIN_CALL_STEP = 25
 """Calls of a loop for each one that is repeated in plain Python, which is a hundred times as slow."""
 
 
@@ -35,7 +36,7 @@ def timed(times: dict[str, Times]) -> Any:
 
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
         own = times[self.__name__]
-        if len(own.compiled) % EVERY == 0:
+        if len(own.compiled) % PLAIN_CALL_STEP == 0:
             copies = [value.copy() if isinstance(value, np.ndarray) else value for value in args]
             with np.errstate(all="ignore"):
                 began = time.thread_time()

@@ -34,12 +34,12 @@ import zmq
 import tactflow
 
 ROOT = Path(__file__).resolve().parents[1]
-CYCLE = 60
+CYCLE_FRAMES = 60
 """Number of pictures in the repeated cycle: one press and release."""
 PICTURES, IDLE = "press.npy", "idle.npy"
-SETTLE, MEASURED = 4.0, 15.0
+SETTLING_SECONDS, MEASURED_SECONDS = 4.0, 15.0
 """Seconds between the first results and the measurement, and duration of the measurement. Chosen by hand."""
-SAMPLE_SECONDS = 5.0
+SAMPLE_INTERVAL_S = 5.0
 """Interval between samples of a process's memory, s. Chosen by hand."""
 PORT = 5750
 """Port of the publisher; the page has the next one."""
@@ -51,8 +51,10 @@ size."""
 def write_pipeline(folder: Path, size: tuple[int, int], source: Mapping[str, Any], **changes: Any) -> None:
     """Write the default pipeline with the endless source, its pictures, and changed keys."""
     for name in (PICTURES, IDLE):
-        scene = tactflow.open_scene(f"{name.removesuffix('.npy')}?frames={CYCLE}")
-        pictures = [cv2.resize(scene.frame(i), size, interpolation=cv2.INTER_AREA) for i in range(CYCLE)]
+        scene = tactflow.open_scene(f"{name.removesuffix('.npy')}?frames={CYCLE_FRAMES}")
+        pictures = [
+            cv2.resize(scene.frame(i), size, interpolation=cv2.INTER_AREA) for i in range(CYCLE_FRAMES)
+        ]
         np.save(folder / name, np.stack(pictures))
     shutil.copy(Path(__file__).with_name("endless.py"), folder)
     document = yaml.safe_load((ROOT / "pipeline.yaml").read_text(encoding="utf-8"))
@@ -160,7 +162,7 @@ def measure(sensors: int, subscribers: int, rate: float, touched: int) -> list[s
         while len(readers.seqs) < sensors:
             fail_if_ended(process, folder)
             time.sleep(0.1)
-        time.sleep(SETTLE)
+        time.sleep(SETTLING_SECONDS)
         readers.ages.clear()
         readers.seqs.clear()
         before, began, used = (
@@ -168,7 +170,7 @@ def measure(sensors: int, subscribers: int, rate: float, touched: int) -> list[s
             time.perf_counter(),
             processor_seconds(process.pid),
         )
-        time.sleep(MEASURED)
+        time.sleep(MEASURED_SECONDS)
         busy = (processor_seconds(process.pid) - used) / (time.perf_counter() - began)
         memory = resources(process.pid)["memory, MB"]
         ages = 1e3 * np.array(readers.ages)
@@ -201,7 +203,7 @@ def soak(frames: int, folder: Path) -> list[dict[str, float]]:
             samples.append(resources(process.pid))
             for old in sorted(folder.glob("recording*.mcap"), key=os.path.getmtime)[:-2]:
                 old.unlink()
-            time.sleep(SAMPLE_SECONDS)
+            time.sleep(SAMPLE_INTERVAL_S)
     if process.returncode:
         fail_if_ended(process, folder)
     with (folder / "results.jsonl").open("rb") as lines:

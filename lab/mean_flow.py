@@ -32,13 +32,13 @@ from tactflow.tools.bench.metrics import filled_polygons, mask_iou
 from tactflow.vision.arrays import Floats
 from tactflow.vision.types import MarkerStatus
 
-NAMED = (
+NAMED_SCENES = (
     *("press", "bright", "cable", "edge", "box", "ring", "screw", "two", "slide", "twist", "strong_shear"),
     *("worn", "dense", "irregular", "tilted", "noisy"),
 )
-FIRST = 1000
+FIRST_SEED = 1000
 """Seed of the first random gel: lower ones were trained on."""
-FOUND = 0.3
+MIN_OVERLAP = 0.3
 """Overlap below which the contact that was found is another one."""
 
 
@@ -141,12 +141,14 @@ def main() -> None:
     args = parser.parse_args()
     logging.disable(logging.WARNING)
     labs = real(args.data)
-    sets = {name: [comparison for seed in args.seeds for comparison in named(name, seed)] for name in NAMED}
+    sets = {
+        name: [comparison for seed in args.seeds for comparison in named(name, seed)] for name in NAMED_SCENES
+    }
     rows = [row(name, frames) for name, frames in (labs | sets).items() if frames]
     outlined = [comparison for frames in labs.values() for comparison in frames]
     known = [comparison for frames in sets.values() for comparison in frames]
     gels: list[Comparison] = []
-    seed, tried = FIRST, 0
+    seed, tried = FIRST_SEED, 0
     while tried < args.scenes:
         scene, seed = wide_scene(seed), seed + 1
         if not scene.contact.any() or len(scene.origin) < 6:
@@ -158,7 +160,7 @@ def main() -> None:
             # No dots were found.
             continue
         gels += [comparison] if comparison else []
-    found = [comparison for comparison in gels if comparison.overlap > FOUND]
+    found = [comparison for comparison in gels if comparison.overlap > MIN_OVERLAP]
     rows += [row("all labs", outlined)] if outlined else []
     rows += [row("all named", known)] if known else []
     rows += [row("random, found", found), row("random, all", gels)]

@@ -26,7 +26,7 @@ from tactflow.system.terminal import table
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers import MarkerTracker
 
-REST: Final = {
+REST_FRAMES: Final = {
     "gels/seu_a/video.mp4": (10, 50),
     "gels/handmade_dots/video.avi": (0, 14),
     "gels/tactip_video": (0, 29),
@@ -129,7 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="recordings named in `REST`")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="recordings named in `REST_FRAMES`")
     data = parser.parse_args().data
     pictures, found = Counter[str](), Counter[str]()
     for kind, picture in without_dots():
@@ -137,7 +137,7 @@ def main() -> None:
         found[kind] += len(find(picture)) > 0
     rows = [(kind, str(pictures[kind]), str(found[kind])) for kind in pictures]
     print(*table([("without dots", "pictures", "with some found"), *rows]), sep="\n")
-    for recording, (first, end) in REST.items() if data else ():
+    for recording, (first, end) in REST_FRAMES.items() if data else ():
         with closing(open_source(str(data / recording))) as reader:
             frames = [to_bgr(read[0], recording) for read in islice(iter(reader.read, None), first, end)]
         spread, own = spread_at_rest(frames)

@@ -26,11 +26,11 @@ from tactflow.vision.arrays import Flags, Floats
 from tactflow.vision.contact.certainty import contact_evidence
 from tactflow.vision.markers import NoMarkersError, detect_markers
 
-WITHIN: Final = 0.2
+MIN_COVERED_SHARE: Final = 0.2
 """Minimum fraction of a region that the outline of its contact covers. Chosen by hand."""
-RIDGE: Final = 0.5
+RIDGE_PENALTY: Final = 0.5
 """Ridge penalty: without it, evidence that separates the places of few labs would get infinite weights."""
-STEPS: Final = (0, 0.25, 0.5, 0.8, 0.9, 0.95, 0.99, 1)
+PROBABILITY_STEPS: Final = (0, 0.25, 0.5, 0.8, 0.9, 0.95, 0.99, 1)
 """Probabilities between which the truth is counted."""
 
 
@@ -40,7 +40,9 @@ def fit_probability(evidence: Floats, is_true: Flags) -> Floats:
     sign = np.where(is_true, -1.0, 1.0)
 
     def loss(weights: Floats) -> float:
-        return float(np.logaddexp(0, sign * (design @ weights)).sum() + RIDGE * (weights[1:] ** 2).sum())
+        return float(
+            np.logaddexp(0, sign * (design @ weights)).sum() + RIDGE_PENALTY * (weights[1:] ** 2).sum()
+        )
 
     return np.asarray(minimize(loss, np.zeros(design.shape[1])).x, np.float64)
 
@@ -58,7 +60,7 @@ def fitted(labs: NDArray[np.str_], evidence: Floats, is_true: Flags) -> Iterator
         odds[~others] = weights[0] + evidence[~others] @ weights[1:]
     probability = 1 / (1 + np.exp(-odds))
     rows, error = [("called", "places", "are so")], 0.0
-    for low, high in pairwise(STEPS):
+    for low, high in pairwise(PROBABILITY_STEPS):
         those = (probability > low) & (probability <= high)
         share = f"{100 * is_true[those].mean():.1f} %" if those.any() else "-"
         rows.append((f"{100 * low:.0f} to {100 * high:.0f} %", str(those.sum()), share))
@@ -81,7 +83,7 @@ def contacts(pipeline: str, labels: Sequence[FrameLabel], data: Path) -> Iterato
         for part in result.contacts:
             x, y = part.hull[0].astype(int)
             labs.append(label.lab)
-            is_contact.append(np.mean(truth[regions == regions[y, x]] > 0) > WITHIN)
+            is_contact.append(np.mean(truth[regions == regions[y, x]] > 0) > MIN_COVERED_SHARE)
         evidence.append(contact_evidence(result.contacts, mask, deviations))
     if not evidence:
         raise SystemExit(f"--data {data}: has none of the labelled recordings")

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import tactflow
-from lab.judges.judge import LARGE
+from lab.judges.judge import MAX_WHOLE_SIDE_PX
 from tactflow import Result
 from tactflow.sources import open_source
 from tactflow.system.terminal import show, table
@@ -37,11 +37,11 @@ SENSORS = (
     ("wedge_grasp", "markerless", "wedge_grasp/*.avi"),
 )
 """Name, pipeline, and recordings in the folder of recordings."""
-FEWEST = 20
+MIN_REST_FRAMES = 20
 """Frames at rest of a sensor."""
-NEAR = 8
+NEIGHBOUR_FRAMES = 8
 """Frames before and after a contact in which the gel is moving already, or still."""
-TOLERANCE = {"dots": 0.05, "center": 0.5, "flow": 0.05}
+TOLERANCES = {"dots": 0.05, "center": 0.5, "flow": 0.05}
 """Largest differences of published numbers, px, as the schema of the message states them."""
 HEADS = ("sensor", "frames", "at rest", "repeated", "glanced at", "far", "cost repeated", "glanced", "whole")
 
@@ -74,7 +74,7 @@ def differing(skipping: Result, fresh: Result) -> set[str]:
         name
         for name in ours.keys() & theirs.keys()
         if ours[name].shape != theirs[name].shape
-        or np.abs(ours[name] - theirs[name]).max(initial=0) > TOLERANCE[name]
+        or np.abs(ours[name] - theirs[name]).max(initial=0) > TOLERANCES[name]
     }
     return names | ({"decision"} if (skipping.contact is None) != (fresh.contact is None) else set())
 
@@ -83,7 +83,7 @@ def run_both(pipeline: str, source: str) -> Pairs:
     """Run a recording."""
     with closing(open_source(source)) as reader:
         first = reader.peek()
-    halved = first is not None and max(first[0].shape) > LARGE
+    halved = first is not None and max(first[0].shape) > MAX_WHOLE_SIDE_PX
     settings = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 2 if halved else 1}
     loaded = tactflow.load(pipeline, source=source, settings=settings)
     pairs: Pairs = []
@@ -108,7 +108,7 @@ class Tally:
     def add(self, pairs: Pairs) -> None:
         """Take in one recording."""
         touched = np.array([fresh.contact is not None for _, fresh in pairs], np.uint8)
-        near = np.convolve(touched, np.ones(2 * NEAR + 1), "same") > 0
+        near = np.convolve(touched, np.ones(2 * NEIGHBOUR_FRAMES + 1), "same") > 0
         before: set[str] = set()
         for (skipping, fresh), touches, is_near in zip(pairs, touched, near, strict=True):
             differs = differing(skipping, fresh)
@@ -181,7 +181,7 @@ def main() -> int:
             if not args.names or any(part in str(source) for part in args.names):
                 pairs = run_both(pipeline, str(source))
                 tally.add(pairs)
-        if tally.counts["rest"] >= FEWEST:
+        if tally.counts["rest"] >= MIN_REST_FRAMES:
             rows.append(tally.row(name))
             bad += tally.counts["late"] + tally.counts["off"]
         if args.plot is not None and pairs:

@@ -27,7 +27,7 @@ from lab.judges.label_file import FrameLabel, load_labels
 from tactflow.system.terminal import show, table
 from tactflow.tools.bench.timing import quiet
 
-SIMULATED = {
+SIMULATED_SOURCES = {
     "press": "default",
     "unmarked": "markerless",
     "bright_dots": "default",
@@ -35,7 +35,7 @@ SIMULATED = {
     "painted": "default",
     "mixed": "default",
 }
-RECORDED = {
+RECORDED_SOURCES = {
     "gels/9dtact_1": "9dtact",
     "gels/digit_fots": "digit",
     "gels/franka_mini/plier-3-0.avi": "mini",
@@ -63,8 +63,8 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="only these sensors")
     args = parser.parse_args()
     quiet()
-    sources = {name: f"sim:{name}?frames=600" for name in SIMULATED}
-    for name in RECORDED if args.data is not None else ():
+    sources = {name: f"sim:{name}?frames=600" for name in SIMULATED_SOURCES}
+    for name in RECORDED_SOURCES if args.data is not None else ():
         if (args.data / name).exists():
             sources[name] = str(args.data / name)
         else:
@@ -84,7 +84,7 @@ def main() -> int:
 
 def _row(name: str, source: str, out: Path, data: Path | None) -> tuple[tuple[str, ...], bool]:
     """A row of the table, and whether the proposal is worse than the pipeline chosen by hand."""
-    by_hand = (SIMULATED | RECORDED)[name]
+    by_hand = (SIMULATED_SOURCES | RECORDED_SOURCES)[name]
     words = ["start", source, "--yes", "--no-run", "--overwrite", "--out", str(out)]
     begin = time.perf_counter()
     done = subprocess.run([sys.executable, "-m", "tactflow", *words], capture_output=True, text=True)
@@ -105,7 +105,7 @@ def _row(name: str, source: str, out: Path, data: Path | None) -> tuple[tuple[st
 
 def _judged(name: str, pipeline: str, data: Path | None) -> Iterator[Judged]:
     """Compare the results of a pipeline with outlines."""
-    if name not in SIMULATED:
+    if name not in SIMULATED_SOURCES:
         assert data is not None
         labels = [label for label in load_labels(OUTLINES) if label.recording == name]
         yield from judge(pipeline, labels, data)

@@ -29,7 +29,7 @@ from tactflow.sim.recipes import SCENES, Recipe
 from tactflow.sim.truth import Truth
 
 FRAMES = 120
-LEAST = 0.1
+MIN_DEPTH_MM = 0.1
 """True depth from which a frame counts, mm."""
 PLACES = {
     "press": (0.99, 0.02),
@@ -39,11 +39,11 @@ PLACES = {
     "block": (0.9, 0.5),
 }
 """Scene -> where it is pressed, parts of the picture's width and height."""
-DEPTH = 36.0
+CUBE_DEPTH_PX = 36.0
 """Of the cube, raw px: its faces of 45 degrees are as wide."""
-BRIGHT = (210.0, 165.0, 145.0)
+REST_GREY = (210.0, 165.0, 145.0)
 """Grey levels, BGR, of the untouched gel of `mini_box`, where up to half of a face is at 255."""
-MIDDLE = (0.2, 0.8)
+MIDDLE_SHARES = (0.2, 0.8)
 """Part of the width of a face that its angle is measured on."""
 
 
@@ -54,7 +54,7 @@ def frames(recipe: Recipe, calibration: Path) -> Iterator[tuple[Result, Truth]]:
     scene, settings = tactflow.open_scene(spec), {"calibration": str(calibration)}
     for result in tactflow.stream("markerless", source=f"sim:{spec}", settings=settings):
         truth = scene.truth(result.seq, result["mapping"])
-        if result.depth is not None and truth.sunk.max() * MM_PER_PX > LEAST:
+        if result.depth is not None and truth.sunk.max() * MM_PER_PX > MIN_DEPTH_MM:
             yield result, truth
 
 
@@ -78,7 +78,7 @@ def cube(level: tuple[float, float, float], calibration: Path) -> str:
     """Angles between the faces of a cube's edge. level : grey levels of the untouched gel, BGR."""
     recipe, usual = SCENES["edge"], light.LIGHTS["photometric"]
     assert recipe.programme is not None
-    edge = partial(shapes.edge, half_length=200.0, slope=1.0, depth=DEPTH)
+    edge = partial(shapes.edge, half_length=200.0, slope=1.0, depth=CUBE_DEPTH_PX)
     programme = replace(recipe.programme, indenters=(edge,), wander=(0.0, 0.0), angles=(0.0, 0.0))
     light.LIGHTS["photometric"] = replace(usual, level=level)
     try:
@@ -102,7 +102,7 @@ def angle(heights: NDArray[np.floating], truth: Truth) -> float:
     across = 2 * (np.arange(len(profile)) - rows.mean()) / truth.depth
     bends = []
     for side in (-1, 1):
-        face = (side * across > MIDDLE[0]) & (side * across < MIDDLE[1])
+        face = (side * across > MIDDLE_SHARES[0]) & (side * across < MIDDLE_SHARES[1])
         slope = np.polyfit(np.flatnonzero(face) * 2 * MM_PER_PX, profile[face], 1)[0]
         bends.append(np.degrees(np.arctan(abs(slope))))
     return float(180 - sum(bends))
@@ -122,7 +122,7 @@ def main() -> None:
         print(f"{name:24} {judge(recipe, calibration)}", flush=True)
         print(f"{name + ' at the border':24} {judge(cut, calibration)}", flush=True)
     usual = light.LIGHTS["photometric"].level
-    for label, level in (("edge of a cube", usual), ("... bright light", BRIGHT)):
+    for label, level in (("edge of a cube", usual), ("... bright light", REST_GREY)):
         print(f"{label:24} {cube(level, calibration)}", flush=True)
 
 

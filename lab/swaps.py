@@ -30,7 +30,7 @@ from lab.judges import judge, judge_dots
 from lab.judges.label_file import load_labels
 from lab.peers import contact, dots, page
 from lab.peers.common import FAILURES, Numbers, Picture, Settings, combinations, failed, one_thread, search
-from lab.peers.dots import FIRST_WIDE, badness, lose
+from lab.peers.dots import FIRST_WIDE_SEED, badness, lose
 from lab.wide import WideScene, wide_scene
 from tactflow import Frame, Markers, Preprocessor, Result
 from tactflow.config.load import load_pipeline
@@ -125,7 +125,7 @@ def detect(node: Node, settings: Settings, pair: Pair) -> Picture | None:
 
 def contact_on_wide(count: int) -> dict[str, Any]:
     """Random gels, two pictures of each: parameters chosen on one half, errors on the other."""
-    found = (wide_scene(seed) for seed in range(FIRST_WIDE, FIRST_WIDE + 2 * count))
+    found = (wide_scene(seed) for seed in range(FIRST_WIDE_SEED, FIRST_WIDE_SEED + 2 * count))
     scenes = [
         (without_dots(scene.reference, scene.picture, not scene.dots.any()), scene.contact) for scene in found
     ]
@@ -193,7 +193,7 @@ def follow(
 
 def dots_on_wide(count: int) -> dict[str, Any]:
     """Random gels with dots, two pictures of each: parameters chosen on one half, errors on the other."""
-    found = (wide_scene(seed) for seed in range(FIRST_WIDE, FIRST_WIDE + 4 * count))
+    found = (wide_scene(seed) for seed in range(FIRST_WIDE_SEED, FIRST_WIDE_SEED + 4 * count))
     scenes = [scene for scene in found if len(scene.origin) >= 9][: 2 * count]
 
     def errors(node: Node, scenes: Sequence[WideScene], settings: Settings) -> Numbers:
@@ -245,7 +245,9 @@ def dragged_gels(data: Path) -> Iterator[tuple[str, list[Picture], list[Any]]]:
     labels = [label for label in load_labels(judge_dots.DOTS) if label.dots]
     for lab, _, picture, sure, uncertain in judge_dots.labelled(labels, data, kinds=[""]):
         height, width = picture.shape[:2]
-        prepare = Preprocessor((width, height), downsample=2 if max(width, height) > judge.LARGE else 1)
+        prepare = Preprocessor(
+            (width, height), downsample=2 if max(width, height) > judge.MAX_WHOLE_SIDE_PX else 1
+        )
         image, marked = (
             prepare(picture).copy(),
             prepare.mapping.to_processed(np.concatenate([sure, uncertain])),

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from tactflow.calibration.presses import Press
 
-HIDDEN = 64
+HIDDEN_NEURONS = 64
 """Neurons of each of three hidden layers."""
-AT_REST = 0.05
+REST_SHARE = 0.05
 """Pixels at rest that are learned, as a part of all."""
 
 Image = NDArray[np.uint8]
@@ -91,14 +91,14 @@ def train(presses: list[Press], rest: Image, ball: float, epochs: int, out: Path
         change = (press.image.astype(np.float32) - rest) / 255
         table = np.dstack([change, columns / width, rows / height]).astype(np.float32)
         inside, slopes = slopes_of_ball(press, ball)
-        calm = (cv2.dilate(press.mask, np.ones((31, 31))) == 0) & (rng.random(inside.shape) < AT_REST)
+        calm = (cv2.dilate(press.mask, np.ones((31, 31))) == 0) & (rng.random(inside.shape) < REST_SHARE)
         samples += [table[inside], table[calm]]
         aims += [slopes, np.zeros((np.count_nonzero(calm), 2), np.float32)]
     x, y = torch.from_numpy(np.concatenate(samples)), torch.from_numpy(np.concatenate(aims))
-    layers: list[nn.Module] = [nn.Linear(5, HIDDEN)]
+    layers: list[nn.Module] = [nn.Linear(5, HIDDEN_NEURONS)]
     for _ in range(2):
-        layers += [nn.ReLU(), nn.Linear(HIDDEN, HIDDEN)]
-    network = nn.Sequential(*layers, nn.ReLU(), nn.Linear(HIDDEN, 2))
+        layers += [nn.ReLU(), nn.Linear(HIDDEN_NEURONS, HIDDEN_NEURONS)]
+    network = nn.Sequential(*layers, nn.ReLU(), nn.Linear(HIDDEN_NEURONS, 2))
     optimiser = torch.optim.Adam(network.parameters(), 2e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, epochs)
     for epoch in range(epochs):

@@ -28,13 +28,13 @@ from tactflow.vision.arrays import Mask
 Plane = NDArray[Any]
 """(H, W) or (H, W, 3) of floats."""
 
-SIDES: Final = (160, 320)
+SIDE_RANGE_PX: Final = (160, 320)
 """px: range of the longer side of a picture."""
-ASPECTS: Final = (1.0, 4 / 3, 4 / 3, 16 / 9)
+ASPECT_RATIOS: Final = (1.0, 4 / 3, 4 / 3, 16 / 9)
 """Longer over shorter side, each as likely."""
-UNTOUCHED: Final = 0.25
+UNTOUCHED_SHARE: Final = 0.25
 """Share of scenes in which nothing touches the gel."""
-LEAST_AREA: Final = 0.002
+MIN_AREA_SHARE: Final = 0.002
 """Part of the picture that a contact covers at least."""
 
 
@@ -76,14 +76,14 @@ def wide_scene(seed: int) -> WideScene:
     (True, True)
     """
     rng = np.random.default_rng(seed)
-    long = int(rng.integers(*SIDES, endpoint=True))
-    short = round(long / rng.choice(ASPECTS))
+    long = int(rng.integers(*SIDE_RANGE_PX, endpoint=True))
+    short = round(long / rng.choice(ASPECT_RATIOS))
     shape = (long, short) if rng.random() < 0.3 else (short, long)
     y, x = (np.indices(shape, np.float32) - np.float32(0.5) * np.reshape(shape, (2, 1, 1))) / np.float32(long)
     rest = _Imprint(np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros((*shape, 2), np.float32))
     pressed = rest
-    if rng.random() >= UNTOUCHED:
-        while pressed.contact.mean() < LEAST_AREA:
+    if rng.random() >= UNTOUCHED_SHARE:
+        while pressed.contact.mean() < MIN_AREA_SHARE:
             pressed = _imprint(rng, x, y)
     return _photographs(rng, x, y, rest, pressed)
 

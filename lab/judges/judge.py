@@ -34,7 +34,7 @@ from tactflow.sources.files import load_image
 from tactflow.streaming import stream
 from tactflow.system.terminal import say, table
 from tactflow.tools.bench import metrics
-from tactflow.tools.bench.score import DIRECTED
+from tactflow.tools.bench.score import MIN_DIRECTED_AXIS_RATIO
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 
@@ -52,14 +52,14 @@ PLAIN: Final = (
     "wedge_grip",
 )
 """Recordings in `OUTLINES` of gels without dots: `default` is replaced by `markerless` there."""
-WORST, ACROSS, TILE = 20, 5, 240
+WORST_COUNT, COLUMN_COUNT, TILE_SIDE_PX = 20, 5, 240
 """The picture of the worst frames: their number, its columns, and the side of a frame, px."""
 GREEN, RED, WHITE, GRAY = (0, 255, 0), (0, 0, 255), (255, 255, 255), 64
-LARGE: Final = 500
+MAX_WHOLE_SIDE_PX: Final = 500
 """Pictures with a longer side, px, are halved, as the documentation advises."""
 Pictures = list[NDArray[np.uint8]]
 """(H, W, 3) BGR each."""
-RESAMPLES: Final = 1000
+RESAMPLE_COUNT: Final = 1000
 """Bootstrap samples: enough for two digits of the bounds."""
 
 
@@ -99,7 +99,7 @@ def compare(label: FrameLabel, result: Result) -> Judged:
     drawn = contact_geometry(truth)
     assert drawn is not None
     angle = np.nan
-    if metrics.aspect_ratio(truth) >= DIRECTED and drawn.angle is not None:
+    if metrics.aspect_ratio(truth) >= MIN_DIRECTED_AXIS_RATIO and drawn.angle is not None:
         angle = 90.0 if contact.angle is None else metrics.angle_error(contact.angle, drawn.angle)
     return replace(
         judged,
@@ -188,12 +188,12 @@ def draw_worst(
         if result is not None and result.image is not None:
             overlap = compare(label, result).hull
             worst.append((overlap, number, _tile(label, result, f"{label.lab} {overlap:.2f}", blank)))
-            worst = sorted(worst, key=lambda one: one[:2])[:WORST]
+            worst = sorted(worst, key=lambda one: one[:2])[:WORST_COUNT]
     if not worst:
         raise ConfigError(f"--picture: {data} has no recording with an outlined frame")
     tiles = [tile for *_, tile in worst]
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % ACROSS)
-    rows = [np.hstack(tiles[first : first + ACROSS]) for first in range(0, len(tiles), ACROSS)]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMN_COUNT)
+    rows = [np.hstack(tiles[first : first + COLUMN_COUNT]) for first in range(0, len(tiles), COLUMN_COUNT)]
     try:
         written = cv2.imwrite(str(path), np.vstack(rows))
     except cv2.error:
@@ -203,18 +203,18 @@ def draw_worst(
 
 
 def _tile(label: FrameLabel, result: Result, text: str, blank: bool) -> NDArray[np.uint8]:
-    """(TILE, TILE, 3) uint8: a frame, or gray instead, with its outlines and its hull."""
+    """(TILE_SIDE_PX, TILE_SIDE_PX, 3) uint8: a frame, or gray instead, with its outlines and its hull."""
     image, mapping = result.image, result["mapping"]
     assert image is not None
     image = np.full_like(image, GRAY) if blank else image
-    factor = TILE / max(image.shape[:2])
+    factor = TILE_SIDE_PX / max(image.shape[:2])
     small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     found = [] if result.contact is None else [result.contact.hull]
     for polygons, colour in ((found, RED), (_outlines(label, mapping), GREEN)):
         corners = [np.rint(np.asarray(polygon) * factor).astype(np.int32) for polygon in polygons]
         cv2.polylines(small, corners, True, colour)
     cv2.putText(small, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, WHITE, 1, cv2.LINE_AA)
-    tile = np.zeros((TILE, TILE, 3), np.uint8)
+    tile = np.zeros((TILE_SIDE_PX, TILE_SIDE_PX, 3), np.uint8)
     tile[: small.shape[0], : small.shape[1]] = small
     return tile
 
@@ -253,7 +253,10 @@ def _results(
         size = max(first[0].shape) if first is not None else 0
     else:
         size = max(source[0].shape)
-    geometry = {"stages.preprocess.rotate": 0, "stages.preprocess.downsample": 2 if size > LARGE else 1}
+    geometry = {
+        "stages.preprocess.rotate": 0,
+        "stages.preprocess.downsample": 2 if size > MAX_WHOLE_SIDE_PX else 1,
+    }
     settings = geometry | dict(changed)
     running = stream(pipeline, source=source, settings=settings, max_frames=last + 1, images=images)
     with closing(running) as results:
@@ -318,7 +321,7 @@ def interval(judged: Sequence[Judged], confidence: float = 0.95) -> tuple[float,
     if not groups:
         return np.nan, np.nan
     overlaps, generator = list(groups.values()), np.random.default_rng(0)
-    drawn = generator.integers(len(overlaps), size=(RESAMPLES, len(overlaps)))
+    drawn = generator.integers(len(overlaps), size=(RESAMPLE_COUNT, len(overlaps)))
     medians = [np.median(np.concatenate([overlaps[index] for index in chosen])) for chosen in drawn]
     low, high = np.quantile(medians, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
@@ -381,7 +384,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--labels", type=Path, default=OUTLINES, metavar="FILE", help="default: those of the package"
     )
     parser.add_argument(
-        "--picture", type=Path, metavar="FILE", help=f"draw the {WORST} worst frames of the first pipeline"
+        "--picture",
+        type=Path,
+        metavar="FILE",
+        help=f"draw the {WORST_COUNT} worst frames of the first pipeline",
     )
     parser.add_argument(
         "--blank", action="store_true", help="leave the frames out of --picture, as their licence may ask for"

@@ -40,10 +40,10 @@ from tactflow.vision.markers.lattice import nearest
 from tactflow.vision.types import MarkerStatus
 
 DOTS: Final = Path(__file__).with_name("dots.json")
-TOLERANCE: Final = 0.3
+TOLERANCE_SPACINGS: Final = 0.3
 """Distance of a dot from its mark, as a fraction of the distance between neighbours: a person's click and a
 centroid differ by so much where a glint covers half a dot, and no other dot is as near."""
-BORDER: Final = 0.12
+BORDER_SPACINGS: Final = 0.12
 """Distance from the border of the picture, as a fraction of the distance between neighbours, within which a
 dot is uncertain: most dots have a radius of 0.12 to 0.3 of it, so the border cuts off half of such a dot."""
 Picture = NDArray[np.uint8]
@@ -100,12 +100,12 @@ def compare(lab: str, found: Floats, dots: Floats, uncertain: Floats, size: tupl
     """Compare detections (N, 2) with the marked dots, by the assignment with the least sum of distances.
 
     dots, uncertain : (M, 2), (K, 2), px. size : of the picture (width, height); dots nearer to its border
-    than `BORDER` are uncertain, too.
+    than `BORDER_SPACINGS` are uncertain, too.
     """
     if not len(dots):
         return FoundDots(lab, 0, 0, len(found))
     which, inner = assign(found, dots, uncertain, size)
-    required = _from_border(dots, size) > BORDER * _pitch(dots)
+    required = _from_border(dots, size) > BORDER_SPACINGS * _pitch(dots)
     seen = np.isin(np.arange(len(dots)), which)
     false = np.count_nonzero((which < 0) & inner)
     return FoundDots(lab, int(required.sum()), int((required & seen).sum()), int(false))
@@ -116,14 +116,14 @@ def assign(found: Floats, dots: Floats, uncertain: Floats, size: tuple[int, int]
     enough from the border to be judged. Arguments as of `compare`."""
     marked, pitch = np.concatenate([dots, uncertain]), _pitch(dots)
     apart = nearest(dots, 1)[0][:, 0] if len(dots) > 1 else np.full(1, pitch)
-    reach = TOLERANCE * np.concatenate([apart, np.full(len(uncertain), pitch)])
+    reach = TOLERANCE_SPACINGS * np.concatenate([apart, np.full(len(uncertain), pitch)])
     away = np.linalg.norm(found[:, None] - marked, axis=2)
     # A pair beyond reach costs as much as no pair.
     rows, columns = linear_sum_assignment(np.minimum(away / reach, 1.0))
     paired = away[rows, columns] < reach[columns]
     which = np.full(len(found), -1, np.int64)
     which[rows[paired]] = columns[paired]
-    return which, np.asarray(_from_border(found, size) > BORDER * pitch)
+    return which, np.asarray(_from_border(found, size) > BORDER_SPACINGS * pitch)
 
 
 def _pitch(dots: Floats) -> float:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tactflow import Preprocessor
 from tactflow.tools.bench.quantities import Tally
 from tactflow.tools.bench.scenes import Case, rendered
-from tactflow.tools.bench.timing import BLOCK
+from tactflow.tools.bench.timing import TURN_FRAMES
 
 Picture = NDArray[np.uint8]
 Numbers = dict[str, float]
@@ -75,16 +75,16 @@ class Calls:
 
 
 def turns(methods: Mapping[str, Any]) -> Iterator[tuple[str, int, Any, float]]:
-    """(name, index of the frame, answer, s) of each frame; methods take turns of `BLOCK` frames (A B A B)."""
+    """(name, index of the frame, answer, s) of each frame; methods take turns of `TURN_FRAMES` (A B A B)."""
     index = dict.fromkeys(methods, 0)
     running = list(methods)
     while running:
         for name in list(running):
-            answers = methods[name].block(BLOCK)
+            answers = methods[name].block(TURN_FRAMES)
             for answer, seconds in answers:
                 yield name, index[name], answer, seconds
                 index[name] += 1
-            if len(answers) < BLOCK:
+            if len(answers) < TURN_FRAMES:
                 running.remove(name)
 
 

@@ -30,7 +30,7 @@ from lab.peers.common import (
     search,
     turns,
 )
-from lab.peers.dots import FIRST_WIDE
+from lab.peers.dots import FIRST_WIDE_SEED
 from lab.wide import WideScene, wide_scene
 from tactflow import Frame, Result
 from tactflow.classic.functions import difference, mask_marker
@@ -44,7 +44,7 @@ from tactflow.tools.bench.score import add_decision, add_geometry, add_mask
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 
-AS_THEY_ARE: Final = {
+UNCHANGED_PICTURES: Final = {
     "stages.preprocess.rotate": 0,
     "stages.preprocess.downsample": 1,
     "stages.capture.settle": 0,
@@ -61,7 +61,7 @@ OURS: Final = "tactflow"
 
 def tactflow_contact(pictures: Sequence[Picture], pipeline: str) -> list[Picture | None]:
     """tactflow: pictures of one recording; the first shows the untouched gel."""
-    results = tactflow.stream(pipeline, source=pictures, settings=AS_THEY_ARE)
+    results = tactflow.stream(pipeline, source=pictures, settings=UNCHANGED_PICTURES)
     return [result.contact_mask if result.contact else None for result in results]
 
 
@@ -137,7 +137,7 @@ CHOICES: Final[Mapping[str, Mapping[str, Sequence[Any]]]] = {
     "pytouch": {"contour_threshold": (100, 20), "scale": (1.0, 2.0)},
     "OpenCV difference": {"threshold": (15, 8, 25, 40), "blur": (9, 5, 21)},
 }
-AT_REST: Final = 6
+REST_RECORDING_COUNT: Final = 6
 """Recordings of a lab without an outline that are judged: all 48 of a gripper would take half of the time."""
 ADAPTERS: Final = {OURS: tactflow_contact, **PEERS}
 
@@ -152,7 +152,9 @@ class Ours:
     """
 
     def __init__(self, pipeline: str, pictures: Sequence[Picture]) -> None:
-        self._running = LockstepPipeline(tactflow.load(pipeline, source=pictures, settings=AS_THEY_ARE))
+        self._running = LockstepPipeline(
+            tactflow.load(pipeline, source=pictures, settings=UNCHANGED_PICTURES)
+        )
 
     def block(self, frames: int) -> list[tuple[Any, float]]:
         """Masks of the next pictures, None without a contact, and times, s."""
@@ -207,7 +209,7 @@ def follow(
 
 def on_wide(count: int, peers: Sequence[str]) -> dict[str, Any]:
     """Random sensors, two pictures of each: one setting for all, found on one half, errors on the other."""
-    scenes = [wide_scene(seed) for seed in range(FIRST_WIDE, FIRST_WIDE + 2 * count)]
+    scenes = [wide_scene(seed) for seed in range(FIRST_WIDE_SEED, FIRST_WIDE_SEED + 2 * count)]
 
     def errors(scenes: Sequence[WideScene], name: str, settings: Settings) -> Numbers:
         tally = Tally()
@@ -291,7 +293,7 @@ def chosen_elsewhere(candidates: Mapping[str, Sequence[judge.Judged]]) -> list[j
 
 
 def chosen_labels(data: Path) -> list[FrameLabel]:
-    """First labels of recordings that are there; of those without an outline, `AT_REST` a lab."""
+    """First labels of recordings at hand; of those without an outline, `REST_RECORDING_COUNT` a lab."""
     labels = [
         label for label in load_labels(judge.OUTLINES) if label.round == 1 and label.contact is not None
     ]
@@ -300,7 +302,7 @@ def chosen_labels(data: Path) -> list[FrameLabel]:
     kept = set(outlined)
     for lab in sorted({label.lab for label in labels}):
         others = sorted({label.recording for label in labels if label.lab == lab} - outlined)
-        kept.update(others[:AT_REST])
+        kept.update(others[:REST_RECORDING_COUNT])
     return [label for label in labels if label.recording in kept]
 
 
@@ -325,7 +327,7 @@ def pair(label: FrameLabel, data: Path) -> tuple[Picture, Picture, PixelMapping]
             pictures.append(_video(path)[int(index)])
     height, width = pictures[0].shape[:2]
     preprocess = tactflow.Preprocessor(
-        (width, height), downsample=2 if max(width, height) > judge.LARGE else 1
+        (width, height), downsample=2 if max(width, height) > judge.MAX_WHOLE_SIDE_PX else 1
     )
     reference, picture = (preprocess(image).copy() for image in pictures)
     return reference, picture, preprocess.mapping

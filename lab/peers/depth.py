@@ -16,7 +16,7 @@ from lab.peers.common import Numbers, Picture
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Press, Session
 from tactflow.calibration.samples import reach
-from tactflow.tools.bench.timing import BLOCK
+from tactflow.tools.bench.timing import TURN_FRAMES
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Scale
 
@@ -25,7 +25,7 @@ Answer = tuple[Plane, Plane]
 """Slopes (H, W, 2) of the depth to the right and down, mm per mm, and depth (H, W), mm."""
 EPOCHS: Final = 60
 """Of the network: 120 instead of 40 gained 0.24 degrees on `mini_ball`."""
-PIXELS: Final = 60_000
+MAX_PIXELS: Final = 60_000
 """That the network learns from at most, so that a set takes seconds."""
 
 
@@ -116,7 +116,7 @@ def train(features: NDArray[np.float32], angles: Plane, rate: float) -> Any:
     ]
     network = nn.Sequential(*layers, nn.Linear(sizes[-1], 2))
     inputs, targets = torch.from_numpy(features), torch.from_numpy(angles.astype(np.float32))
-    some = torch.randperm(len(inputs))[:PIXELS]
+    some = torch.randperm(len(inputs))[:MAX_PIXELS]
     inputs, targets = inputs[some], targets[some]
     optimizer = torch.optim.Adam(network.parameters(), rate)
     schedule = torch.optim.lr_scheduler.StepLR(optimizer, EPOCHS // 10, 0.5)
@@ -259,9 +259,9 @@ def _tried(
 def _times(methods: Mapping[str, Any], presses: Sequence[Press]) -> Numbers:
     """Median CPU time of a press, ms; methods take turns."""
     times: dict[str, list[float]] = {name: [] for name in methods}
-    for first in range(0, len(presses), BLOCK):
+    for first in range(0, len(presses), TURN_FRAMES):
         for name, method in methods.items():
-            for press in presses[first : first + BLOCK]:
+            for press in presses[first : first + TURN_FRAMES]:
                 began = time.thread_time()
                 method(press)
                 times[name].append(time.thread_time() - began)

@@ -37,9 +37,9 @@ from tactflow.tools.bench.scenes import Case
 from tactflow.tools.bench.score import MarkerScore
 from tactflow.vision.arrays import Floats
 
-FIRST_WIDE: Final = 2_000_000
+FIRST_WIDE_SEED: Final = 2_000_000
 """Seed of the first random scene here."""
-MEMORY: Final = 20
+MEMORY_FRAMES: Final = 20
 """Frames for which trackpy remembers a particle that it does not see."""
 
 
@@ -70,7 +70,7 @@ class Trackpy:
         reach = settings.pop("search_range")
         self.settings, self.picture = settings, reference
         self.links = trackpy.link_iter(
-            self.positions(), reach, memory=MEMORY, adaptive_stop=reach / 4, adaptive_step=0.9
+            self.positions(), reach, memory=MEMORY_FRAMES, adaptive_stop=reach / 4, adaptive_step=0.9
         )
         next(self.links)
         self.origin = self.position = self.found
@@ -217,7 +217,7 @@ def on_named(cases: Sequence[Case], folder: Path, methods: Sequence[str]) -> dic
 
 def on_wide(count: int, methods: Sequence[str]) -> dict[str, Any]:
     """Random sensors, two pictures of each: one setting for all, found on one half, errors on the other."""
-    found = (wide_scene(seed) for seed in range(FIRST_WIDE, FIRST_WIDE + 4 * count))
+    found = (wide_scene(seed) for seed in range(FIRST_WIDE_SEED, FIRST_WIDE_SEED + 4 * count))
     scenes = [scene for scene in found if len(scene.origin) >= 9][: 2 * count]
 
     def errors(method: str, scenes: Sequence[WideScene], settings: Settings) -> Numbers:

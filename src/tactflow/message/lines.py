@@ -126,7 +126,7 @@ class LineStream:
         return sys.platform == "win32" or bool(select.select([], [self._descriptor], [], seconds)[1])
 
     def close(self) -> None:
-        """Write the rest and close the file; wait `LINGER_SECONDS` at most if the run does not wait for the reader.
+        """Write the rest and close the file, within `LINGER_SECONDS` if the run does not wait for the reader.
 
         Raises StageError also if the reader did not take all lines of a recording.
         """

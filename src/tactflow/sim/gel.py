@@ -1,13 +1,14 @@
 """The gel: contact region, surface and displacement under an indenter.
 
 Contact is where the indenter lies below the surface of the untouched gel. It need not touch the gel there,
-since a soft surface sinks: when a ball of radius R is pressed by d into a deep gel, that region has a radius
-of sqrt(2 R d), but the gel clings to the ball only up to sqrt(R d), where the surface has sunk by d / 2
-(Hertz); a thin layer on a plate sinks only where it is touched, so the two regions are the same (Johnson,
-Contact Mechanics, 1985, ch. 4 and 5.8). A sensor's gel is in between: here it sinks by s = SINK_IN_RATIO d where
-it leaves the indenter, for every shape. Deeper parts have the surface of the indenter and carry the force.
-Around them, the surface decays as s exp(RIM_SLOPE_RATIO (reached / s - 1)), a closed form of the Gaussian
-pyramid of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight Tactile Sensors", RA-L 2022).
+since a soft surface sinks: when a ball of radius R is pressed by d into a deep gel, that region has a
+radius of sqrt(2 R d), but the gel clings to the ball only up to sqrt(R d), where the surface has sunk by d
+/ 2 (Hertz); a thin layer on a plate sinks only where it is touched, so the two regions are the same
+(Johnson, Contact Mechanics, 1985, ch. 4 and 5.8). A sensor's gel is in between: here it sinks by s =
+SINK_IN_RATIO d where it leaves the indenter, for every shape. Deeper parts have the surface of the indenter
+and carry the force. Around them, the surface decays as s exp(RIM_SLOPE_RATIO (reached / s - 1)), a closed
+form of the Gaussian pyramid of Taxim (Si and Yuan, "Taxim: An Example-based Simulation Model for GelSight
+Tactile Sensors", RA-L 2022).
 """
 
 from __future__ import annotations

@@ -100,9 +100,9 @@ def draw(
     """Paint markers onto a padded canvas, in place.
 
     canvas : (H + 2 half, W + 2 half, 3) int16, grey levels times `FIXED_POINT_STEPS`. centers : (N, 2)
-    positions without the padding, px. strength : (N,) opacity, 0 to 1. radii : (N,), px. half : see `half_patch`.
-    bright : grey level of bright markers; None for dark ones. deform : (N, 2, 2), Jacobian from the image to
-    the gel; None for the identity.
+    positions without the padding, px. strength : (N,) opacity, 0 to 1. radii : (N,), px. half : see
+    `half_patch`. bright : grey level of bright markers; None for dark ones. deform : (N, 2, 2), Jacobian
+    from the image to the gel; None for the identity.
     """
     padded_height, padded_width = canvas.shape[:2]
     anchor = np.rint(centers).astype(np.int64)

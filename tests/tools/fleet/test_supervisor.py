@@ -12,10 +12,10 @@ import pytest
 
 from tactflow.system.signals import ending_handled
 from tactflow.tools.fleet.supervisor import (
-    FIRST_PAUSE,
-    GIVE_UP_AFTER,
-    GOOD_RUN,
-    LONGEST_PAUSE,
+    FIRST_PAUSE_S,
+    GOOD_RUN_S,
+    MAX_FAILURES,
+    MAX_PAUSE_S,
     Member,
     Supervisor,
 )
@@ -85,7 +85,7 @@ def test_the_pause_before_a_new_start_doubles_until_the_sensor_is_given_up(
     assert machine.run() == end
     starts = machine.starts["left"]
     gaps = [later - earlier for earlier, later in pairwise(starts)]
-    expected = [min(FIRST_PAUSE * 2**number, LONGEST_PAUSE) for number in range(GIVE_UP_AFTER)]
+    expected = [min(FIRST_PAUSE_S * 2**number, MAX_PAUSE_S) for number in range(MAX_FAILURES)]
     assert gaps == pytest.approx(expected, abs=0.2)
     said = capsys.readouterr().err
     assert "given up" in said
@@ -94,10 +94,10 @@ def test_the_pause_before_a_new_start_doubles_until_the_sensor_is_given_up(
 
 
 def test_after_a_good_run_the_first_pause_comes_again() -> None:
-    machine = Machine({"left": [(0.0, 3), (0.0, 3), (GOOD_RUN + 1, 3), (1.0, 0)]})
+    machine = Machine({"left": [(0.0, 3), (0.0, 3), (GOOD_RUN_S + 1, 3), (1.0, 0)]})
     assert machine.run() == 0
     starts = machine.starts["left"]
-    assert starts[3] - starts[2] == pytest.approx(GOOD_RUN + 1 + FIRST_PAUSE, abs=0.2)
+    assert starts[3] - starts[2] == pytest.approx(GOOD_RUN_S + 1 + FIRST_PAUSE_S, abs=0.2)
 
 
 def test_a_mistake_in_the_command_line_ends_the_other_sensors() -> None:

@@ -58,7 +58,7 @@ def test_the_choice_keeps_the_budget_in_truth_and_nothing_cheaper_does(
 ) -> None:
     monkeypatch.setattr(space, "AXES", FIELD)
     monkeypatch.setattr(space, "swaps", lambda *_: [])
-    monkeypatch.setattr(search, "SIMULATED", (Case("press", 24),))
+    monkeypatch.setattr(search, "SIMULATED_CASES", (Case("press", 24),))
     path = Fitted(SMALL, Case("press", 30), tmp_path, 3).path
     budget = 1.5
     words = ("tune", "default", "--source", str(path), "--max-error", str(budget), "--page", "tuned.html")
@@ -94,7 +94,7 @@ def test_swaps_are_found_by_their_ports_and_keep_the_keys_of_the_file() -> None:
 def test_only_swaps_that_gain_something_are_measured_in_full(
     recorded: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(search, "SIMULATED", (Case("press", 24),))
+    monkeypatch.setattr(search, "SIMULATED_CASES", (Case("press", 24),))
     monkeypatch.setattr(search, "FIRST_LOOK", Case("press", 12))
     original = Trial(ORIGINAL, {}, tactflow.load("default"))
     slower_and_worse = tactflow.load("default", settings={"stages.tracker": {"use": "classic_tracker"}})
@@ -195,7 +195,7 @@ def test_the_original_is_one_row_and_stays_where_flow_cannot_be_judged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(space, "AXES", FIELD)
-    monkeypatch.setattr(search, "SIMULATED", (Case("press", 24),))
+    monkeypatch.setattr(search, "SIMULATED_CASES", (Case("press", 24),))
     # So large a pitch that no dot lies within the contact.
     look = Look((320, 240), "markers=3x2&pitch=260", noise=2.0)
     monkeypatch.setattr(search, "fit", lambda _: look)

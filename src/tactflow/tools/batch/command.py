@@ -33,7 +33,7 @@ from tactflow.tools.batch.store import Format, Outcome, Store
 from tactflow.tools.batch.work import Request, resolved
 from tactflow.tools.batch.workers import DaskCluster, LocalProcesses
 
-LONGEST = 200
+MAX_MESSAGE_LETTERS = 200
 """Letters of a message in a list of many: two lines of a terminal."""
 
 
@@ -145,8 +145,9 @@ def _progress(total: int, tell: Callable[[str], None], *, shown: bool) -> Iterat
             failed += outcome.status != "done"
             frames += outcome.frames
             if outcome.status != "done":
-                reason = (outcome.error or "").partition("\n")[0]
-                tell(f"failed: {outcome.name}: {textwrap.shorten(reason, LONGEST, placeholder=' ...')}")
+                first_line = (outcome.error or "").partition("\n")[0]
+                reason = textwrap.shorten(first_line, MAX_MESSAGE_LETTERS, placeholder=" ...")
+                tell(f"failed: {outcome.name}: {reason}")
             update(completed=done, description=f"{done} of {total}, {failed} failed, {frames} frames")
 
         yield on_outcome

@@ -18,7 +18,7 @@ from tactflow.system.extras import missing
 from tactflow.system.files import completed
 from tactflow.tools.batch.recordings import Recording
 from tactflow.tools.batch.store import Format, Outcome, Store
-from tactflow.tools.batch.summary import TRACED
+from tactflow.tools.batch.summary import TRACE_LABELS
 from tactflow.tools.page import Html, Section, marked, page, plot, series, table
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ COLUMNS = (
     *("largest contact, px²", "result", "over time", "largest contacts, or what went wrong"),
 )
 """Headings of the page."""
-TRACE_WIDTH = 240
+TRACE_WIDTH_PX = 240
 """Width of the plot of a recording, CSS pixels."""
 _TYPES = {"int": "int64", "float": "float64"}
 """Python type -> Arrow type; all others are strings."""
@@ -96,8 +96,8 @@ def write_page(store: Store, runs: Runs, title: str) -> Path:
 
 def _trace(outcome: Outcome) -> Html:
     """A small plot of what the recording has of area, flow and force over time."""
-    values = {name: np.array(outcome.trace.get(name, ()), np.float64) for name in ("t", *TRACED)}
-    shown = [name for name in TRACED if np.isfinite(values[name]).any()]
+    values = {name: np.array(outcome.trace.get(name, ()), np.float64) for name in ("t", *TRACE_LABELS)}
+    shown = [name for name in TRACE_LABELS if np.isfinite(values[name]).any()]
     if not shown:
         return Html("")
 
@@ -105,10 +105,10 @@ def _trace(outcome: Outcome) -> Html:
         for index, name in enumerate(shown):
             axes = figure.add_subplot(len(shown), 1, index + 1)
             axes.plot(values["t"], values[name], color=series(index), linewidth=1)
-            axes.set_ylabel(TRACED[name], fontsize=7)
+            axes.set_ylabel(TRACE_LABELS[name], fontsize=7)
             axes.tick_params(labelsize=7, labelbottom=name == shown[-1])
 
-    return plot(draw, width=TRACE_WIDTH, height=60 * len(shown) + 20)
+    return plot(draw, width=TRACE_WIDTH_PX, height=60 * len(shown) + 20)
 
 
 def _cells(store: Store, recording: Recording, outcome: Outcome) -> Iterator[str]:

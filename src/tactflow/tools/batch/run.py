@@ -18,7 +18,7 @@ from tactflow.tools.batch.workers import SCHEDULER_GONE, Workers
 
 POLL_SECONDS = 0.2
 """Interval at which signals are checked, s: too short for people to notice."""
-MAX_DEATHS = 3
+MAX_WORKER_DEATHS = 3
 """Recordings in a row that may kill their worker; more suggest that no worker can run here."""
 
 
@@ -172,6 +172,6 @@ class Batch:
         """Reason to start no more recordings after this outcome, or None."""
         if outcome.disk_full:
             return "the disk is full; free some space, then run again: finished recordings are kept"
-        if self._deaths == MAX_DEATHS:
-            return f"{MAX_DEATHS} recordings in a row killed their workers; try fewer --workers"
+        if self._deaths == MAX_WORKER_DEATHS:
+            return f"{MAX_WORKER_DEATHS} recordings in a row killed their workers; try fewer --workers"
         return None

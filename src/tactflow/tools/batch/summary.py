@@ -13,15 +13,15 @@ from tactflow.message.result import Result
 
 MAX_PICTURES = 4
 """Pictures per recording: they fit next to each other."""
-TRACED = {"area": "area, px²", "flow": "flow, px", "force": "force, N"}
+TRACE_LABELS = {"area": "area, px²", "flow": "flow, px", "force": "force, N"}
 """What is drawn over time for each recording: name -> label."""
 TRACE_POINTS = 150
 """Points of such a curve, at least, in a long recording; twice as many at most."""
-PICTURE_SIDE = 240
+PICTURE_SIDE_PX = 240
 """Longer side of a picture, px."""
 PAPER_GREY = 45
 """Grey level of the picture on which results without one are drawn."""
-_QUALITY = 70
+_JPEG_QUALITY = 70
 """JPEG quality of a picture, 1 to 100: about 7 kB. Chosen by hand."""
 
 
@@ -36,11 +36,11 @@ class Picture(NamedTuple):
 class Trace:
     """A few quantities of a run, thinned out evenly so that they stay few.
 
-    values : name of `TRACED` -> a number or None for each kept frame; "t" -> its time, s.
+    values : name of `TRACE_LABELS` -> a number or None for each kept frame; "t" -> its time, s.
     """
 
     def __init__(self) -> None:
-        self.values: dict[str, list[float | None]] = {name: [] for name in ("t", *TRACED)}
+        self.values: dict[str, list[float | None]] = {name: [] for name in ("t", *TRACE_LABELS)}
         self._stride, self._seen = 1, 0
 
     def add(self, result: Result) -> None:
@@ -122,6 +122,6 @@ def _jpeg(result: Result) -> bytes:
         image = np.full((max(1, height), max(1, width), 3), PAPER_GREY, np.uint8)
     annotate = Annotator(text=False)
     drawn = annotate(image, contact=result.contact, flow=result.flow, markers=result.markers)
-    scale = min(1.0, PICTURE_SIDE / max(drawn.shape[:2]))
+    scale = min(1.0, PICTURE_SIDE_PX / max(drawn.shape[:2]))
     small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return encode_jpeg(np.asarray(small, np.uint8), _QUALITY)
+    return encode_jpeg(np.asarray(small, np.uint8), _JPEG_QUALITY)

@@ -32,7 +32,7 @@ from tactflow.tools.batch.recordings import Recording
 from tactflow.tools.batch.store import Format, Outcome, Store, file_name, fingerprint, remove
 from tactflow.tools.batch.summary import Summary
 
-_SRC = Mark("recording", 0, 0)
+_SOURCE_POSITION = Mark("recording", 0, 0)
 """Position of the source in error messages: it is not in the pipeline file."""
 _MAX_WARNINGS = 5
 """Warnings kept per recording; further ones are mostly repetitions."""
@@ -231,7 +231,7 @@ def _pipeline_for(task: Task, path: Path) -> Pipeline:
     settings = {**pipeline.settings, "stages": stages, "sinks": {sink.component.name: {}}}
     nodes = {
         **pipeline.nodes,
-        source.id: replace(source, params=source.params.changed(**input_), mark=_SRC),
+        source.id: replace(source, params=source.params.changed(**input_), mark=_SOURCE_POSITION),
         sink.id: replace(sink, params=params),
     }
     return replace(pipeline, nodes=nodes, settings=settings)

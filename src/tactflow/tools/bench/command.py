@@ -14,7 +14,7 @@ from tactflow.tools.bench.results import CLASSIC, load_errors, regressions
 from tactflow.tools.bench.run import DEFAULT, MARKERLESS, run_bench
 from tactflow.tools.bench.tables import lines
 
-WORSE = 3
+WORSE_EXIT_CODE = 3
 """Exit code when an error has increased since the run of `--against`."""
 
 
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     worse = regressions(result, stored, scenes)
     verdict = f"{len(worse)} errors have" if worse else "no error has"
     say("\n".join([f"tactflow: {verdict} increased since {args.against}", *worse]))
-    return WORSE if worse else 0
+    return WORSE_EXIT_CODE if worse else 0
 
 
 def packaged_files() -> dict[str, Path]:

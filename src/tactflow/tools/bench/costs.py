@@ -17,7 +17,7 @@ from tactflow.engine.graph import Node, Pipeline
 from tactflow.tools.bench.lockstep import LockstepPipeline, TimedResult, on_recording
 from tactflow.tools.bench.timing import quiet
 
-KINDS: Final = ("contact", "first touch", "in full, untouched", "glanced at", "repeated")
+FRAME_KINDS: Final = ("contact", "first touch", "in full, untouched", "glanced at", "repeated")
 """What was done with a frame."""
 ENGINE: Final = "engine, message"
 """What is left of a frame's time when that of its stages is taken away."""
@@ -25,7 +25,7 @@ ENGINE: Final = "engine, message"
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a run. t : s. kind : one of `KINDS`. cpu_ms, stage_ms : CPU time, whole and of each stage.
+    """One frame of a run. t : s. kind : one of `FRAME_KINDS`. cpu_ms, stage_ms : CPU time, total and per stage.
     area : of the contact, px^2, 0 without. shift : largest displacement of a dot, px; NaN without dots."""
 
     t: float
@@ -45,7 +45,7 @@ class Costs:
     def by_stage(self) -> dict[str, dict[str, float]]:
         """Kind of frame -> stage -> median CPU time, ms; `ENGINE` has what is left of the whole frame's."""
         found: dict[str, dict[str, float]] = {}
-        for kind in KINDS:
+        for kind in FRAME_KINDS:
             steps = [step for step in self.steps if step.kind == kind]
             if steps:
                 names = list(dict.fromkeys(name for step in steps for name in step.stage_ms))
@@ -116,11 +116,11 @@ def measure_costs(pipelines: Mapping[str, Pipeline], recording: Path | str) -> d
 def _step(result: TimedResult, stage_ms: Mapping[str, float], touched: bool) -> Step:
     markers, contact, reasons = result.markers, result.contact, result.skipped.values()
     if contact is not None:
-        kind = KINDS[0] if touched else KINDS[1]
+        kind = FRAME_KINDS[0] if touched else FRAME_KINDS[1]
     elif "at_rest" in reasons:
-        kind = KINDS[3]
+        kind = FRAME_KINDS[3]
     else:
-        kind = KINDS[4] if "unchanged" in reasons else KINDS[2]
+        kind = FRAME_KINDS[4] if "unchanged" in reasons else FRAME_KINDS[2]
     shift = np.nan if markers is None else float(np.abs(markers.position - markers.origin).max(initial=0))
     area = 0.0 if contact is None else float(contact.area)
     return Step(result.t, kind, 1e3 * result.cpu_s, stage_ms, area, shift)

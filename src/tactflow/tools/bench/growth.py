@@ -20,17 +20,17 @@ from tactflow.sim import open_scene
 from tactflow.tools.bench.lockstep import LockstepPipeline, TimedResult, on_recording
 from tactflow.tools.bench.timing import quiet
 
-SIZES: Final = ((160, 120), (320, 240), (640, 480), (800, 600), (1280, 960), (1600, 1200))
+PICTURE_SIZES_PX: Final = ((160, 120), (320, 240), (640, 480), (800, 600), (1280, 960), (1600, 1200))
 """Width and height of raw pictures, px."""
-GRIDS: Final = ("3x3", "6x5", "10x8", "20x15", "40x30", "52x39")
+DOT_GRIDS: Final = ("3x3", "6x5", "10x8", "20x15", "40x30", "52x39")
 """Columns and rows of dots."""
-CONTACTS: Final = (0, 1, 2, 4, 6, 8)
-SENSORS: Final = (1, 2, 4, 8, 16, 32)
-LENGTHS: Final = (100, 300, 1000, 3000)
+CONTACT_COUNTS: Final = (0, 1, 2, 4, 6, 8)
+SENSOR_COUNTS: Final = (1, 2, 4, 8, 16, 32)
+RUN_LENGTHS_FRAMES: Final = (100, 300, 1000, 3000)
 """Frames of a run."""
-FRAMES: Final = 24
+RUN_FRAMES: Final = 24
 """Frames of each run but the last: a reference, a few at rest, and a contact that lasts."""
-BALL: Final = 150
+IMPRINT_SIDE_PX: Final = 150
 """Side of the imprint that is copied to make several contacts, raw px."""
 
 Pictures = NDArray[np.uint8]
@@ -68,11 +68,17 @@ def measure_growth(default: Pipeline, markerless: Pipeline, *, quick: bool = Fal
         return values[: len(values) - 1 : 2] if quick else values
 
     make: list[tuple[str, str, Sequence[object], Callable[..., list[float]], Callable[..., float]]] = [
-        ("Picture", "raw px", some(SIZES), partial(_of_size, default), lambda size: size[0] * size[1]),
-        ("Dots", "", some(GRIDS), partial(_of_dots, default), _count),
-        ("Contacts at once", "", some(CONTACTS), partial(_of_contacts, markerless), float),
-        ("Sensors in one process", "", some(SENSORS), partial(_of_sensors, default), float),
-        ("Length of the run", "frames", some(LENGTHS), partial(_of_length, default), float),
+        (
+            "Picture",
+            "raw px",
+            some(PICTURE_SIZES_PX),
+            partial(_of_size, default),
+            lambda size: size[0] * size[1],
+        ),
+        ("Dots", "", some(DOT_GRIDS), partial(_of_dots, default), _count),
+        ("Contacts at once", "", some(CONTACT_COUNTS), partial(_of_contacts, markerless), float),
+        ("Sensors in one process", "", some(SENSOR_COUNTS), partial(_of_sensors, default), float),
+        ("Length of the run", "frames", some(RUN_LENGTHS_FRAMES), partial(_of_length, default), float),
     ]
     for title, unit, sizes, measure, number in make[:2] if quick else make:
         x, times, left_out = [], [], {}
@@ -114,7 +120,7 @@ def _counts(result: TimedResult, frames: int) -> bool:
     return result.seq >= frames // 2
 
 
-def _press(query: str = "", frames: int = FRAMES) -> Pictures:
+def _press(query: str = "", frames: int = RUN_FRAMES) -> Pictures:
     """A press that begins and stays: half of the frames show its deepest moment, with new noise each."""
     scene = open_scene(f"press?frames=120{query and '&' + query}")
     indices = [*range(6), *np.linspace(27, 44, frames - 6).round().astype(int)]
@@ -136,7 +142,7 @@ def _of_contacts(pipeline: Pipeline, count: int) -> list[float]:
     rest, pressed = scene.frame(0).astype(np.int16), scene.frame(35).astype(np.int16)
     change = pressed - rest
     y, x = np.unravel_index(np.abs(change).sum(axis=2).argmax(), change.shape[:2])
-    half = BALL // 2
+    half = IMPRINT_SIDE_PX // 2
     y, x = (int(np.clip(at, half, side - half)) for at, side in ((y, rest.shape[0]), (x, rest.shape[1])))
     imprint = change[y - half : y + half, x - half : x + half]
     shown = rest.copy()
@@ -144,7 +150,7 @@ def _of_contacts(pipeline: Pipeline, count: int) -> list[float]:
     for row, column in places[:count]:
         shown[row - half : row + half, column - half : column + half] += imprint
     rng = np.random.default_rng(0)
-    levels = [rest] * 6 + [shown] * (FRAMES - 6)
+    levels = [rest] * 6 + [shown] * (RUN_FRAMES - 6)
     noisy = [level + rng.normal(0, 2, level.shape) for level in levels]
     return _times([pipeline], np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
 

@@ -30,7 +30,7 @@ from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline, Queue
 from tactflow.engine.run import RunResult
 from tactflow.message.result import Result, encode_message
-from tactflow.tools.bench.timing import BLOCK, Times, quiet
+from tactflow.tools.bench.timing import TURN_FRAMES, Times, quiet
 from tactflow.vision.geometry import PixelMapping
 
 
@@ -61,7 +61,7 @@ class LockstepPipeline:
         self._thread = threading.Thread(target=self._run, name="tactflow-bench", daemon=True)
         self._thread.start()
 
-    def block(self, frames: int = BLOCK) -> list[TimedResult]:
+    def block(self, frames: int = TURN_FRAMES) -> list[TimedResult]:
         """Run a number of further frames without a pause between them, and return their results.
 
         Returns fewer where the recording ends or the pipeline fails. The next call then returns an empty
@@ -138,7 +138,7 @@ def on_recording(pipeline: Pipeline, path: Path) -> Pipeline:
 def take_turns(
     pipelines: Mapping[str, Pipeline],
     observe: Callable[[str, TimedResult], str],
-    block: int = BLOCK,
+    block: int = TURN_FRAMES,
     limit_s: float = math.inf,
 ) -> tuple[dict[str, Times], dict[str, str]]:
     """Run pipelines in turns of a few frames until all recordings are over.

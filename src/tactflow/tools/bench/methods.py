@@ -31,7 +31,7 @@ from tactflow.tools.bench import metrics, score
 from tactflow.tools.bench.quantities import Tally
 from tactflow.tools.bench.results import BenchResult
 from tactflow.tools.bench.scenes import Case, Rendered, rendered
-from tactflow.tools.bench.timing import BLOCK, quiet
+from tactflow.tools.bench.timing import TURN_FRAMES, quiet
 
 
 def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Node]:
@@ -187,9 +187,9 @@ def _measure_stage(
     budget_s = QUICK_BUDGET_S if result.quick else FULL_BUDGET_S
     trials = {name: _Trial(stage, node, frames, budget_s) for name, node in ways.items()}
     with quiet():
-        for first in range(0, len(frames), BLOCK):
+        for first in range(0, len(frames), TURN_FRAMES):
             for trial in trials.values():
-                trial.run(range(first, min(first + BLOCK, len(frames))))
+                trial.run(range(first, min(first + TURN_FRAMES, len(frames))))
     for name, trial in trials.items():
         if trial.failure:
             result.failures[f"{stage}/{name}/{scene}"] = trial.failure

@@ -57,7 +57,7 @@ FRONTS: Final = (
     ("flow_in_mask", "flow_error"),
 )
 """Group and quantity of each plot of time against error."""
-_FLOOR: Final = 1e-3
+_MIN_PLOTTED_ERROR: Final = 1e-3
 """Smallest error on a logarithmic axis: an error of 0 is drawn here."""
 _LEAD: Final = (
     "Every method and pipeline is a point: CPU time of a frame with contact, in one thread, against its "
@@ -140,14 +140,14 @@ def draw_points(axes: Axes, found: Sequence[Point], own: Sequence[str] = ()) -> 
     for point in found:
         marked = point.name in (CLASSIC, *own)
         tint = colour("bad") if point.name == CLASSIC else series(0) if not marked else colour("good")
-        low, middle, high = (max(error, _FLOOR) for error in point.error)
+        low, middle, high = (max(error, _MIN_PLOTTED_ERROR) for error in point.error)
         across = [[point.ms[1] - point.ms[0]], [point.ms[2] - point.ms[1]]]
         along = [[middle - low], [high - middle]]
         shape, place = "s" if marked else "o", (point.ms[1], middle)
         axes.errorbar(*place, yerr=along, xerr=across, fmt=shape, color=tint, elinewidth=0.8, markersize=5)
         axes.annotate(point.name, place, (4, 3), textcoords="offset points", fontsize=7.5, color=tint)
     best = front(found)
-    steps = [max(point.error[1], _FLOOR) for point in best]
+    steps = [max(point.error[1], _MIN_PLOTTED_ERROR) for point in best]
     axes.plot([p.ms[1] for p in best], steps, color=colour("quiet"), linewidth=0.8, zorder=0)
     axes.set(xscale="log", yscale="log", xlabel="CPU time of a frame, ms")
     axes.margins(x=0.25, y=0.15)

@@ -16,9 +16,9 @@ from tactflow.tools.bench.scenes import Rendered
 
 SIDE_PX: Final = 240
 """Longer side of a picture."""
-_QUALITY: Final = 75
+_JPEG_QUALITY: Final = 75
 """JPEG quality, 1 to 100: about 6 kB a picture."""
-_GREEN: Final = (90, 230, 60)
+_TRUTH_COLOUR: Final = (90, 230, 60)
 """Colour of the true outline, blue, green, red."""
 
 
@@ -41,11 +41,11 @@ def true_picture(result: TimedResult, truth: Truth) -> bytes:
     drawn = image.copy()
     mask = np.asarray(truth.contact_mask, np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(drawn, outlines, -1, _GREEN, max(1, round(min(drawn.shape[:2]) / 200)))
+    cv2.drawContours(drawn, outlines, -1, _TRUTH_COLOUR, max(1, round(min(drawn.shape[:2]) / 200)))
     return _small(drawn)
 
 
 def _small(picture: NDArray[np.uint8]) -> bytes:
     scale = min(1.0, SIDE_PX / max(picture.shape[:2]))
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return encode_jpeg(np.asarray(small, np.uint8), _QUALITY)
+    return encode_jpeg(np.asarray(small, np.uint8), _JPEG_QUALITY)

@@ -25,7 +25,7 @@ MEAN, MOST = np.mean, np.max
 """How values become one number."""
 
 
-SHARE = 0.1
+TOLERANCE_SHARE = 0.1
 """Share of a stored error by which a later one may exceed it: keeps the rule sensible for large errors."""
 
 
@@ -33,10 +33,10 @@ SHARE = 0.1
 class Quantity:
     """One measured error.
 
-    key : name in results. title : for people. unit : "" for none.
-    summary : makes one number of the values (N,) of all frames, N > 0.
-    best : the perfect value: 0 for an error, of which less is better; otherwise more is.
-    slack : a stored result may be exceeded by slack + `SHARE` * |stored - best| before it counts as worse:
+    key : name in results. title : for people. unit : "" for none. summary : makes one number of the values
+    (N,) of all frames, N > 0. best : the perfect value: 0 for an error, of which less is better; otherwise
+    more is. slack : a stored result may be exceeded by slack + `TOLERANCE_SHARE` * |stored - best| before
+    it counts as worse:
         by what other CPUs change in the last bits of floating-point sums (a marker or a pixel at a threshold
         falls to the other side). For shares of frames, a little more than one frame of the quick run's 30.
     """
@@ -59,7 +59,7 @@ class Quantity:
 
     def allowed(self, stored: float) -> float:
         """The worst value that still counts as no worse than `stored`."""
-        margin = self.slack + SHARE * self.distance(stored)
+        margin = self.slack + TOLERANCE_SHARE * self.distance(stored)
         return stored + margin if self.best == 0 else stored - margin
 
     def is_worse(self, value: float, stored: float) -> bool:

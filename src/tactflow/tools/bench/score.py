@@ -15,13 +15,13 @@ from tactflow.vision.flow import DisplacementField
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
 
-DIRECTED = 2.0
+MIN_DIRECTED_AXIS_RATIO = 2.0
 """Minimum ratio of the axes of a contact whose direction is judged. Chosen by hand."""
 
-_FIELD_POINTS = 100
+_FIELD_POINT_COUNT = 100
 """Places at which a displacement field is compared."""
 
-_ROUND = 100
+_MIN_ROUND_PIXELS = 100
 """Minimum number of pixels of a contact whose roundness is judged. Chosen by hand."""
 
 
@@ -60,7 +60,7 @@ def add_centroid(tally: Tally, mask: NDArray[np.uint8], truth: Truth) -> None:
 def add_geometry(tally: Tally, contact: Contact, truth: Truth) -> None:
     """Compare outline, area, centre and direction of a contact.
 
-    Directions are judged where the truth is at least `DIRECTED` times as long as wide.
+    Directions are judged where the truth is at least `MIN_DIRECTED_AXIS_RATIO` times as long as wide.
     """
     shape = truth.contact_mask.shape
     tally.add(hull_iou=metrics.polygon_iou(contact.hull, truth.hull, shape))
@@ -69,9 +69,9 @@ def add_geometry(tally: Tally, contact: Contact, truth: Truth) -> None:
     if truth.center is not None:
         tally.add(center_error=metrics.distance(contact.center, truth.center))
     if truth.angle is None:
-        if np.count_nonzero(truth.contact_mask) >= _ROUND:
+        if np.count_nonzero(truth.contact_mask) >= _MIN_ROUND_PIXELS:
             tally.percent(angle_invented=contact.angle is not None)
-    elif metrics.aspect_ratio(truth.contact_mask) >= DIRECTED:
+    elif metrics.aspect_ratio(truth.contact_mask) >= MIN_DIRECTED_AXIS_RATIO:
         tally.percent(angle_missing=contact.angle is None)
         if contact.angle is not None:
             error = metrics.angle_error(contact.angle, truth.angle)
@@ -89,11 +89,11 @@ def add_flow(tally: Tally, flow: Flow | None, truth: Truth) -> None:
 
 
 def add_field(tally: Tally, field: DisplacementField | None, truth: Truth) -> None:
-    """Compare the displacement field where the gel is in contact, at up to `_FIELD_POINTS` places."""
+    """Compare the displacement field where the gel is in contact, at up to `_FIELD_POINT_COUNT` places."""
     rows, columns = np.nonzero(truth.contact_mask)
     if field is None or not len(rows):
         return
-    chosen = np.unique(np.linspace(0, len(rows) - 1, _FIELD_POINTS).round().astype(np.int64))
+    chosen = np.unique(np.linspace(0, len(rows) - 1, _FIELD_POINT_COUNT).round().astype(np.int64))
     points = np.column_stack([columns, rows])[chosen].astype(np.float64)
     errors = field.at(points) - truth.displacement(points)
     tally.add(field_rms=np.hypot(*errors.T))

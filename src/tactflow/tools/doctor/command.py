@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from tactflow.recording.verdict import Finding
     from tactflow.tools.doctor.session import Examined, Session
 
-WIDTH = 100
+LINE_CHARACTERS = 100
 """Characters of a line."""
-INDENT = 28
+INDENT_CHARACTERS = 28
 """Characters before the effect and the remedy of a fault."""
-SIGNS = {"good": "ok", "warning": "WARN", "fault": "FAULT", "unknown": "?"}
+VERDICT_WORDS = {"good": "ok", "warning": "WARN", "fault": "FAULT", "unknown": "?"}
 """Verdict -> how the table shows it."""
 
 
@@ -104,9 +104,9 @@ def _table(session: Session) -> Iterator[str]:
 def _rows(findings: Sequence[Finding]) -> Iterator[str]:
     """Findings: one line each, and below it the effect and the remedy of a fault."""
     for finding in findings:
-        yield f"  {SIGNS[finding.verdict]:<6} {finding.name:<12} {finding.says}"
+        yield f"  {VERDICT_WORDS[finding.verdict]:<6} {finding.name:<12} {finding.says}"
         for title, text in (("effect", finding.effect), ("change", finding.advice)):
             if text:
-                lines = textwrap.wrap(text, WIDTH - INDENT)
-                yield f"{title + ': ':>{INDENT}}{lines[0]}"
-                yield from (" " * INDENT + line for line in lines[1:])
+                lines = textwrap.wrap(text, LINE_CHARACTERS - INDENT_CHARACTERS)
+                yield f"{title + ': ':>{INDENT_CHARACTERS}}{lines[0]}"
+                yield from (" " * INDENT_CHARACTERS + line for line in lines[1:])

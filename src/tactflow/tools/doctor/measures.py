@@ -16,15 +16,15 @@ from tactflow.vision.markers.lattice import corners
 
 Gray = NDArray[np.float32]
 
-TILE: Final = 16
+TILE_SIDE_PX: Final = 16
 """Side of the tiles for noise estimates, px: 256 samples each."""
-DIM: Final = 25
+MIN_LIT_GREY: Final = 25
 """Minimum grey level for relative changes of light: noise of 2 grey levels would be 8 %."""
-STRIPS: Final = 4
+STRIP_COUNT: Final = 4
 """Strips of a picture: bands of light cross all of them, a contact does not."""
 MAX_BANDS: Final = 24
 """Maximum number of bands across a picture: 120 Hz light with a readout of 100 ms causes 12."""
-REGULAR: Final = 0.7
+MIN_CLOSED_SHARE: Final = 0.7
 """Minimum share of closing parallelograms in a regular grid, where it is 0.8 and more. Chosen by hand."""
 
 
@@ -91,10 +91,12 @@ def noise_of(pairs: Sequence[Pair]) -> float:
 def _calm_deviation(values: NDArray[np.float32]) -> float:
     """Standard deviation of (H, W, 3) values at the lower quartile of the tiles, without motion and
     texture."""
-    height, width = (side - side % TILE for side in values.shape[:2])
+    height, width = (side - side % TILE_SIDE_PX for side in values.shape[:2])
     if not height or not width:
         return float(values.std())
-    tiles = values[:height, :width].reshape(height // TILE, TILE, width // TILE, TILE, -1)
+    tiles = values[:height, :width].reshape(
+        height // TILE_SIDE_PX, TILE_SIDE_PX, width // TILE_SIDE_PX, TILE_SIDE_PX, -1
+    )
     variance = tiles.var(axis=(1, 3)).mean(axis=-1)
     return float(np.sqrt(np.percentile(variance, 25.0)))
 
@@ -160,7 +162,9 @@ def bands(frames: Sequence[Gray]) -> tuple[float, str]:
     the rows of a strip are a profile of the light.
     """
     middle = np.median(np.stack(frames), axis=0)
-    ratios = [np.where(middle > DIM, frame / np.maximum(middle, DIM), 1.0) for frame in frames]
+    ratios = [
+        np.where(middle > MIN_LIT_GREY, frame / np.maximum(middle, MIN_LIT_GREY), 1.0) for frame in frames
+    ]
     amplitudes = {
         axis: _common_wave([_profiles(ratio if axis == "rows" else ratio.T) for ratio in ratios])
         for axis in ("rows", "columns")
@@ -170,7 +174,7 @@ def bands(frames: Sequence[Gray]) -> tuple[float, str]:
 
 
 def _profiles(ratio: NDArray[Any]) -> list[NDArray[Any]]:
-    return [np.median(strip, axis=1) for strip in np.array_split(ratio, STRIPS, axis=1)]
+    return [np.median(strip, axis=1) for strip in np.array_split(ratio, STRIP_COUNT, axis=1)]
 
 
 def _common_wave(profiles: Sequence[Sequence[NDArray[Any]]]) -> float:
@@ -194,7 +198,7 @@ def lattice(detection: Detection, gray: Gray) -> Lattice:
     contrast = float(np.median(np.abs(around[y, x] - gray[y, x])))
     closed = 0.0 if detection.chosen is None else detection.chosen.lattice.closed_share
     # An irregular grid has no predictable positions.
-    empty = len(_empty_positions(detection)) if closed >= REGULAR else 0
+    empty = len(_empty_positions(detection)) if closed >= MIN_CLOSED_SHARE else 0
     return Lattice(len(detection.centers), closed, empty / (len(detection.centers) + empty), contrast)
 
 

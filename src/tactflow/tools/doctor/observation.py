@@ -18,7 +18,7 @@ from tactflow.recording.course import Watcher
 from tactflow.recording.verdict import Recorded
 from tactflow.sources import Arrival, FrameReader, open_source
 from tactflow.sources.files import ArrayFile, ImageFiles
-from tactflow.tools.doctor.measures import REGULAR, Gray, Pair, exposure, grey
+from tactflow.tools.doctor.measures import MIN_CLOSED_SHARE, Gray, Pair, exposure, grey
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.change import DamageTest, shows_gel
 from tactflow.vision.geometry.valid_area import valid_area
@@ -26,11 +26,11 @@ from tactflow.vision.markers import Detection, NoMarkersError, detect_markers
 
 LIVE_SECONDS: Final = 10.0
 """How long a live source is observed by default, s: time for some presses."""
-BETWEEN: Final = 30
+MIDDLE_GREY_MARGIN: Final = 30
 """Distance of a level from black and from white, grey levels; compression alone does not reach it."""
-SHARE_BETWEEN: Final = 0.01
+MIN_MIDDLE_GREY_SHARE: Final = 0.01
 """Minimum share of such levels in a picture that has not been thresholded: the shade of a single press."""
-KEPT: Final = 24
+KEPT_PAIRS: Final = 24
 """Pairs of frames to keep, up to twice as many while reading: 70 MB at 800 x 600."""
 MIN_DOTS: Final = 20
 """Minimum number of dots of an irregular grid: compression produces 6 and 16 spots on wedge_grasp, a gel
@@ -93,8 +93,10 @@ class Observation:
     @cached_property
     def black_and_white(self) -> bool:
         """Whether the pictures have been thresholded: they have no levels between."""
-        between = [np.mean((gray > BETWEEN) & (gray < 255 - BETWEEN)) for gray in self.grays]
-        return bool(np.mean(between) < SHARE_BETWEEN)
+        between = [
+            np.mean((gray > MIDDLE_GREY_MARGIN) & (gray < 255 - MIDDLE_GREY_MARGIN)) for gray in self.grays
+        ]
+        return bool(np.mean(between) < MIN_MIDDLE_GREY_SHARE)
 
     @cached_property
     def typical(self) -> Gray:
@@ -111,7 +113,7 @@ class Observation:
             found = _dots_of(pair.image)
             if found is None:
                 continue
-            if found.chosen is not None and found.chosen.lattice.closed_share >= REGULAR:
+            if found.chosen is not None and found.chosen.lattice.closed_share >= MIN_CLOSED_SHARE:
                 return found
             again = None if pair.after is None else _dots_of(pair.after)
             if len(found.centers) >= MIN_DOTS and (pair.after is None or _recur(found, again)):
@@ -200,7 +202,7 @@ def _read(
             pairs[-1] = pairs[-1]._replace(after=frame.image)
         if course.frames % stride == 0:
             pairs.append(Pair(course.frames, frame.image, None))
-            if len(pairs) > 2 * KEPT:
+            if len(pairs) > 2 * KEPT_PAIRS:
                 stride *= 2
                 pairs[:] = [pair for pair in pairs if pair.number % stride == 0]
         suspect = test is None or test.is_damaged(frame.image)

@@ -23,22 +23,22 @@ MAX_LAG_SECONDS: Final = 2.0
 """Largest lag that is searched, s; a network stream has 1 s and more."""
 MIN_MOMENTS: Final = 40
 """Minimum number of moments of each half of a session: fewer have no significant correlation."""
-SIGNIFICANT: Final = 5.0
+MIN_CORRELATION_STDERRS: Final = 5.0
 """Minimum correlation of a lag, standard errors: one of 10,000 sessions has it by chance, at 200 lags."""
-DISTINCT: Final = 3.0
+MIN_GAIN_STDERRS: Final = 3.0
 """Minimum distance of a correlation from those in step, and its minimum in each half, standard errors."""
-OUTLIER: Final = 10.0
+MAX_CHANGE_STDDEVS: Final = 10.0
 """Limit of a change, in robust standard deviations, so that no single moment decides."""
-FRAMES_IN_STEP: Final = 1.5
+MAX_IN_STEP_INTERVALS: Final = 1.5
 """Largest lag of sensors in step, intervals: unsynchronised cameras are up to one apart, and a change belongs
 to two frames."""
-CLOSING_SECONDS: Final = 0.05
+MAX_IN_STEP_SECONDS: Final = 0.05
 """Largest lag of sensors in step, s: fingers that close at 50 mm/s on an object 2 mm off the middle touch it
 40 ms apart."""
-START_SECONDS: Final = 1.0
+MENTIONED_START_SECONDS: Final = 1.0
 """Difference between the first frames, or between the last ones, that is mentioned, s: programs that start
 sensors one after another need less."""
-HALF: Final = 50.0
+BAD_ABSENCE_PERCENT: Final = 50.0
 """Share of a session without one of its sensors from which it is bad, %."""
 
 
@@ -77,7 +77,7 @@ def _compared(left: Track, right: Track) -> Finding:
         return Finding(None, f"{right.name}: too few frames", name="step", unit="ms")
     apart, share = _apart(left.name, right.name, *times)
     lag = lag_between(times[0], left.course.changes, times[1], right.course.changes)
-    limit = max(FRAMES_IN_STEP * interval, CLOSING_SECONDS)
+    limit = max(MAX_IN_STEP_INTERVALS * interval, MAX_IN_STEP_SECONDS)
     texts = [*apart, *_lag_texts(left.name, right.name, lag, limit)]
     if not texts:
         if lag is None:
@@ -97,7 +97,7 @@ def _compared(left: Track, right: Track) -> Finding:
         (1000 * limit, np.inf),
         "step",
         "ms",
-        "fault" if share >= HALF else "warning",
+        "fault" if share >= BAD_ABSENCE_PERCENT else "warning",
     )
 
 
@@ -107,7 +107,7 @@ def _apart(left: str, right: str, first: Series, second: Series) -> tuple[list[s
     texts = []
     for late, words in ((begin, "begins {} after"), (end, "ends {} before")):
         names = (right, left) if late > 0 else (left, right)
-        if abs(late) >= START_SECONDS:
+        if abs(late) >= MENTIONED_START_SECONDS:
             texts.append(f"{names[0]} {words.format(seconds_text(abs(late)))} {names[1]}")
     whole = max(first[-1], second[-1]) - min(first[0], second[0])
     return texts, 100.0 * (abs(begin) + abs(end)) / max(whole, 1e-9)
@@ -147,7 +147,7 @@ def lag_between(first: Series, changes: Series, second: Series, others: Series) 
         return None
     left, right = _activity(first, changes, grid), _activity(second, others, grid)
     span = min(round(MAX_LAG_SECONDS / interval), half // 2)
-    near = int(max(FRAMES_IN_STEP, CLOSING_SECONDS / interval))
+    near = int(max(MAX_IN_STEP_INTERVALS, MAX_IN_STEP_SECONDS / interval))
     whole, *halves = (
         _correlations(left[part], right[part], span) for part in (slice(None), slice(half), slice(half, None))
     )
@@ -159,14 +159,14 @@ def lag_between(first: Series, changes: Series, second: Series, others: Series) 
         return float(scores.max() - scores[max(middle - near, 0) : middle + near + 1].max())
 
     drifts = all(
-        scores.max() > SIGNIFICANT and beaten(scores, other) > DISTINCT
+        scores.max() > MIN_CORRELATION_STDERRS and beaten(scores, other) > MIN_GAIN_STDERRS
         for scores, other in zip(halves, reversed(lags[1:]), strict=True)
     )
     if abs(lags[0]) <= near:
-        agrees = all(beaten(scores, 0) <= DISTINCT for scores in halves)
+        agrees = all(beaten(scores, 0) <= MIN_GAIN_STDERRS for scores in halves)
     else:
-        agrees = beaten(whole, 0) > DISTINCT and all(
-            scores.max() > DISTINCT and abs(lag - lags[0]) <= near
+        agrees = beaten(whole, 0) > MIN_GAIN_STDERRS and all(
+            scores.max() > MIN_GAIN_STDERRS and abs(lag - lags[0]) <= near
             for scores, lag in zip(halves, lags[1:], strict=True)
         )
     seconds = [
@@ -174,7 +174,7 @@ def lag_between(first: Series, changes: Series, second: Series, others: Series) 
         for lag, scores in zip(lags, (whole, *halves), strict=True)
     ]
     of_halves = (seconds[1], seconds[2]) if drifts else (seconds[0], seconds[0])
-    return Lag(seconds[0], of_halves, drifts or bool(whole.max() > SIGNIFICANT and agrees))
+    return Lag(seconds[0], of_halves, drifts or bool(whole.max() > MIN_CORRELATION_STDERRS and agrees))
 
 
 def _activity(times: Series, changes: Series, grid: Series) -> Series:
@@ -187,7 +187,7 @@ def _activity(times: Series, changes: Series, grid: Series) -> Series:
     news = level[1:] - (float(level[1:] @ level[:-1]) / power if power else 0.0) * level[:-1]
     news -= np.median(news)
     deviation = 1.4826 * float(np.median(np.abs(news)))
-    news = np.clip(news, -OUTLIER * deviation, OUTLIER * deviation)
+    news = np.clip(news, -MAX_CHANGE_STDDEVS * deviation, MAX_CHANGE_STDDEVS * deviation)
     # The same moment may belong to different frames of two sensors.
     return np.asarray(np.convolve(news, [0.25, 0.5, 0.25], "same"), np.float64)
 

@@ -13,7 +13,7 @@ import zmq
 from tactflow.network.parameters import PublisherParams
 from tactflow.network.publisher import Publisher
 
-QUIET_S = 0.1
+QUIET_SECONDS = 0.1
 """Time at the end for messages that are still on their way between processes, s."""
 
 
@@ -44,7 +44,7 @@ def relay(params: PublisherParams, upstream: Sequence[str]) -> Iterator[None]:
     try:
         yield
     finally:
-        time.sleep(QUIET_S)
+        time.sleep(QUIET_SECONDS)
         # Ends the proxy, which closes its socket.
         context.term()
         thread.join()

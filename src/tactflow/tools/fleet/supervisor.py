@@ -16,17 +16,17 @@ from tactflow.system.files import discard_output
 from tactflow.system.signals import INTERRUPTED_EXIT_CODE
 from tactflow.tools.fleet.sinks import WatchedSink
 
-FIRST_PAUSE = 1.0
+FIRST_PAUSE_S = 1.0
 """Pause before the first restart, s; it doubles with each further failure (exponential back-off)."""
-LONGEST_PAUSE = 30.0
+MAX_PAUSE_S = 30.0
 """Upper limit of that pause, s."""
-GIVE_UP_AFTER = 5
+MAX_FAILURES = 5
 """Failures in a row after which a sensor is given up."""
-GOOD_RUN = 30.0
+GOOD_RUN_S = 30.0
 """A process that ran this long, s, resets the count of failures."""
-KILL_AT = 3
+KILLING_SIGNAL_COUNT = 3
 """Number of the signal that kills the processes; the first lets them finish, the second ends them."""
-LOOK_EVERY = 0.05
+POLL_SECONDS = 0.05
 """Poll interval, s."""
 
 Process = subprocess.Popen[bytes]
@@ -90,7 +90,7 @@ class Supervisor:
                 except StopIteration as end:
                     codes[sensor] = end.value
                     del running[sensor]
-            self._pause(LOOK_EVERY)
+            self._pause(POLL_SECONDS)
         for reader in self._readers:
             reader.join(5)
         if self._signals > 1:
@@ -120,11 +120,11 @@ class Supervisor:
                 self._say(member, f"failed (exit code {code}); given up, as {refused} may not be replaced")
                 return code
             lasted = self._clock() - started
-            failures = 1 if lasted > GOOD_RUN else failures + 1
-            if failures > GIVE_UP_AFTER:
+            failures = 1 if lasted > GOOD_RUN_S else failures + 1
+            if failures > MAX_FAILURES:
                 self._say(member, f"failed {failures} times in a row (exit code {code}); given up")
                 return self._last_code(member, code)
-            pause = min(FIRST_PAUSE * 2 ** (failures - 1), LONGEST_PAUSE)
+            pause = min(FIRST_PAUSE_S * 2 ** (failures - 1), MAX_PAUSE_S)
             self._say(member, f"failed (exit code {code}); starting again in {pause:g} s")
             start_at = self._clock() + pause
             while self._clock() < start_at and not self._ends:
@@ -135,7 +135,7 @@ class Supervisor:
         """Forward signals to a process until it ends. Returns its exit code."""
         sent = 0
         while (code := process.poll()) is None:
-            if self._signals >= KILL_AT:
+            if self._signals >= KILLING_SIGNAL_COUNT:
                 process.kill()
             elif sent < self._ends:
                 # SIGINT would show a traceback in a process that is still importing. One signal at a time:

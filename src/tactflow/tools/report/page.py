@@ -18,7 +18,7 @@ from tactflow.tools.page import Html, Section, colour, details, multiples, page,
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WORK = ("in full", "glanced at", "repeated")
+WORK_KINDS = ("in full", "glanced at", "repeated")
 """What was done with a frame."""
 _NOT_RUN = "Statistics of the run show where time went: tactflow run --stats run.json, then --stats run.json."
 _NOTHING_SKIPPED = "Every value was computed in every frame."
@@ -53,7 +53,9 @@ class Report:
 
 def _work(skipped: Mapping[str, str]) -> str:
     reasons = skipped.values()
-    return WORK[1] if "at_rest" in reasons else WORK[2] if "unchanged" in reasons else WORK[0]
+    return (
+        WORK_KINDS[1] if "at_rest" in reasons else WORK_KINDS[2] if "unchanged" in reasons else WORK_KINDS[0]
+    )
 
 
 def collect(results: Iterable[Result]) -> dict[str, Report]:
@@ -139,12 +141,12 @@ def _skipping(name: str, report: Report) -> Section:
 
     def draw(figure: Figure) -> None:
         axes, left = figure.subplots(), 0.0
-        for index, kind in enumerate(WORK):
+        for index, kind in enumerate(WORK_KINDS):
             share = 100 * report.work[kind] / report.frames
             axes.barh([0], [share], left=left, color=series(index), label=f"{kind}: {share:.0f} %")
             left += share
         axes.set(yticks=[], xlabel="frames, %", xlim=(0, 100))
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.35), ncols=len(WORK))
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.35), ncols=len(WORK_KINDS))
 
     rows = [
         [port, reason, count, f"{100 * count / report.frames:.1f} %"]

@@ -24,8 +24,8 @@ from tactflow.system.signals import INTERRUPTED_EXIT_CODE, ending_handled, inter
 from tactflow.system.terminal import notes, say, typed
 from tactflow.tools.doctor import Observation, examine
 from tactflow.tools.doctor.observation import watch
-from tactflow.tools.start.propose import FEWEST_FOUND, OF_ONE, Attempt, Sample, divide, propose
-from tactflow.tools.tune.recording import CHANGE, Kept
+from tactflow.tools.start.propose import MIN_FOUND_SHARE, SPECIAL_PIPELINES, Attempt, Sample, divide, propose
+from tactflow.tools.tune.recording import CONTACT_CHANGE, Kept
 from tactflow.tools.tune.report import commented
 from tactflow.view.questions import Questions
 
@@ -122,7 +122,7 @@ def _cameras(dev: Path) -> list[str]:
 
 def _set_up(args: argparse.Namespace, source: str, reader: FrameReader, questions: Questions) -> None:
     """Ask and propose until a pipeline is accepted, and write it. Raises KeyboardInterrupt if none is."""
-    left_out = OF_ONE | {"default", "markerless"}
+    left_out = SPECIAL_PIPELINES | {"default", "markerless"}
     named = {name: what for name, what in described_pipelines().items() if name not in left_out}
     answer = questions.ask("Which sensor is this?", {"unknown": "Another one, or unknown"} | named)
     kind = answer if answer in named else None
@@ -185,7 +185,7 @@ def _untouched(source: str, reader: FrameReader, questions: Questions) -> tuple[
         rest, kept = Observation(source, reader.description, live=True), Kept()
         _watch(reader, REST_SECONDS, rest, questions, kept, at_rest=True)
         change = max(divide(kept.frames, len(kept)).changes)
-        if change < CHANGE:
+        if change < CONTACT_CHANGE:
             return rest, kept
         text = (
             f"The picture changed by {100 * change:.0f} %, although nothing should touch the gel. Keep away "
@@ -210,7 +210,7 @@ def _decide(
     text = f"Proposed: {best}"
     if not sample.pressed:
         text = f"No press was seen, so that contacts are untested. {text}"
-    elif best.failure or best.found < FEWEST_FOUND:
+    elif best.failure or best.found < MIN_FOUND_SHARE:
         del choices["write"]
         text = f"No pipeline finds the presses of this gel. The best is {best}"
     if args.yes:

@@ -23,29 +23,29 @@ from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
 from tactflow.streaming import stream
-from tactflow.tools.tune.recording import CHANGE, change_between
-from tactflow.tools.tune.space import DOWNSAMPLE, MIN_PITCH, MIN_SIDE
+from tactflow.tools.tune.recording import CONTACT_CHANGE, change_between
+from tactflow.tools.tune.space import DOWNSAMPLE, MIN_PITCH_PX, MIN_SIDE_PX
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.change import Settling
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import MarkerStatus
 
-LARGE: Final = 500
+MAX_WHOLE_SIDE_PX: Final = 500
 """px: pictures with a longer side are shrunk; the shipped pipelines are measured on 160 to 480 px."""
-PRESSED: Final = 0.5
+MIN_PRESS_RATIO: Final = 0.5
 """Change of light, relative to the largest, from which a frame counts as pressed. Those between are left out,
 because whether they show a contact is a matter of definition."""
-FEWEST_FOUND: Final = 0.5
+MIN_FOUND_SHARE: Final = 0.5
 """Share of presses below which a pipeline does not find the contacts of a gel: no better than a coin."""
-NEAR: Final = 0.1
+SCORE_TOLERANCE: Final = 0.1
 """Difference of two scores up to which they count as equal: the standard error of a share of 25 frames."""
-STEADY: Final = 0.35
+MAX_REST_DISPLACEMENT_PX: Final = 0.35
 """95th percentile of the dots' displacement at rest, px, above which they are not tracked: the bound used to
 label the recordings of franka_mini."""
-TRIED: Final = ("default", "markerless", "tactip")
+TRIED_PIPELINES: Final = ("default", "markerless", "tactip")
 """Shipped pipelines that are tried for every sensor. The others differ from one of them in geometry and
-calibration alone, except for `OF_ONE`."""
-OF_ONE: Final = frozenset({"classic", "wedge"})
+calibration alone, except for `SPECIAL_PIPELINES`."""
+SPECIAL_PIPELINES: Final = frozenset({"classic", "wedge"})
 """Shipped pipelines for no kind of sensor: the original script, and one that rectifies the picture of one
 camera."""
 
@@ -97,7 +97,7 @@ class Attempt:
     @property
     def has_dots(self) -> bool:
         """Whether it tracks dots that keep still on the untouched gel."""
-        return self.dots > 0 and self.steady < STEADY
+        return self.dots > 0 and self.steady < MAX_REST_DISPLACEMENT_PX
 
     def __str__(self) -> str:
         if self.failure:
@@ -122,10 +122,10 @@ def divide(frames: Sequence[ColorImage], at_rest: int | None = None) -> Sample:
             break
     reference = settling.best()
     changes = [change_between(frames[reference], image) for image in frames]
-    same = takewhile(lambda index: changes[index] < CHANGE, range(reference, len(frames)))
+    same = takewhile(lambda index: changes[index] < CONTACT_CHANGE, range(reference, len(frames)))
     rest = list(same) if at_rest is None else list(range(reference, at_rest))
     # Frames before the reference may show another state of the gel.
-    limit = max(CHANGE, PRESSED * max(changes[reference:]))
+    limit = max(CONTACT_CHANGE, MIN_PRESS_RATIO * max(changes[reference:]))
     pressed = [index for index in range(rest[-1] + 1, len(frames)) if changes[index] >= limit]
     return Sample(list(frames), reference, rest, pressed, changes)
 
@@ -138,9 +138,9 @@ def shrinking(size: tuple[int, int], pitch: float | None) -> int:
     """
     factor = 1
     while (
-        max(size) / factor > LARGE
-        and min(size) / (2 * factor) >= MIN_SIDE
-        and (pitch is None or pitch / (2 * factor) >= MIN_PITCH)
+        max(size) / factor > MAX_WHOLE_SIDE_PX
+        and min(size) / (2 * factor) >= MIN_SIDE_PX
+        and (pitch is None or pitch / (2 * factor) >= MIN_PITCH_PX)
     ):
         factor *= 2
     return factor
@@ -153,7 +153,7 @@ def propose(
     kind: str | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[Attempt]:
-    """Try the shipped pipelines of `TRIED` and those that fit the sensor, best first.
+    """Try the shipped pipelines of `TRIED_PIPELINES` and those that fit the sensor, best first.
 
     Of pipelines whose scores are near the best, one that also tracks steady dots is preferred, then one for
     this kind of sensor, then the first.
@@ -166,14 +166,14 @@ def propose(
     settings = {"stages.preprocess.rotate": rotate, DOWNSAMPLE: shrinking((width, height), pitch)}
     fitting = [kind] if kind is not None else _recognised(untouched) if rotate == 0 else []
     attempts = []
-    for name in dict.fromkeys([*TRIED, *fitting]):
+    for name in dict.fromkeys([*TRIED_PIPELINES, *fitting]):
         attempts.append(_attempt(name, settings, sample))
         report(str(attempts[-1]))
     best = max(attempt.score for attempt in attempts)
 
     def rank(attempt: Attempt) -> tuple[float, bool, bool]:
         with_dots = pitch is not None and attempt.has_dots
-        worse = 0.0 if attempt.score >= best - NEAR else 1.0 - attempt.score
+        worse = 0.0 if attempt.score >= best - SCORE_TOLERANCE else 1.0 - attempt.score
         return worse, not with_dots, attempt.pipeline not in fitting
 
     return sorted(attempts, key=rank)

@@ -14,16 +14,16 @@ from tactflow.tools.bench.lockstep import TimedResult, on_recording, take_turns,
 from tactflow.tools.bench.quantities import Tally, rms
 from tactflow.tools.bench.scenes import Rendered
 from tactflow.tools.bench.score import PipelineScore
-from tactflow.tools.bench.timing import BLOCK, Times
+from tactflow.tools.bench.timing import TURN_FRAMES, Times
 from tactflow.tools.tune.recording import Recording
 
-ERRORS: Final = {
+ERROR_KINDS: Final = {
     "center": "centre of the contact, mean",
     "dots": "displacement of the dots, RMS",
     "flow": "mean flow in the contact, mean",
 }
 """Kinds of error, px of the camera image before downsampling."""
-SOUND: Final = {
+SOUNDNESS_TOLERANCES: Final = {
     "missed_half_depth": (3.0, "% of contacts at half depth missed:"),
     "false_contacts": (2.0, "% of idle frames called contact:"),
     "wrong_percent": (0.5, "% of dots confused with others:"),
@@ -32,10 +32,10 @@ SOUND: Final = {
 }
 """Quantity of the bench -> tolerated difference from the best candidate, and its description. A pipeline
 outside a tolerance is unsound. Chosen by hand."""
-DISAGREEMENT: Final = 10.0
+MAX_DISAGREEMENT_PERCENT: Final = 10.0
 """Frames of the recording, %, in which a pipeline may disagree with the most expensive one about contact: the
 simulator lacks the sensor's light, wrinkles and stains. All differ at the ends of presses. Chosen by hand."""
-FLOW: Final = frozenset({"stages.field", "stages.flow_in_mask", "stages.flow_in_mask.method"})
+FLOW_SETTINGS: Final = frozenset({"stages.field", "stages.flow_in_mask", "stages.flow_in_mask.method"})
 """Settings that change nothing but the mean flow."""
 
 
@@ -44,7 +44,7 @@ class Trial:
     """A pipeline that is tried, and what was measured.
 
     settings : values that differ from the user's file, as `stages.preprocess.downsample` -> value.
-    errors : by kind (`ERRORS`), px of the camera image. quantities : errors by their names in the bench,
+    errors : by kind (`ERROR_KINDS`), px of the camera image. quantities : errors by their names in the bench,
     processed pixels. ms : median CPU time of a frame with contact, on the recording; infinite if not
     measured. fault : why it cannot be chosen, or "".
     """
@@ -69,7 +69,10 @@ class Trial:
 
 
 def judge(
-    trials: Sequence[Trial], recordings: Sequence[Rendered], block: int = BLOCK, limit_s: float = math.inf
+    trials: Sequence[Trial],
+    recordings: Sequence[Rendered],
+    block: int = TURN_FRAMES,
+    limit_s: float = math.inf,
 ) -> dict[str, float]:
     """Set the errors and faults of trials on simulated recordings, in turns.
 
@@ -130,10 +133,10 @@ def _busy_ms(times: Times) -> float:
 
 
 def mark_unsound(trials: Sequence[Trial]) -> None:
-    """Mark trials that are worse than the best by more than a tolerance of `SOUND`, and those with another
+    """Mark trials that are worse than the best by more than `SOUNDNESS_TOLERANCES`, and those with another
     mean flow where none could be compared with the truth."""
     running = [trial for trial in trials if not trial.fault]
-    for key, (tolerance, description) in SOUND.items():
+    for key, (tolerance, description) in SOUNDNESS_TOLERANCES.items():
         known = [trial for trial in running if key in trial.quantities]
         sign = math.copysign(1.0, tolerance)
         best = min((sign * trial.quantities[key] for trial in known), default=0.0)
@@ -143,7 +146,7 @@ def mark_unsound(trials: Sequence[Trial]) -> None:
                 trial.fault = f"{description} {value:.3g} (best {sign * best:.3g})"
     if not any("flow" in trial.errors for trial in trials):
         for trial in trials:
-            if trial.settings.keys() & FLOW and trial.usable:
+            if trial.settings.keys() & FLOW_SETTINGS and trial.usable:
                 trial.fault = "its mean flow could not be judged: too few dots in the contact"
 
 
@@ -169,5 +172,5 @@ def measure_on_recording(trials: Sequence[Trial], recording: Recording) -> None:
     for trial in running:
         trial.ms = _busy_ms(times[trial.name])
         other = 100.0 * float(np.not_equal(decisions[trial.name], decisions[running[0].name]).mean())
-        if other > DISAGREEMENT:
+        if other > MAX_DISAGREEMENT_PERCENT:
             trial.fault = f"finds other contacts than {running[0].name} in {other:.0f} % of the recording"

@@ -17,21 +17,21 @@ from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import Frame
 from tactflow.engine.graph import Pipeline
 from tactflow.sources import Arrival, open_source
-from tactflow.tools.doctor.measures import DIM, Pair
+from tactflow.tools.doctor.measures import MIN_LIT_GREY, Pair
 from tactflow.tools.doctor.observation import Observation, watch
 from tactflow.vision.arrays import ColorImage
 
-MAX_READ: Final = 1800
+MAX_READ_FRAMES: Final = 1800
 """Maximum number of frames searched for a contact: 30 s at 60 frames/s."""
-MAX_USED: Final = 160
+MAX_KEPT_FRAMES: Final = 160
 """Maximum number of frames that are kept around the strongest press."""
 MIN_FRAMES: Final = 20
 """Minimum length of a recording, frames. Chosen by hand."""
-FIRST: Final = 48
+FIRST_FRAME_COUNT: Final = 48
 """Number of first frames that are kept: a second or two."""
-MEMORY: Final = 256_000_000
-"""Bytes of the frames that are kept around the strongest press, at most `MAX_USED` of them."""
-CHANGE: Final = 0.04
+MAX_KEPT_BYTES: Final = 256_000_000
+"""Bytes of the frames that are kept around the strongest press, at most `MAX_KEPT_FRAMES` of them."""
+CONTACT_CHANGE: Final = 0.04
 """Threshold for a contact: maximum relative change of light in the small picture. Chosen by hand, 1.6 times
 the repeatability of the gel that `difference` assumes."""
 
@@ -57,12 +57,12 @@ class Kept:
 
     def add(self, image: ColorImage, *, at_rest: bool = False) -> None:
         """Keep a frame, or let it go. at_rest : only as one of the first."""
-        if len(self._first) < FIRST:
+        if len(self._first) < FIRST_FRAME_COUNT:
             self._first.append(image.copy())
             return
         if at_rest:
             return
-        room = int(np.clip(MEMORY // image.nbytes, FIRST, MAX_USED))
+        room = int(np.clip(MAX_KEPT_BYTES // image.nbytes, FIRST_FRAME_COUNT, MAX_KEPT_FRAMES))
         changes = [change for change, _ in self._window]
         change = change_between(self._first[0], image)
         if len(changes) == room:
@@ -103,7 +103,7 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
 
     def keep(arrival: Arrival) -> bool:
         kept.add(arrival.image)
-        return observation.frames < MAX_READ
+        return observation.frames < MAX_READ_FRAMES
 
     with closing(open_source(source)) as reader:
         if reader.live:
@@ -117,7 +117,7 @@ def take(source: str, pipeline: Pipeline, folder: Path) -> Recording:
         )
     frames = kept.frames
     change = max(change_between(frames[0], image) for image in frames)
-    if change < CHANGE:
+    if change < CONTACT_CHANGE:
         raise SourceError(
             f"{source}: no contact in the first {observation.frames} frames (the light changes by at most "
             f"{100 * change:.1f} %); record some presses, with the gel untouched at first"
@@ -137,7 +137,7 @@ def change_between(first: ColorImage, now: ColorImage) -> float:
     # 96 px are enough for a contact to cover several pixels.
     size = (96, max(1, round(96 * first.shape[0] / first.shape[1])))
     before, after = (cv2.resize(i, size, interpolation=cv2.INTER_AREA).astype(float) for i in (first, now))
-    ratio = np.where(before > DIM, after / np.maximum(before, DIM), 1.0)
+    ratio = np.where(before > MIN_LIT_GREY, after / np.maximum(before, MIN_LIT_GREY), 1.0)
     ratio = ratio / np.maximum(np.median(ratio, axis=(0, 1)), 0.1)
     return float(cv2.blur(np.abs(ratio - 1.0).max(axis=2), (7, 7)).max())
 

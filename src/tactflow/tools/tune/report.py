@@ -15,7 +15,7 @@ from tactflow.engine.graph import Pipeline
 from tactflow.system.terminal import markdown, printable
 from tactflow.tools.bench.page import Point, draw_points
 from tactflow.tools.page import Section, marked, page, plot, table
-from tactflow.tools.tune.measure import ERRORS
+from tactflow.tools.tune.measure import ERROR_KINDS
 from tactflow.tools.tune.search import Goal, Tuned
 
 if TYPE_CHECKING:
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 def lines(tuned: Tuned) -> Iterator[str]:
     """How the pipelines were measured, and a table of them, as Markdown."""
-    kinds = [kind for kind in ERRORS if any(kind in trial.errors for trial in tuned.trials)]
+    kinds = [kind for kind in ERROR_KINDS if any(kind in trial.errors for trial in tuned.trials)]
     facts = [
         f"simulated sensor fitted to {tuned.recording.source}: {tuned.look}",
         "errors: px of the camera image, simulated; time: CPU of a frame with contact, on the recording",
-        "; ".join(f"{kind}: {ERRORS[kind]}" for kind in kinds),
+        "; ".join(f"{kind}: {ERROR_KINDS[kind]}" for kind in kinds),
     ]
     rows = []
     for trial in tuned.trials:

@@ -15,19 +15,19 @@ from tactflow.tools.tune.recording import Recording
 from tactflow.tools.tune.sensor import Fitted, Look, fit
 from tactflow.tools.tune.space import ORIGINAL
 
-SIMULATED: Final = (Case("press", 140), Case("slide", 80))
+SIMULATED_CASES: Final = (Case("press", 140), Case("slide", 80))
 """Simulated recordings: several depths and positions, and a drag. No cable: whether its ends are detected
 under light pressure is random."""
 ERROR_FACTOR: Final = 1.5
 """Without a budget, the largest acceptable error relative to the smallest. Chosen by hand."""
-WORTHWHILE: Final = 0.95
+MAX_TIME_RATIO: Final = 0.95
 """Time, relative to the user's own pipeline, above which another one does not replace it: less is within the
 scatter of two measurements. Chosen by hand."""
 
 FIRST_LOOK: Final = Case("press", 24)
 """Short recording on which single swaps are compared with the original, before those that are worth it are
 measured like the other candidates."""
-FIRST_LOOK_S, FIRST_TURN = 3.0, 4
+FIRST_LOOK_S, FIRST_TURN_FRAMES = 3.0, 4
 """CPU time on that recording after which a swap is too slow, s, about 15 times that of the default pipeline;
 frames in a turn, so that a swap of a second a frame does not take much longer."""
 
@@ -63,7 +63,7 @@ class Goal:
         """The best of the allowed trials; the original, unless another is significantly faster."""
         allowed = self.order(self.allowed(trials))
         for trial in allowed:
-            if trial.name == ORIGINAL and WORTHWHILE * trial.ms <= allowed[0].ms:
+            if trial.name == ORIGINAL and MAX_TIME_RATIO * trial.ms <= allowed[0].ms:
                 return trial
         return allowed[0] if allowed else None
 
@@ -113,8 +113,8 @@ def search(
         worth = _at_first_sight(swaps, candidates, Fitted(look, FIRST_LOOK, folder, FIRST_LOOK.frames))
         say(f"{len(swaps)} stages swapped, worth a closer look: {', '.join(t.name for t in worth) or 'none'}")
         candidates = [*candidates, *worth]
-    say(f"{len(candidates)} candidates on {sum(case.frames for case in SIMULATED)} simulated frames")
-    judge(candidates, [Fitted(look, case, folder, case.frames) for case in SIMULATED])
+    say(f"{len(candidates)} candidates on {sum(case.frames for case in SIMULATED_CASES)} simulated frames")
+    judge(candidates, [Fitted(look, case, folder, case.frames) for case in SIMULATED_CASES])
     mark_unsound(candidates)
     _require_usable(candidates)
     say(f"the same on {recording.frames} frames of the recording")
@@ -128,15 +128,15 @@ def _at_first_sight(swaps: Sequence[Trial], candidates: Sequence[Trial], rendere
     original = next(trial for trial in candidates if trial.name == ORIGINAL)
     reference = Trial(ORIGINAL, {}, original.pipeline)
     compared = [reference, *(Trial(swap.name, swap.settings, swap.pipeline) for swap in swaps)]
-    ms = judge(compared, [rendered], FIRST_TURN, FIRST_LOOK_S)
+    ms = judge(compared, [rendered], FIRST_TURN_FRAMES, FIRST_LOOK_S)
     mark_unsound(compared)
     better = {
         trial.name
         for trial in compared[1:]
         if trial.usable
         and (
-            ms[trial.name] < WORTHWHILE * ms.get(ORIGINAL, math.inf)
-            or trial.error < WORTHWHILE * reference.error
+            ms[trial.name] < MAX_TIME_RATIO * ms.get(ORIGINAL, math.inf)
+            or trial.error < MAX_TIME_RATIO * reference.error
         )
     }
     return [swap for swap in swaps if swap.name in better]

@@ -21,9 +21,9 @@ from tactflow.tools.tune.recording import Recording
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.geometry import PixelMapping
 
-OWN_BLUR: Final = 0.9
+SIMULATOR_BLUR_PX: Final = 0.9
 """Intrinsic blur of the simulator's dots as the doctor measures it, px of its frame."""
-DOT_LIMITS: Final = (1.5, 60.0)
+DOT_RADIUS_LIMITS_PX: Final = (1.5, 60.0)
 """Range of dot radii passed to the simulator, px of its frame. Chosen by hand."""
 MAX_COLUMNS: Final = 60
 """Maximum number of columns and rows of dots in the simulator."""
@@ -66,7 +66,7 @@ def fit(recording: Recording) -> Look:
         (round(SIZE[0] * scale), round(SIZE[1] * scale)),
         query,
         round(measures.noise_of(observation.pairs), 2),
-        round(math.sqrt(max(blur**2 - (OWN_BLUR * scale) ** 2, 0.0)), 2),
+        round(math.sqrt(max(blur**2 - (SIMULATOR_BLUR_PX * scale) ** 2, 0.0)), 2),
         tuple(map(float, levels)),
     )
 
@@ -78,7 +78,7 @@ def _dots(observation: Observation, scale: float) -> str:
         return "markers=none"
     missing = measures.lattice(dots, observation.typical).missing
     pitch = min(dots.pitch / scale, 400.0)
-    radius = float(np.clip(min(dots.dot_radius / scale, 0.4 * pitch), *DOT_LIMITS))
+    radius = float(np.clip(min(dots.dot_radius / scale, 0.4 * pitch), *DOT_RADIUS_LIMITS_PX))
     columns, rows = (int(np.clip(side // pitch, 1, MAX_COLUMNS)) for side in SIZE)
     grid = f"markers={columns}x{rows}&pitch={pitch:.2f}&dot={radius:.2f}&polarity={dots.polarity}"
     return f"{grid}&missing={min(missing, 0.5):.3f}"

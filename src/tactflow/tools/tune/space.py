@@ -18,9 +18,9 @@ from tactflow.tools.tune.measure import Trial
 
 ORIGINAL: Final = "as given"
 """Name of the user's own pipeline, whatever its settings."""
-MIN_SIDE: Final = 90
+MIN_SIDE_PX: Final = 90
 """Minimum shorter side of the processed image, px: a contact of a tenth of it covers about 60 px."""
-MIN_PITCH: Final = 6.0
+MIN_PITCH_PX: Final = 6.0
 """Minimum dot pitch, processed px; the smallest on a real gel is 7 (sts_torque160)."""
 
 DOWNSAMPLE: Final = "stages.preprocess.downsample"
@@ -66,7 +66,7 @@ def candidates(
         if "flow_in_mask" not in original.nodes:
             settings.pop("stages.flow_in_mask.method", None)
         factor = settings.get(DOWNSAMPLE, 1)
-        fits = min(size) / factor >= MIN_SIDE and (pitch is None or pitch / factor >= MIN_PITCH)
+        fits = min(size) / factor >= MIN_SIDE_PX and (pitch is None or pitch / factor >= MIN_PITCH_PX)
         if not fits and factor != 1:
             continue
         try:
