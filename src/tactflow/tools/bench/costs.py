@@ -25,8 +25,16 @@ ENGINE: Final = "engine, message"
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a run. t : s. kind : one of `FRAME_KINDS`. cpu_ms, stage_ms : CPU time, total and per stage.
-    area : of the contact, px^2, 0 without. shift : largest displacement of a dot, px; NaN without dots."""
+    """One frame of a run.
+
+    Attributes
+    ----------
+    t : capture time, s.
+    kind : one of `FRAME_KINDS`.
+    cpu_ms, stage_ms : CPU time, total and per stage.
+    area : of the contact, px^2; 0 without.
+    shift : largest displacement of a dot, px; NaN without dots.
+    """
 
     t: float
     kind: str
