@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
@@ -46,7 +47,16 @@ class Clip:
         matrix = self.matrices[number] @ self.mapping.matrix
         index = self.indices[number]
         deep = any(p.depth >= DEEP * p.shape.depth - 1e-9 for p in self.scene.presses(index))
-        return _truth(self.scene, index, (width, height), matrix.tobytes()), deep
+        truth = _truth(self.scene, index, (width, height), matrix.tobytes())
+        shift = (self.matrices[number] - self.matrices[0])[:2, 2]
+        if shift.any():
+            # Displacements are those since the reference, which lay elsewhere in the picture.
+            truth, flow = copy(truth), truth.contact_flow
+            truth.origin = truth.origin - shift
+            truth.__dict__["contact_flow"] = (
+                None if flow is None else (flow[0] + shift[0], flow[1] + shift[1])
+            )
+        return truth, deep
 
     def changed(self, frames: list[Image], matrices: list[Matrix] | None = None) -> Clip:
         """The same clip with other pictures."""
@@ -101,10 +111,13 @@ class DotErrors:
         found, own = index >= 0, index[index >= 0]
         moved = (truth.position - truth.origin)[found]
         errors = metrics.distance(markers.displacement[own], moved)
-        status, stated = markers.status[own], np.nan_to_num(markers.stderr[own], nan=0.0)
+        status, stated = markers.status[own], markers.stderr[own]
         self._seen.append(errors[(status == MarkerStatus.TRACKED) & truth.visible[found]])
-        claimed = status != MarkerStatus.LOST
-        self._silent.append((errors > SILENT_PX) & (errors > SILENT_STDERR * stated) & claimed)
+        # A dot that is inferred without a standard error is one of which nothing is claimed.
+        unknown = np.where(status == MarkerStatus.TRACKED, 0.0, np.inf)
+        claimed = SILENT_STDERR * np.where(np.isnan(stated), unknown, stated)
+        lost = status == MarkerStatus.LOST
+        self._silent.append((errors > SILENT_PX) & (errors > claimed) & ~lost)
 
     def summary(self) -> dict[str, float]:
         """`SEEN_RMS` and `SILENT_PERCENT`, where there were dots."""
@@ -128,8 +141,7 @@ nothing says so, %."""
 SILENT_PX: Final = 1.0
 """Error of a dot from which it is wrong, px: half the width of the edge of a dot."""
 SILENT_STDERR: Final = 4.0
-"""Error, in stated standard errors, which they do not explain: 1 in 16,000 of normal errors. A method that
-states none says nothing."""
+"""Error, in stated standard errors, which they do not explain: 1 in 16,000 of normal errors."""
 
 MARKED: Final = (Case("bright_cable", 40), Case("press", 44), Case("jumps", 40))
 BARE: Final = (Case("unmarked", 44),)
