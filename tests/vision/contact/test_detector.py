@@ -504,6 +504,17 @@ def test_simulated_contacts_are_found_from_half_depth_on_with_their_outline(scen
     assert np.median(centers) < 1
 
 
+def test_a_contact_keeps_its_outline_where_single_channels_are_saturated() -> None:
+    scene, preprocess = open_scene("press?frames=44&markers=none"), Preprocessor((800, 600), downsample=2)
+    detector = ContactDetector()
+    # Twice as bright: a channel is saturated on nearly all of the gel.
+    rest, pressed = (cv2.convertScaleAbs(preprocess(scene.frame(index)), alpha=2) for index in (0, 26))
+    assert np.mean(np.max(rest, axis=2) == 255) > 0.8
+    detector.add_reference(rest)
+    truth = scene.truth(26, preprocess.mapping)
+    assert _overlap(detector.detect(pressed).mask > 0, truth.contact_mask) > 0.8
+
+
 @pytest.mark.parametrize("scene", ["press?markers=18x14", "finger?markers=20x16"])
 def test_in_a_small_picture_contacts_between_many_dots_keep_their_outline(scene: str) -> None:
     sensor = _Sensor(scene, 60, downsample=4)

@@ -84,7 +84,8 @@ class Derived:
 
     weight : one over the standard deviation. brightness : (h, w), one over the squared length of the weighted
     mean. colour_factor : (h, w), how much more a change of colour counts than one of brightness. scale :
-    (h, w), one over the standard deviation for `signed_change`; 0 where the light is not informative.
+    (h, w), one over the standard deviation for `signed_change`; 0 where all channels are saturated, or where
+    there is no gel.
     """
 
     illumination: IlluminationModel
@@ -113,7 +114,8 @@ class Derived:
         factor = (variance / (steady + (tint * mean) ** 2)).min(axis=0)
         length = np.linalg.norm(mean * weight, axis=0) + np.float32(1e-6)
         scale = 1 / np.sqrt(steady.max(axis=0) + (repeatability * mean.mean()) ** 2)
-        scale = scale * (mean.max(axis=0) < SATURATED_GREY)
+        # A saturated channel still darkens; where all are, nothing shows that the gel has brightened.
+        scale = scale * (mean.min(axis=0) < SATURATED_GREY)
         if gel is not None:
             weight, scale = weight * gel, scale * gel
         return cls(
@@ -226,7 +228,7 @@ class BackgroundModel:
     def signed_change(self, change: Change) -> Floats32:
         """Signed change of each cell, (3, h, w), in standard deviations that are the same for all channels.
 
-        change : of this frame. The result is 0 where the light is not informative. The variation of the light
+        change : of this frame. The result is 0 where `Derived.scale` is. The variation of the light
         is relative to the brightness of the whole picture: relative to its own, a dark channel that a tilt
         lights up would dominate the others.
         """
