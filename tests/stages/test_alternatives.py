@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 import tactflow
 from tactflow import Frame
+from tactflow.calibration.file import Calibration, ScaleEntry, small_picture
+from tactflow.config.registry import resolve
 from tactflow.engine.frame import Absent
 from tactflow.sim import open_scene
+from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.geometry import Preprocessor
-from tactflow.vision.types import MarkerStatus
+from tactflow.vision.types import MarkerStatus, Scale
 from tests.vision.dots import grid, render
 
 TRACKERS = ["lucas_kanade", "dis_flow", "rlof", "nearest_dots"]
@@ -27,6 +30,37 @@ Picture = NDArray[np.uint8]
 
 def picture(points: NDArray[np.float64], seed: int = 0) -> Picture:
     return render((205, 210), points, 4.2, noise=1.0, seed=seed)
+
+
+@pytest.mark.parametrize("name", ["depth", "frankot_chellappa"])
+def test_heights_are_those_of_the_ball_that_has_these_slopes(name: str) -> None:
+    # Of this sensor, two channels change in proportion to the horizontal part of the normal.
+    coefficients = np.zeros((6, 19, 2))
+    coefficients[0, 0, 0] = coefficients[0, 1, 1] = 1.0
+    radius, rim, mm = 60.0, 24.0, 0.1
+    y, x = np.mgrid[:160, :200] - np.array([80.0, 100.0])[:, None, None]
+    away = np.minimum(np.hypot(x, y), rim)
+    depth = mm * (np.sqrt(radius**2 - away**2) - np.sqrt(radius**2 - rim**2))
+    normal = np.where(away < rim, 1, 0) / radius * np.stack([x, y])
+    untouched = np.full((160, 200, 3), 100, np.uint8)
+    pressed = untouched.copy()
+    pressed[..., :2] = np.rint(100 + 120 * np.moveaxis(normal, 0, -1))
+    mask = ((away < rim) * 255).astype(np.uint8)
+    calibration = Calibration(
+        sensor="main",
+        made_from="a.mcap",
+        raw_size=(200, 160),
+        size=(200, 160),
+        corners=[(0.0, 0.0)] * 4,
+        scale=ScaleEntry.of(Scale(mm, mm, (0.0, 0.0), (99.5, 79.5)), "pitch"),
+        look=small_picture(untouched),
+        slopes=SlopeModel(coefficients),
+    )
+    component = resolve(name, "stages")
+    stage: Any = component.make(component.params(), calibration=calibration)
+    found = stage.process(pressed, untouched, mask, calibration.scale)
+    np.testing.assert_allclose(found.heights, depth, atol=0.03)
+    assert found.greatest == pytest.approx(depth.max(), abs=0.03)
 
 
 @pytest.mark.parametrize("name", TRACKERS)

@@ -13,6 +13,7 @@ import numpy as np
 
 from tactflow.drawing.plots import SERIES
 from tactflow.tools.bench.costs import Costs
+from tactflow.tools.bench.depth import DEPTH
 from tactflow.tools.bench.growth import Growth
 from tactflow.tools.bench.latency import percentiles
 from tactflow.tools.bench.quantities import QUANTITIES, Quantity
@@ -45,6 +46,8 @@ FRONTS: Final = (
     (PIPELINE, "angle_mean"),
     (PIPELINE, "flow_error"),
     (PIPELINE, "field_rms"),
+    (DEPTH, "depth_rms"),
+    (DEPTH, "depth_greatest"),
     ("tracker", "displacement_rms"),
     ("tracker", "lost_percent"),
     ("marker_mask", "localisation_rms"),

@@ -20,6 +20,7 @@ from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Pipeline
 from tactflow.tools.bench.costs import measure_costs
+from tactflow.tools.bench.depth import DEPTH, DEPTH_SCENES, simulated_calibration, with_depth
 from tactflow.tools.bench.growth import measure_growth
 from tactflow.tools.bench.latency import measure_latency
 from tactflow.tools.bench.lockstep import TimedResult, on_recording, take_turns
@@ -27,7 +28,16 @@ from tactflow.tools.bench.methods import measure_methods
 from tactflow.tools.bench.pictures import deepest_frame, found_picture, true_picture
 from tactflow.tools.bench.quantities import Tally
 from tactflow.tools.bench.results import CLASSIC, PIPELINE, TRUTH, BenchResult
-from tactflow.tools.bench.scenes import FULL, FULL_STAGES, QUICK, QUICK_STAGES, TROUBLES, Case, rendered
+from tactflow.tools.bench.scenes import (
+    FULL,
+    FULL_STAGES,
+    QUICK,
+    QUICK_STAGES,
+    TROUBLES,
+    Case,
+    Rendered,
+    rendered,
+)
 from tactflow.tools.bench.score import PipelineScore
 
 DEFAULT = "default"
@@ -84,6 +94,11 @@ def run_bench(
             for case in alone
             if case.label in scenes
         ]
+        if everything and not quick:
+            steps += [
+                (f"depth on {case.label}", partial(measure_depth, *shared, loaded, case))
+                for case in DEPTH_SCENES
+            ]
         if everything or recording is not None:
             steps += _further_steps(result, Path(folder), loaded, recording)
         for number, (what, measure) in enumerate(steps):
@@ -95,35 +110,65 @@ def run_bench(
 
 
 def measure_scene(result: BenchResult, scratch: Path, loaded: Pipelines, case: Case) -> None:
-    """Measure whole pipelines, in turns of a few frames, on a simulated scene.
+    """Measure whole pipelines on a simulated scene, and keep a picture of its deepest frame.
 
     result : rows are added to it. scratch : folder for temporary files.
     """
     with rendered(case, scratch) as scene:
-        suited = _marked(loaded) if len(scene.scene.layout.rest) else _bare(loaded)
+        suited = _suited(loaded, scene)
         if case in TROUBLES:
             # The script takes half of a run's time and was not made for any of this.
             suited = {name: pipeline for name, pipeline in suited.items() if name != CLASSIC}
-        scores = {name: PipelineScore(scene, Tally()) for name in suited}
-        ready = {name: on_recording(pipeline, scene.path) for name, pipeline in suited.items()}
         deepest = deepest_frame(scene)
         shown: dict[str, bytes] = {}
 
-        def observe(name: str, found: TimedResult) -> str:
+        def look(name: str, found: TimedResult) -> None:
             if found.seq == deepest:
                 if found.mapping is not None and not shown:
                     shown[TRUTH] = true_picture(found, scene.truths(found.mapping)[deepest])
                 shown[name] = found_picture(found)
-            return scores[name].add(found)
 
-        times, failures = take_turns(ready, observe)
+        _measure(result, PIPELINE, suited, scene, look)
     result.pictures[case.label] = shown
+
+
+def measure_depth(result: BenchResult, scratch: Path, loaded: Pipelines, case: Case) -> None:
+    """Measure pipelines with a calibration, and other stages for the depth, on a simulated scene.
+
+    result, scratch : as for `measure_scene`.
+    """
+    with rendered(case, scratch) as scene:
+        _measure(result, DEPTH, with_depth(_suited(loaded, scene), simulated_calibration()), scene)
+
+
+def _measure(
+    result: BenchResult,
+    group: str,
+    pipelines: Pipelines,
+    scene: Rendered,
+    look: Callable[[str, TimedResult], None] = lambda *_: None,
+) -> None:
+    """Measure whole pipelines, in turns of a few frames. look : is shown every result."""
+    scores = {name: PipelineScore(scene, Tally()) for name in pipelines}
+    ready = {name: on_recording(pipeline, scene.path) for name, pipeline in pipelines.items()}
+
+    def observe(name: str, found: TimedResult) -> str:
+        look(name, found)
+        return scores[name].add(found)
+
+    times, failures = take_turns(ready, observe)
+    label = scene.case.label
     for name, score in scores.items():
         if name in failures:
-            result.failures[f"{PIPELINE}/{name}/{case.label}"] = failures[name]
+            result.failures[f"{group}/{name}/{label}"] = failures[name]
         else:
             errors, frames = score.tally.errors(), sum(map(len, times[name].values()))
-            result.add(PIPELINE, name, case.label, errors, times=times[name], frames=frames)
+            result.add(group, name, label, errors, times=times[name], frames=frames)
+
+
+def _suited(loaded: Pipelines, scene: Rendered) -> dict[str, Pipeline]:
+    """The pipelines for a gel with or without markers, as the scene has it."""
+    return _marked(loaded) if len(scene.scene.layout.rest) else _bare(loaded)
 
 
 def _further_steps(

@@ -7,19 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.sim import Truth
+from tactflow.sim.gel import MM_PER_PX
 from tactflow.tools.bench import metrics
 from tactflow.tools.bench.lockstep import TimedResult
 from tactflow.tools.bench.quantities import Tally
 from tactflow.tools.bench.scenes import Rendered
 from tactflow.vision.flow import DisplacementField
 from tactflow.vision.geometry import PixelMapping
-from tactflow.vision.types import Contact, Flow, Markers, MarkerStatus
+from tactflow.vision.types import Contact, Depth, Flow, Markers, MarkerStatus
 
 MIN_DIRECTED_AXIS_RATIO = 2.0
 """Minimum ratio of the axes of a contact whose direction is judged. Chosen by hand."""
 
 _FIELD_POINT_COUNT = 100
 """Places at which a displacement field is compared."""
+
+MIN_DEPTH_MM = 0.1
+"""True depth from which a height map is judged, mm: of less, a relative error says nothing."""
 
 _MIN_ROUND_PIXELS = 100
 """Minimum number of pixels of a contact whose roundness is judged. Chosen by hand."""
@@ -97,6 +101,20 @@ def add_field(tally: Tally, field: DisplacementField | None, truth: Truth) -> No
     points = np.column_stack([columns, rows])[chosen].astype(np.float64)
     errors = field.at(points) - truth.displacement(points)
     tally.add(field_rms=np.hypot(*errors.T))
+
+
+def add_depth(tally: Tally, depth: Depth | None, truth: Truth) -> None:
+    """Compare a height map within the true contact, from `MIN_DEPTH_MM` on."""
+    if depth is None or not truth.touching:
+        return
+    true = truth.sunk * MM_PER_PX
+    greatest = float(true.max())
+    if greatest < MIN_DEPTH_MM:
+        return
+    tally.add(depth_rms=(depth.heights - true)[truth.contact_mask])
+    tally.add(depth_greatest=100 * abs(depth.greatest / greatest - 1))
+    if depth.greatest_stderr is not None:
+        tally.within("depth", depth.greatest - greatest, depth.greatest_stderr)
 
 
 def add_detection(tally: Tally, points: NDArray[np.float64], truth: Truth) -> None:
@@ -185,4 +203,5 @@ class PipelineScore:
             self._markers.add(result.markers, truth)
         add_flow(self.tally, result.flow, truth)
         add_field(self.tally, result.field, truth)
+        add_depth(self.tally, result.depth, truth)
         return "contact" if truth.touching else "idle"

@@ -8,11 +8,13 @@ from statistics import median
 import numpy as np
 
 from tactflow.system.terminal import markdown
+from tactflow.tools.bench.depth import DEPTH
 from tactflow.tools.bench.quantities import QUANTITIES
 from tactflow.tools.bench.results import CLASSIC, LEFT_OUT, PIPELINE, TIMES, BenchResult, Measurement
 
 TITLES = {
     PIPELINE: "Whole pipelines",
+    DEPTH: "Depth, with a calibration",
     "marker_mask": "Marker mask",
     "inpaint": "Marker removal",
     "difference": "Contact or not, and where",
@@ -24,6 +26,7 @@ TITLES = {
 
 PRIMARY = {
     PIPELINE: ("displacement_rms", "center_error", "angle_mean", "hull_iou", "flow_error"),
+    DEPTH: ("depth_rms", "depth_greatest"),
     "marker_mask": ("marker_recall", "localisation_rms"),
     "inpaint": ("inpaint_mae",),
     "difference": ("contact_iou", "center_error", "false_contacts", "missed_contacts"),
