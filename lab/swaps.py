@@ -37,6 +37,7 @@ from tactflow.config.load import load_pipeline
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.tools.bench import metrics
 from tactflow.tools.bench.command import packaged_files
+from tactflow.tools.bench.depth import DEPTH, DEPTH_SCENES
 from tactflow.tools.bench.methods import STAGES, alternatives
 from tactflow.tools.bench.quantities import QUANTITIES, Tally
 from tactflow.tools.bench.run import machine
@@ -320,9 +321,10 @@ def from_bench(path: Path) -> dict[str, Any]:
     scenes = set()
     for key, numbers in json.loads(path.read_text(encoding="utf-8"))["values"].items():
         group, *method, scene = key.split("/")
-        if group not in STAGES:
+        if group not in (*STAGES, DEPTH):
             continue
-        scenes.add(scene)
+        if group in STAGES:
+            scenes.add(scene)
         own = values.setdefault(group, {}).setdefault("/".join(method), {})
         for quantity, value in numbers.items():
             own.setdefault(quantity, []).append(value)
@@ -347,13 +349,17 @@ def write(numbers: Mapping[str, Any], path: Path) -> None:
         for name, (stage, columns) in FRONTS.items()
     }
     stages = []
-    for stage in STAGES:
+    for stage in (*STAGES, DEPTH):
         columns = [("ms", f"bench|{stage}|*|contact_ms", ".3g", -1)]
         for key in PRIMARY[stage]:
             quantity = QUANTITIES[key]
             columns.append((quantity.heading, f"bench|{stage}|*|{key}", ".3g", 1 if quantity.best else -1))
         table = page.table(numbers, columns, list(ways(stage)))
-        stages += [f"### {TITLES[stage]}: `{stage}`", "", *table, "", *advice(stage), ""]
+        stages += [f"### {TITLES[stage]}: `{stage}`", ""]
+        if stage == DEPTH:
+            pressed = ", ".join(case.name for case in DEPTH_SCENES[:-1])
+            stages += [f"Times are those of a whole frame, scenes {pressed}.", ""]
+        stages += [*table, "", *advice(stage), ""]
     values = page.Values(tables | {"stages": "\n".join(stages)})
     values["machine"] = ", ".join(f"{key} {value}" for key, value in numbers["machine"].items())
     values.numbers = numbers

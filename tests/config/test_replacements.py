@@ -62,9 +62,9 @@ class Wrong(Stage):
         ("hull", ["classic_hull", "fit_line", "min_area_rect"]),
         ("flow_in_mask", ["classic_flow"]),
         ("otsu", ["classic_difference", "difference", "knn", "mog2", "ssim"]),
-        # `fusion` takes the contact mask that it gives; `depth` and `normals` give different things.
+        # `fusion` takes the contact mask that it gives; `normals` gives something else than `depth`.
         ("fusion", []),
-        ("depth", []),
+        ("depth", ["frankot_chellappa"]),
         ("capture", []),
     ],
 )

@@ -46,17 +46,19 @@ def simulated_calibration() -> Path:
     return path
 
 
-def with_depth(pipelines: Mapping[str, Pipeline], calibration: Path) -> dict[str, Pipeline]:
-    """The pipelines that measure depth, calibrated; the first also with every other stage in its place."""
+def with_depth(pipelines: Mapping[str, Pipeline], calibration: Path, swapped: str) -> dict[str, Pipeline]:
+    """The pipelines that measure depth, calibrated; one of them also with every other stage in its place.
+
+    swapped : name of that one.
+    """
     found: dict[str, Pipeline] = {}
     for name, pipeline in pipelines.items():
         if DEPTH not in pipeline.nodes:
             continue
-        calibrated = replace(pipeline, calibration=calibration)
+        found[name] = calibrated = replace(pipeline, calibration=calibration)
         node = calibrated.nodes[DEPTH]
-        others = replacements(node.component, [n.component for n in pipeline.nodes.values()])
-        found[name] = calibrated
-        for other in others if len(found) == 1 else ():
+        used = [node.component for node in pipeline.nodes.values()]
+        for other in replacements(node.component, used) if name == swapped else ():
             nodes = {**calibrated.nodes, DEPTH: replace(node, component=other, params=other.params())}
             found[other.name] = replace(calibrated, nodes=nodes)
     return found

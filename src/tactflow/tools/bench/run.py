@@ -138,7 +138,8 @@ def measure_depth(result: BenchResult, scratch: Path, loaded: Pipelines, case: C
     result, scratch : as for `measure_scene`.
     """
     with rendered(case, scratch) as scene:
-        _measure(result, DEPTH, with_depth(_suited(loaded, scene), simulated_calibration()), scene)
+        calibrated = with_depth(_suited(loaded, scene), simulated_calibration(), DEFAULT)
+        _measure(result, DEPTH, calibrated, scene)
 
 
 def _measure(
