@@ -262,7 +262,7 @@ def test_a_file_that_claims_an_absurd_picture_is_refused_before_memory_is_taken(
     picture.write_bytes(data)
     with pytest.raises(SourceError, match=r"has more than|not an image"):
         open_source(str(picture))
-    monkeypatch.setattr(base, "MOST_PIXELS", 700)
+    monkeypatch.setattr(base, "MAX_PIXELS", 700)
     with pytest.raises(SourceError, match="32 x 24, more than 700 pixels"):
         open_source(make(tmp_path, "video.avi"))
 
