@@ -371,7 +371,7 @@ def advice(stage: str) -> Iterator[str]:
     """Lines of a list: each registered alternative, and when to take it, by its docstring."""
     for name, node in ways(stage).items():
         paragraphs = inspect.cleandoc(node.component.cls.__doc__ or "").split("\n\n")
-        use = [" ".join(paragraph.split()) for paragraph in paragraphs if paragraph.startswith("Take ")]
+        use = [" ".join(paragraph.split()) for paragraph in paragraphs if paragraph.startswith("Use ")]
         if use:
             yield f"- `{node.component.name}`{' (classic)' if name == 'classic' else ''}: {use[0]}"
 

@@ -16,7 +16,7 @@ from tactflow.vision.markers.mask import Dot, find_dot
 class AdaptiveThreshold(Stage):
     """Mask of the dots by an adaptive threshold on the brightness.
 
-    Take it for marks of any shape, such as lines, squares or characters. The borders of a contact are in its
+    Use it for marks of any shape, such as lines, squares or characters. The borders of a contact are in its
     mask, too.
 
         marker_mask: {use: adaptive_threshold, contrast: 12}

@@ -17,7 +17,7 @@ from tactflow.vision.markers.mask import Dot, find_dot
 class BlobDetector(Stage):
     """Mask of the dots by SimpleBlobDetector: discs that many thresholds agree on.
 
-    Take it for isolated round dots, and where each pixel outside of dots has to stay out of the mask. Worn
+    Use it for isolated round dots, and where no pixel outside a dot may be masked. Worn
     dots and those beside a contact are missing.
 
         marker_mask: {use: blob_detector}

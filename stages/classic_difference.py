@@ -14,7 +14,7 @@ from tactflow.ports import ContactPorts, Unmarked
 class ClassicDifference(Stage):
     """Contact where the gel is brighter by 14 grey levels in all channels, as in the original script.
 
-    Take it as the baseline. It finds nothing on gels that answer with colour or darken.
+    Use it as the baseline. It finds nothing on gels that change colour or darken.
 
         difference: {use: classic_difference}
 

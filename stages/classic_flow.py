@@ -13,7 +13,7 @@ from tactflow.vision.types import Flow, Markers
 class ClassicFlow(Stage):
     """Mean displacement of the dots inside the contact, in whole pixels, as in the original script.
 
-    Take it as the baseline. Lost dots count, too.
+    Use it as the baseline. Lost dots count, too.
 
         flow_in_mask: {use: classic_flow, dilate: 8, when: touching}
 

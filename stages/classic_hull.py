@@ -12,7 +12,7 @@ from tactflow.vision.types import Contact
 class ClassicHull(Stage):
     """Hull, line through its vertices and ellipse of the contact, as in the original script.
 
-    Take it as the baseline. Its centre is the middle of the line across the picture, not of the contact.
+    Use it as the baseline. Its centre is the middle of the line across the picture, not of the contact.
 
         hull: {use: classic_hull, when: touching}
 

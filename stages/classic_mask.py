@@ -10,7 +10,7 @@ from tactflow.ports import Image, MarkerMask
 class ClassicMask(Stage):
     """Mask of dark dots by a difference of Gaussians, as in the original script.
 
-    Take it as the baseline. Its sizes and its threshold are those of one sensor: dots of 9 px diameter.
+    Use it as the baseline. Its sizes and its threshold are those of one sensor: dots of 9 px diameter.
 
         marker_mask: {use: classic_mask}
 

@@ -12,7 +12,7 @@ class ClassicTracker(Stage):
     """Match the dots of each frame to the grid of the first one by depth-first search, as in the original
     script.
 
-    Take it as the baseline, for a grid of rows and columns without gaps.
+    Use it as the baseline, for a grid of rows and columns without gaps.
 
         tracker: {use: classic_tracker}
 

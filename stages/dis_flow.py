@@ -27,7 +27,7 @@ _PRESETS = {
 class DisFlow(Stage):
     """Follow the dots by DIS optical flow, sampled at the dots, with a forward-backward check.
 
-    Take it where the gel has texture between the dots, or as a start for a flow of every pixel. Its
+    Use it where the gel has texture between the dots, or as a start for a flow of every pixel. Its
     smoothness pulls dots towards their neighbours: a tenth of a pixel or more.
 
         tracker: {use: dis_flow, preset: medium}

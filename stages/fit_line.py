@@ -19,7 +19,7 @@ from tactflow.vision.types import Contact
 class FitLine(Stage):
     """Hull and area of the contact, with a line fitted to its outline for centre and direction.
 
-    Take `huber` for contacts whose outline has long spurs, such as a cable beside a glint; otherwise both are
+    Use `huber` for contacts whose outline has long spurs, such as a cable beside a glint; otherwise both are
     the same. The centre is that of the outline, which leans towards its ragged side.
 
         hull: {use: fit_line, distance: huber, when: touching}

@@ -16,7 +16,7 @@ from tactflow.ports import Image, MarkerMask, Unmarked
 class FrequencySelective(Stage):
     """Fill the markers by frequency selective reconstruction, which continues the texture around them.
 
-    Take it for pictures of single presses whose texture matters, such as a weave; at half a second or more a
+    Use it for pictures of single presses whose texture matters, such as a weave; at half a second or more a
     frame it is too slow for anything else.
 
         inpaint: {use: frequency_selective, quality: best}

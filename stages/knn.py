@@ -24,7 +24,7 @@ reference within four frames."""
 class Knn(Stage):
     """Detect contact by background subtraction with k nearest neighbours.
 
-    Take it for a fixed distance of colours from a reference that has more than one state, such as lamps that
+    Use it for a fixed distance of colours from a reference that has more than one state, such as lamps that
     flicker. With a `learning_rate` it follows slow light, and forgets contacts that last.
 
         difference: {use: knn, distance: 12}

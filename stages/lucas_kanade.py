@@ -19,7 +19,7 @@ from tactflow.vision.types import Markers
 class LucasKanade(Stage):
     """Follow the dots by pyramidal Lucas-Kanade, with a forward-backward check.
 
-    Take it as the yardstick that every reader knows, and for marks of any shape that move by less than half
+    Use it as the yardstick that every reader knows, and for marks of any shape that move by less than half
     their distance between frames. It confuses dots that jump farther, and knows no standard errors.
 
         tracker: {use: lucas_kanade, max_error: 0.5}

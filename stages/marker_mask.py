@@ -50,7 +50,7 @@ class MarkerMaskStage(Stage):
     def process(self, image: Image, valid: Valid | None = None) -> MarkerMask:
         """255 where a marker covers the gel; all 0 where the first frame showed no markers.
 
-        How they look is learned inside of `valid`.
+        Their appearance is learned inside `valid`.
         """
         if not self._known:
             self._dot, self._known = self._find(image, valid), True

@@ -18,7 +18,7 @@ from tactflow.vision.types import Contact
 class MinAreaRect(Stage):
     """Hull and area of the contact, with the smallest rectangle around it for centre and direction.
 
-    Take it for boxes, bars and edges that end inside the picture. A single pixel that sticks out turns it; a
+    Use it for boxes, bars and edges that end inside the picture. A single pixel that sticks out turns it; a
     bent or round contact has no stable rectangle.
 
         hull: {use: min_area_rect, when: touching}

@@ -15,7 +15,7 @@ from tactflow.vision.contact.specks import without_specks
 class Mog2(Stage):
     """Detect contact by background subtraction with a mixture of Gaussians, MOG2.
 
-    Take it where the reference has many frames, so that each pixel's own noise is known, and where the light
+    Use it where the reference has many frames, so that each pixel's own noise is known, and where the light
     flickers between a few states. With a `learning_rate` it follows slow light, and forgets contacts that
     last.
 

@@ -16,7 +16,7 @@ from tactflow.vision.types import Markers
 class NearestDots(Stage):
     """Link the dots detected in each frame to the nearest ones of the frame before.
 
-    Take it as the simplest tracker, where dots move by less than half their distance between frames, and as
+    Use it as the simplest tracker, where dots move by less than half their distance between frames, and as
     a start for a tracker with a detector of your own. A dot that is hidden for a while may come back as
     another.
 

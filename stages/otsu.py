@@ -16,8 +16,8 @@ from tactflow.vision.contact.specks import without_specks
 class Otsu(Stage):
     """Detect contact by the absolute difference from the reference and Otsu's threshold.
 
-    Take it as the usual first script, and where the strength of the answer differs from press to press. Otsu
-    splits every picture, so `least` says from which threshold on the two parts are gel and contact.
+    Use it as the usual first script, and where the strength of the response differs from press to press. Otsu
+    splits every picture, so `least` is the lowest threshold that separates gel from contact.
 
         difference: {use: otsu, least: 8}
 

@@ -68,7 +68,7 @@ class Probe(Stage):
         self._since_work = 0
 
     def process(self, frame: Frame) -> ProbePorts:
-        """Compare with the frames before. Only the smallest rectangle that holds all of the gel is looked at;
+        """Compare with the frames before. Only the smallest rectangle around the gel is compared;
         a reference frame is always processed."""
         if not self._skipping:
             return ProbePorts(True, True)

@@ -20,7 +20,7 @@ from tactflow.vision.types import Markers
 class Rlof(Stage):
     """Follow the dots by robust local optical flow (RLOF), with a forward-backward check.
 
-    Take it where the light over the dots changes with the contact and Lucas-Kanade loses them: it estimates
+    Use it where the light over the dots changes with the contact and Lucas-Kanade loses them: it estimates
     gain and offset of each window, and gives less weight to pixels that differ.
 
         tracker: {use: rlof, max_error: 0.5}

@@ -17,7 +17,7 @@ from tactflow.vision.markers.detection import to_gray
 class Ssim(Stage):
     """Detect contact by the structural similarity to the reference, SSIM.
 
-    Take it for objects with texture: it answers to edges and ridges, and little to a change of brightness.
+    Use it for objects with texture: it responds to edges and ridges, and little to changes of brightness.
     The smooth middle of a ball's contact is missing in its mask.
 
         difference: {use: ssim, similarity: 0.8}

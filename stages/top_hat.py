@@ -18,7 +18,7 @@ from tactflow.vision.markers.mask import Dot, find_dot
 class TopHat(Stage):
     """Mask of the dots by a top-hat: what is narrower than a disc, and darker or brighter than around.
 
-    Take it for marks of one width under uneven light; it keeps their outline to the pixel. Thin folds of the
+    Use it for marks of one width under uneven light; it keeps their outline to the pixel. Thin folds of the
     gel are in its mask, too.
 
         marker_mask: {use: top_hat, contrast: 12}

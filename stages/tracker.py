@@ -51,7 +51,7 @@ class Tracker(Stage):
     def process(self, image: Image, frame: Frame, valid: Valid | None = None) -> Markers:
         """Position, status and standard error of every marker; the first frame serves as reference.
 
-        Marks are looked for inside of `valid`. One that the reference did not show joins behind the others.
+        Marks are searched for inside `valid`. Those that the reference did not show are appended.
         """
         if self._tracker is None:
             self._valid = valid

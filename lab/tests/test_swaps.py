@@ -65,4 +65,4 @@ def test_the_page_has_every_way_to_do_a_stages_work_and_marks_what_is_better(tmp
     assert "| dis_flow | 2.00 | 0.300 |" in text
     # Everything registered has a row, measured or not, and says when to take it.
     assert "| nearest_dots | - | - |" in text
-    assert "- `otsu`: Take it as the usual first script" in text
+    assert "- `otsu`: Use it as the usual first script" in text
