@@ -25,6 +25,13 @@ class Csv(LineSink):
 
     The unit stands behind the name, because a second line of units would turn each column into text for
     spreadsheets, pandas and R.
+
+    >>> from pathlib import Path
+    >>> import tactflow
+    >>> settings = {"sinks": {"csv": {"path": "a.csv"}}}
+    >>> result = tactflow.run("markerless", source="sim:unmarked", settings=settings, max_frames=3)
+    >>> Path("a.csv").read_text().split(",")[:3]
+    ['sensor', 'seq', 't [s]']
     """
 
     class Params(LineParams):

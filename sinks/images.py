@@ -26,6 +26,12 @@ class Images(Sink):
 
     The picture comes from the port `annotated`; `in: {annotated: inpaint.unmarked}` selects another colour
     image. `max_rate` writes fewer frames.
+
+    >>> import tactflow
+    >>> settings = {"sinks": {"images": {"folder": "pictures"}}}
+    >>> result = tactflow.run(source="sim:press", settings=settings, max_frames=3)
+    >>> sorted(path.name for path in Path("pictures").glob("*.png"))
+    ['frame-000000.png', 'frame-000001.png', 'frame-000002.png']
     """
 
     threaded = True

@@ -14,6 +14,13 @@ class Jsonl(LineSink):
     Lines reach a file at least every `flush` seconds and at the end, and standard output at once. If the
     reader of standard output closes it, the sink requests no more frames. A recording waits for a slow
     reader; in a live run, lines are dropped and counted instead.
+
+    >>> from pathlib import Path
+    >>> import tactflow
+    >>> settings = {"sinks": {"jsonl": {"path": "a.jsonl"}}}
+    >>> result = tactflow.run("markerless", source="sim:unmarked", settings=settings, max_frames=3)
+    >>> len(Path("a.jsonl").read_text().splitlines())
+    3
     """
 
     class Params(MessageParams, LineParams):

@@ -43,6 +43,12 @@ class Record(OutputSink, Recorder):
     A recording from the start is written to `path`, all others to numbered files, `press-001.mcap`, which
     never replace a file. With `rotate_after`, a long recording continues in further numbered files, each of
     which can be played by itself.
+
+    >>> import tactflow
+    >>> settings = {"sinks": {"record": {"path": "a.mcap"}}}
+    >>> result = tactflow.run("markerless", source="sim:unmarked", settings=settings, max_frames=3)
+    >>> tactflow.run("markerless", source="a.mcap", settings={"sinks": {}}).stats["frames"]
+    3
     """
 
     takes_references = True

@@ -18,6 +18,12 @@ class Video(OutputSink):
 
     The file plays at the rate of capture: without `fps`, that is the median rate of the first frames. Players
     show frames at a constant rate, so frames dropped by a live run shorten the film.
+
+    >>> import tactflow
+    >>> settings = {"sinks": {"video": {"path": "a.avi"}}}
+    >>> result = tactflow.run(source="sim:press", settings=settings, max_frames=3)
+    >>> tactflow.run("markerless", source="a.avi", settings={"sinks": {}}).stats["frames"]
+    3
     """
 
     class Params(OutputParams):

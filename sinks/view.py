@@ -38,6 +38,11 @@ class View(Sink):
 
     While no open page is ready for another frame, none is requested or encoded. A view that cannot be served
     is reported once and never stops a run.
+
+    >>> import tactflow
+    >>> settings = {"sinks": {"view": {"port": 0}}}
+    >>> tactflow.run(source="sim:press", settings=settings, max_frames=3).stats["frames"]
+    3
     """
 
     threaded = True

@@ -39,6 +39,17 @@ class Zmq(Sink):
     topic, a space, JSON with sensor, seq, t and size (width, height), a line end, the data.
 
     With `control`, other programs may pause the run, take a new reference, start and end recordings.
+
+    >>> import tactflow
+    >>> sink = Zmq(Zmq.Params(endpoint="tcp://127.0.0.1:*"))
+    >>> sink.open()
+    >>> with tactflow.Subscriber(sink.endpoint) as results:
+    ...     sink.wait_for_subscriber(10)
+    ...     sink.write(Result(tactflow.Frame("main", 36, 1.2, np.zeros((60, 80, 3), np.uint8))))
+    ...     next(iter(results)).seq
+    True
+    36
+    >>> sink.close()
     """
 
     threaded = True

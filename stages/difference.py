@@ -15,8 +15,14 @@ from tactflow.vision.contact.reference import ReferenceCheck
 
 
 class ContactPorts(NamedTuple):
-    """contact_mask : 255 in contact. touching : whether anything is. deviations : the changes behind the
-    mask; None without contact."""
+    """Where something touches the gel.
+
+    Attributes
+    ----------
+    contact_mask : 255 in contact.
+    touching : whether anything is.
+    deviations : the changes behind the mask; None without contact.
+    """
 
     contact_mask: ContactMask
     touching: Touching

@@ -12,7 +12,12 @@ from tactflow.vision.types import Markers
 
 
 class FieldPorts(NamedTuple):
-    """field : the displacement of the gel on a regular grid."""
+    """Motion of the gel.
+
+    Attributes
+    ----------
+    field : displacement on a regular grid.
+    """
 
     field: DisplacementField | None
 

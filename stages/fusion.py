@@ -14,7 +14,14 @@ from tactflow.vision.types import Evidence, Markers
 
 
 class FusedPorts(NamedTuple):
-    """contact_mask : 255 in contact. touching : whether anything is. evidence : what showed it."""
+    """Where something touches the gel.
+
+    Attributes
+    ----------
+    contact_mask : 255 in contact.
+    touching : whether anything is.
+    evidence : what showed it.
+    """
 
     contact_mask: ContactMask
     touching: Touching

@@ -59,7 +59,13 @@ smallest pictures of the sensors with shipped pipelines."""
 
 
 class Preprocessed(NamedTuple):
-    """image : the processed frame. mapping : between its pixels and those of the raw frame."""
+    """The processed frame.
+
+    Attributes
+    ----------
+    image : its pixels.
+    mapping : between its pixels and those of the raw frame.
+    """
 
     image: Image
     mapping: PixelMapping

@@ -14,7 +14,13 @@ from tactflow.vision.geometry.valid_area import bounding_box, valid_area
 
 
 class ProbePorts(NamedTuple):
-    """changed : whether anything may have moved. suspect : whether the contact may be another one."""
+    """Which stages a frame needs.
+
+    Attributes
+    ----------
+    changed : whether anything may have moved.
+    suspect : whether the contact may have changed.
+    """
 
     changed: Changed
     suspect: Suspect

@@ -33,8 +33,10 @@ def test_the_examples_of_a_module_run(name: str, tmp_path: Path, monkeypatch: py
     assert doctest.testmod(module, optionflags=flags).failed == 0
 
 
-@pytest.mark.parametrize("name", [module.name for module in pkgutil.iter_modules(stages.__path__)])
-def test_every_stage_has_an_example(name: str) -> None:
+@pytest.mark.parametrize(
+    "name", [module.name for package in (stages, sinks) for module in pkgutil.iter_modules(package.__path__)]
+)
+def test_every_stage_and_sink_has_an_example(name: str) -> None:
     (component,) = (component for component in catalogue()[0] if component.name == name)
     assert ">>>" in (component.cls.__doc__ or "")
 

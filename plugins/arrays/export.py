@@ -94,6 +94,8 @@ def export(
 class ArrayFile:
     """Writes an HDF5 file with one array per quantity, all of which grow along their first axis.
 
+    Parameters
+    ----------
     path : of the file. Raises OSError if it cannot be created.
     """
 

@@ -37,11 +37,14 @@ MAX_READ_BYTES = 64 << 20
 class ArrayDataset(FrameReader):
     """Frames of one array of an HDF5 file, a Zarr folder or a Zarr .zip file.
 
+    Parameters
+    ----------
     spec : `file.h5?dataset=/frames`; `times=/t` names their times, else frame i is taken at i / fps;
-    `order=rgb` if the colors are in that order. If an array `episode_ends` divides the frames, each episode
-    is an epoch with a reference of its own, and `episode=3` plays one of them. An export of tactflow needs no
-    settings. directory, fps : as for `open_source`. Raises SourceError if there is no such file, array (it
-    lists the valid ones) or episode, it holds no frames, or a package is missing.
+        `order=rgb` if the colors are in that order. If an array `episode_ends` divides the frames, each
+        episode is an epoch with a reference of its own, and `episode=3` plays one of them. An export of
+        tactflow needs no settings.
+    directory, fps : as for `open_source`. Raises SourceError if there is no such file, array (it lists the
+        valid ones) or episode, it holds no frames, or a package is missing.
     """
 
     # HDF5 and the codecs of both formats raise all kinds of errors.

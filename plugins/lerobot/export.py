@@ -89,7 +89,12 @@ def export(
 
 
 class DatasetWriter:
-    """Writes one dataset. Parameters as for `export`; video : whether to store pictures as a video."""
+    """Writes one dataset. Parameters as for `export`;
+
+    Parameters
+    ----------
+    video : whether to store pictures as a video.
+    """
 
     def __init__(self, folder: Path, fps: int, task: str, *, video: bool = True) -> None:
         problem = missing("LeRobot datasets", "lerobot", ["pyarrow", "av"])

@@ -22,8 +22,12 @@ SETTINGS = {"camera": "key of a camera", "episode": "number of an episode (all i
 class Episode(NamedTuple):
     """Where an episode is.
 
-    number : in the dataset. length : number of frames. table, video : its files. begin : its start in the
-    video, s.
+    Attributes
+    ----------
+    number : in the dataset.
+    length : number of frames.
+    table, video : its files.
+    begin : its start in the video, s.
     """
 
     number: int
@@ -38,9 +42,12 @@ class LeRobotEpisodes(FrameReader):
 
     Each episode is an epoch with a reference of its own.
 
-    spec : `PATH?camera=observation.images.left_tactile&episode=3`, with or without the prefix `lerobot:`; the
-    only camera need not be named. directory : as for `open_source`. Raises SourceError if there is no such
-    dataset, camera or episode (it lists the valid ones), or a package is missing.
+    Parameters
+    ----------
+    spec : `PATH?camera=observation.images.left_tactile&episode=3`, with or without the prefix `lerobot:`;
+        the only camera need not be named.
+    directory : as for `open_source`. Raises SourceError if there is no such dataset, camera or episode (it
+        lists the valid ones), or a package is missing.
     """
 
     # The parsers of JSON, Parquet and video raise all kinds of errors.

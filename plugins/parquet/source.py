@@ -26,9 +26,12 @@ class PictureColumn(FrameReader):
     A picture is the bytes of a JPEG, PNG or other image file, by themselves or in a struct with the field
     `bytes`.
 
+    Parameters
+    ----------
     spec : `file.parquet?column=image`, or a folder of that name with several files, which are read in
-    natural order; a single column of pictures need not be named. directory, fps : as for `open_source`.
-    Raises SourceError if there is no such file or column (it lists the valid ones), or a package is missing.
+        natural order; a single column of pictures need not be named.
+    directory, fps : as for `open_source`. Raises SourceError if there is no such file or column (it lists
+        the valid ones), or a package is missing.
     """
 
     # Arrow raises all kinds of errors.

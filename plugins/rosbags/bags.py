@@ -58,9 +58,11 @@ class Bag(FrameReader):
     The time of a frame is the stamp in its message, or the time of its recording if that is 0; it counts from
     the first frame.
 
-    spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder. directory : as for
-    `open_source`. Raises SourceError if there is no such file or topic (it lists the valid ones), or a
-    package is missing.
+    Parameters
+    ----------
+    spec : `file.mcap?topic=/name`, and so for a `.bag` or `.db3` file or a rosbag2 folder.
+    directory : as for `open_source`. Raises SourceError if there is no such file or topic (it lists the
+        valid ones), or a package is missing.
     """
 
     parser_errors = (Exception,)

@@ -62,7 +62,10 @@ Held = Annotated[bool, SignalPort("held", closed=None)]
 class ContactPorts(NamedTuple):
     """The outputs of a stage that detects contact.
 
-    contact_mask : 255 in contact. touching : whether anything is.
+    Attributes
+    ----------
+    contact_mask : 255 in contact.
+    touching : whether anything is.
     """
 
     contact_mask: ContactMask

@@ -42,8 +42,11 @@ class Matcher:
     and upper neighbours, or stays empty at a cost. A branch is pruned when it costs more than the best
     complete assignment.
 
+    Parameters
+    ----------
     grid : (rows, columns, 2) float64, px; NaN where there is no marker.
-    spacing : typical distance between neighbours, px. max_visits : see `MAX_VISITS`.
+    spacing : typical distance between neighbours, px.
+    max_visits : see `MAX_VISITS`.
     """
 
     def __init__(self, grid: Floats, spacing: float, *, max_visits: int = MAX_VISITS) -> None:

@@ -11,9 +11,12 @@ from types import ModuleType
 class Command:
     """A command of the program, from the core or from the entry point group `tactflow.commands`.
 
-    summary : what it does, a phrase. module : imported when the command is used. name : of its functions in
-    that module: `add_arguments(parser)` and `run(args) -> exit code`, or, with a name, `add_arguments_NAME`
-    and `run_NAME`.
+    Attributes
+    ----------
+    summary : what it does, a phrase.
+    module : imported when the command is used.
+    name : of its functions in that module: `add_arguments(parser)` and `run(args) -> exit code`, or, with a
+        name, `add_arguments_NAME` and `run_NAME`.
     """
 
     summary: str

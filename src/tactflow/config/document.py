@@ -45,8 +45,11 @@ def dotted(keys: Sequence[str | int]) -> str:
 class Document:
     """The values of a pipeline file, the location of each, and the errors found so far.
 
-    root : mappings, lists, text, numbers, booleans and None. file : its name in messages; or the origin of
-    values outside a file, such as an option of the command line.
+    Parameters
+    ----------
+    root : mappings, lists, text, numbers, booleans and None.
+    file : its name in messages; or the origin of values outside a file, such as an option of the command
+        line.
     """
 
     def __init__(self, file: str, root: Any = None, *, line: int = 0) -> None:
@@ -218,6 +221,8 @@ _SCALARS = frozenset(_TAG + name for name in ("null", "bool", "int", "float", "s
 class _Loader(yaml.SafeLoader):
     """Loads plain values; dates stay text, and 1e-3 is a number as in YAML 1.2. Aliases are expanded.
 
+    Attributes
+    ----------
     places : path of a value -> location of its key, or of the item of a list.
     """
 

@@ -20,8 +20,11 @@ from tactflow.system.spelling import did_you_mean
 class Override:
     """A replacement for a value.
 
-    key : dotted path, as in "stages.hull.min_area". value : a Python object; None for a whole stage or sink
-    removes it. origin : stands for file, line and column in messages.
+    Attributes
+    ----------
+    key : dotted path, as in "stages.hull.min_area".
+    value : a Python object; None for a whole stage or sink removes it.
+    origin : stands for file, line and column in messages.
     """
 
     key: str

@@ -19,6 +19,8 @@ from tactflow.system.spelling import did_you_mean
 class Draft:
     """A stage or sink of the file before its inputs are connected.
 
+    Attributes
+    ----------
     mark : of its key.
     component : None if `use` could not be resolved; no errors are reported for nodes that depend on it.
     params : None if invalid.

@@ -20,6 +20,8 @@ MAX_POINTS: Final = 2000
 class Quantity(NamedTuple):
     """A plot: its title, its unit, and its curves as label -> keys and indices of the value in a message.
 
+    Attributes
+    ----------
     grows : whether its length says how strong a contact is, so that the largest one is of interest.
     """
 

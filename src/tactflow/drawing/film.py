@@ -31,10 +31,17 @@ class Film:
     Pictures with an odd side are padded by a copy of the last row or column, which the encoder would
     otherwise cut off.
 
-    path : the file; its extension chooses the codec. fps : frames per second; None: the rate of the first
-    frames. overwrite : replace an existing file. frames : written so far.
-
     Every method raises StageError if the file exists or cannot be written, or OpenCV cannot encode it.
+
+    Parameters
+    ----------
+    path : the file; its extension chooses the codec.
+    fps : frames per second; None: the rate of the first frames.
+    overwrite : replace an existing file.
+
+    Attributes
+    ----------
+    frames : written so far.
     """
 
     def __init__(self, path: Path, *, fps: float | None = None, overwrite: bool = False) -> None:

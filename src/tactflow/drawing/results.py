@@ -82,14 +82,16 @@ def dimmed(image: NDArray[np.uint8], valid: NDArray[np.uint8]) -> NDArray[np.uin
 class Annotator:
     """Draws contact, markers and flow on a copy of the processed frame.
 
-    arrow_scale : length of an arrow over the displacement it shows; 1 ends it where the marker is now.
-    view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest black;
-        "depth" the height map instead of the picture.
-    text : whether numbers are written.
-    deepest : mm, for the "depth" view: height of the lightest colour.
-
     Arrows are yellow for tracked markers, white for inferred ones, dim gray for lost ones. The hull is green,
     the principal axis orange with a dot on the centroid and its angle beside it.
+
+    Parameters
+    ----------
+    arrow_scale : length of an arrow over the displacement it shows; 1 ends it where the marker is now.
+    view : "frame" shows the whole frame; "contact" only the contact and the arrows inside it, the rest
+        black; "depth" the height map instead of the picture.
+    text : whether numbers are written.
+    deepest : mm, for the "depth" view: height of the lightest colour.
 
     Raises ValueError for values out of range. Not to be shared between threads: it owns a font with a cache.
 

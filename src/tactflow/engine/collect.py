@@ -19,7 +19,7 @@ class Collect(Sink):
     """Calls a function with every result."""
 
     class Params(StageParams):
-        """take : called with each result, in the thread that computes it."""
+        """The function `take`, called with each result in the thread that computes it."""
 
         take: Callable[[Any], None]
 

@@ -22,6 +22,8 @@ class TactflowError(Exception):
 class ConfigError(TactflowError):
     """An error in the command line or the pipeline file; nothing was started.
 
+    Attributes
+    ----------
     mistakes : messages, all reported at once.
 
     >>> ConfigError("pipeline.yaml:3:1  colour: unknown key").mistakes

@@ -19,6 +19,8 @@ MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
 class Frame:
     """One captured frame. Immutable; the image is read-only.
 
+    Attributes
+    ----------
     sensor : name of the sensor.
     seq : index of the frame at the source, from 0; a dropped frame leaves a gap. -1 for a reference image
         that was loaded from a file and is not part of the source.
@@ -54,6 +56,8 @@ NO_PICTURE.flags.writeable = False
 class Absent:
     """Placeholder for a missing value; false in a condition.
 
+    Attributes
+    ----------
     reason : a short snake_case word.
 
     >>> Absent("no_contact")

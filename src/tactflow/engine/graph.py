@@ -45,10 +45,15 @@ class Delivery:
 class Component:
     """A stage or sink, as named by `use:`.
 
-    name : as in `use:`. cls, params : the class, and the model of its parameters. ports : from its
-    annotations. memory : always "pure" for sources and sinks. origin : for messages ("built-in", "plug-in
-    NAME VERSION", a file, a module). make : constructs an instance from parameters; the class, or a function
-    that calls it. delivery : of a sink.
+    Attributes
+    ----------
+    name : as in `use:`.
+    cls, params : the class, and the model of its parameters.
+    ports : from its annotations.
+    memory : always "pure" for sources and sinks.
+    origin : for messages ("built-in", "plug-in NAME VERSION", a file, a module).
+    make : constructs an instance from parameters; the class, or a function that calls it.
+    delivery : of a sink.
     """
 
     name: str
@@ -81,9 +86,12 @@ class Ref:
 class Gate:
     """Runs a stage only while a signal is True.
 
-    signal : the boolean port. reason : of the absent outputs while the gate is closed.
+    Attributes
+    ----------
+    signal : the boolean port.
+    reason : of the absent outputs while the gate is closed.
     otherwise : "absent" makes the outputs `Absent(reason)`; "repeat" repeats the last outputs (absent if
-    there are none).
+        there are none).
     """
 
     signal: Ref
@@ -119,10 +127,17 @@ class OnError(BaseModel, frozen=True, extra="forbid", strict=True):
 class Node:
     """One stage or sink of a pipeline.
 
-    inputs : every input port of the component -> connected output, or None for an unconnected optional input.
-    mark : location of its definition. gates : all must be open for it to run. segment : name in the file, or
-    None. queue : in front of its segment. max_rate : limit of a sink, Hz. passive_inputs : names in a sink's
-    result -> outputs that are included if they were computed for other nodes, but never requested.
+    Attributes
+    ----------
+    inputs : every input port of the component -> connected output, or None for an unconnected optional
+        input.
+    mark : location of its definition.
+    gates : all must be open for it to run.
+    segment : name in the file, or None.
+    queue : in front of its segment.
+    max_rate : limit of a sink, Hz.
+    passive_inputs : names in a sink's result -> outputs that are included if they were computed for other
+        nodes, but never requested.
     """
 
     id: str
@@ -142,10 +157,15 @@ class Node:
 class Pipeline:
     """A validated pipeline. `nodes` is in topological order: producers come before consumers.
 
-    file, directory : of the pipeline file. nodes : id -> node. skipping : whether work may be skipped.
-    opencv_threads : None leaves the number to OpenCV. calibration : the sensor's calibration file, or None.
-    warnings : for the user, before the run. settings : the file with all overrides, as plain values that can
-    be written as YAML.
+    Attributes
+    ----------
+    file, directory : of the pipeline file.
+    nodes : id -> node.
+    skipping : whether work may be skipped.
+    opencv_threads : None leaves the number to OpenCV.
+    calibration : the sensor's calibration file, or None.
+    warnings : for the user, before the run.
+    settings : the file with all overrides, as plain values that can be written as YAML.
     """
 
     file: str

@@ -15,10 +15,14 @@ T = TypeVar("T")
 class Link(Generic[T]):
     """One producer, one consumer, at most `capacity` items.
 
+    Parameters
+    ----------
     when_full : "block" makes the producer wait (nothing is lost); "latest" has one slot and overwrites it;
-    "drop_oldest" discards the oldest item. The order is preserved. The end of the stream is a flag, not an
-    item, so that it cannot be dropped.
+        "drop_oldest" discards the oldest item. The order is preserved. The end of the stream is a flag, not
+        an item, so that it cannot be dropped.
 
+    Attributes
+    ----------
     drops, delivered : number of items so far.
     """
 

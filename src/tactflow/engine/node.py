@@ -30,9 +30,16 @@ _NO_DEMAND = Absent("no_demand")
 class TickState:
     """The values of one frame, which each segment fills in for its own nodes.
 
-    index : number of the tick in this run. demand : ids of the sinks that want it. values : one per slot;
-    `Absent` if missing. reasons : slot -> why its value was not computed in this tick, for absent and
-    repeated values. renewed : the reason if a stage requested this frame as a reference, else None.
+    Parameters
+    ----------
+    index : number of the tick in this run.
+    demand : ids of the sinks that want it.
+
+    Attributes
+    ----------
+    values : one per slot; `Absent` if missing.
+    reasons : slot -> why its value was not computed in this tick, for absent and repeated values.
+    renewed : the reason if a stage requested this frame as a reference, else None.
     """
 
     __slots__ = ("demand", "frame", "index", "reasons", "renewed", "values")

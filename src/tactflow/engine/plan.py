@@ -25,7 +25,13 @@ BLOCK_CAPACITY_FRAMES = 4
 
 @dataclass(frozen=True, slots=True)
 class LinkPlan:
-    """A link between two segments. capacity : number of ticks. when_full : policy."""
+    """A link between two segments.
+
+    Attributes
+    ----------
+    capacity : number of ticks.
+    when_full : policy.
+    """
 
     producer: str
     consumer: str
@@ -42,8 +48,11 @@ class LinkPlan:
 class Plan:
     """How to run a pipeline.
 
+    Attributes
+    ----------
     segments : name -> node ids in order of evaluation; the source's segment is the first.
-    links : between segments. pruned : stages that are not constructed, because no sink needs them.
+    links : between segments.
+    pruned : stages that are not constructed, because no sink needs them.
     """
 
     pipeline: Pipeline

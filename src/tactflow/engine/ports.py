@@ -24,8 +24,12 @@ from tactflow.engine.frame import Absent, Frame, Tick
 class ArrayPort:
     """Type of a port that carries an array; used as `Annotated[NDArray[...], ArrayPort(...)]`.
 
-    name : default name of the port. shape : one entry per axis, an int (exact) or a str (a named dimension).
-    dtype : numpy dtype name. unit : of the values.
+    Attributes
+    ----------
+    name : default name of the port.
+    shape : one entry per axis, an int (exact) or a str (a named dimension).
+    dtype : numpy dtype name.
+    unit : of the values.
     """
 
     name: str
@@ -38,8 +42,11 @@ class ArrayPort:
 class SignalPort:
     """Type of a boolean port that can gate stages.
 
-    closed : the reason while it is False. otherwise : outputs of a gated stage then: "absent", or "repeat"
-    for the last ones. closed None: both are those of the input signal, for a stage that only holds a signal.
+    Attributes
+    ----------
+    closed : the reason while it is False.
+    otherwise : outputs of a gated stage then: "absent", or "repeat" for the last ones. closed None: both
+        are those of the input signal, for a stage that only holds a signal.
     """
 
     name: str
@@ -51,7 +58,11 @@ class SignalPort:
 class Port:
     """One input or output of a stage.
 
-    name : the port's name. annotation : the Python type. optional : True if the input may be absent.
+    Attributes
+    ----------
+    name : the port's name.
+    annotation : the Python type.
+    optional : True if the input may be absent.
     """
 
     name: str
@@ -71,6 +82,8 @@ class ResultParameter:
 class Ports:
     """The ports of a stage or sink class: inputs in the order of the parameters, and outputs.
 
+    Attributes
+    ----------
     result : the parameter that stands for several inputs, or None.
     """
 

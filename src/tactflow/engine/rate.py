@@ -7,7 +7,12 @@ TIME_TOLERANCE_S = 5e-7
 
 
 class RateLimit:
-    """Selects frames of a stream, at most `rate` per second. rate : Hz, > 0; None selects all."""
+    """Selects frames of a stream, at most `rate` per second.
+
+    Parameters
+    ----------
+    rate : Hz, > 0; None selects all.
+    """
 
     __slots__ = ("_due", "_rate")
 

@@ -24,8 +24,11 @@ from tactflow.system.signals import INTERRUPTED_EXIT_CODE
 class RunResult:
     """The outcome of a run.
 
-    error : the error that ended it, or None; failure : the same as an exception. stats : as in the statistics
-    file.
+    Attributes
+    ----------
+    error : the error that ended it, or None.
+    failure : the same as an exception.
+    stats : as in the statistics file.
     """
 
     exit_code: int

@@ -39,7 +39,10 @@ class NodeFailedError(Exception):
 class NewReferences:
     """Turns requested frames into references, before the first segment of stages.
 
-    slot : of the source's frames. sinks : ids of those that take every reference.
+    Parameters
+    ----------
+    slot : of the source's frames.
+    sinks : ids of those that take every reference.
     """
 
     def __init__(self, slot: int, sinks: Collection[str]) -> None:

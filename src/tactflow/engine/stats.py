@@ -22,7 +22,11 @@ _BIN_OFFSET = -log(_MIN_DURATION_S) * _BINS_PER_E
 class Durations:
     """A histogram of durations with logarithmic bins; quantiles are accurate to 1 %. Thread-safe.
 
-    Covers 0.1 us to about 5 h; values outside count in the outermost bins. total : sum of the durations, s.
+    Covers 0.1 us to about 5 h; values outside count in the outermost bins.
+
+    Attributes
+    ----------
+    total : sum of the durations, s.
     """
 
     def __init__(self) -> None:
@@ -61,7 +65,10 @@ class Durations:
 class NodeStats:
     """Statistics of a stage or sink, written by the thread of its segment.
 
-    skips : reason -> number of frames in which it did not run. errors : number of frames in which it failed.
+    Attributes
+    ----------
+    skips : reason -> number of frames in which it did not run.
+    errors : number of frames in which it failed.
     durations : of its runs.
     """
 
@@ -85,7 +92,11 @@ class NodeStats:
 class SignalStats:
     """Counts of a boolean port, or of the presence of an output that may be absent.
 
-    true : ticks in which it was true. rises : changes to true. last : value in the last tick.
+    Attributes
+    ----------
+    true : ticks in which it was true.
+    rises : changes to true.
+    last : value in the last tick.
     """
 
     true: int = 0

@@ -24,10 +24,14 @@ AXIS_NAMES = ("x", "y", "z")
 class Column(NamedTuple):
     """A column of a table.
 
-    name : such as `contact_center_x`. path : keys and indices of the value in a message.
+    Attributes
+    ----------
+    name : such as `contact_center_x`.
+    path : keys and indices of the value in a message.
     kind : number, integer, string, boolean, numbers, points (a list of pairs) or words (name -> text).
-    description : with unit. unit : of the numbers; empty without one. detail : whether only detailed messages
-    have it.
+    description : with unit.
+    unit : of the numbers; empty without one.
+    detail : whether only detailed messages have it.
     """
 
     name: str

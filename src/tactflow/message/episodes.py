@@ -43,8 +43,10 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
 class AlignedMarkers:
     """The N markers of a dataset in one frame.
 
-    offset : (N, 2) float64, displacements since the reference frame of this recording, px. status : (N,)
-    uint8, values of `MarkerStatus`. All are finite.
+    Attributes
+    ----------
+    offset : (N, 2) float64, displacements since the reference frame of this recording, px.
+    status : (N,) uint8, values of `MarkerStatus`. All are finite.
     """
 
     offset: NDArray[np.float64]
@@ -57,6 +59,8 @@ class MarkerOrder:
     Each recording detects its markers anew, and may miss some. Two are the same marker if their positions in
     the reference frames are closer than half the distance between neighbours.
 
+    Attributes
+    ----------
     origin : (N, 2) float64, px, positions in the first recording; None until a frame has markers.
 
     >>> order = MarkerOrder()

@@ -83,10 +83,14 @@ Statuses = Annotated[NDArray[np.uint8], PlainValidator(_statuses, json_schema_in
 class Sending:
     """When a key is sent, and with which value.
 
-    unit : of the numbers; empty without one. needs : keys of `CONDITIONS` that must all be given. if_known :
-    whether it is left out instead of null. value : function of the value that the part is made of, and of the
-    whole result; None: the attribute, or the port, of the key's name. elements : names of the elements of a
-    tuple that are not x, y and z.
+    Attributes
+    ----------
+    unit : of the numbers; empty without one.
+    needs : keys of `CONDITIONS` that must all be given.
+    if_known : whether it is left out instead of null.
+    value : function of the value that the part is made of, and of the whole result; None: the attribute, or
+        the port, of the key's name.
+    elements : names of the elements of a tuple that are not x, y and z.
     """
 
     unit: str = ""
@@ -105,7 +109,12 @@ class Sending:
 
 
 class Key(NamedTuple):
-    """A key of a part. part : of the objects that it holds."""
+    """A key of a part.
+
+    Attributes
+    ----------
+    part : of the objects that it holds.
+    """
 
     name: str
     sending: Any
@@ -137,7 +146,12 @@ def sent(
 
 
 class Part(BaseModel):
-    """An object of the message. of : the class of its value in Python; None if it is not decoded."""
+    """An object of the message.
+
+    Attributes
+    ----------
+    of : the class of its value in Python; None if it is not decoded.
+    """
 
     # Keys of a later version are ignored when read, but are errors for the schema.
     model_config = ConfigDict(

@@ -29,8 +29,14 @@ class Result(Tick):
     Pixels are those of the processed frame, x right, y down. A property is None if nothing was found, or no
     stage of the pipeline computes it. `result["brightness"]` is the output of a stage of your own.
 
+    Parameters
+    ----------
     frame : as captured: `seq`, `t`, and the raw image; (0, 0, 3) if pictures were not kept.
-    skipped : port -> why it was not computed in this frame; `unchanged` and `at_rest` repeat the last value.
+    skipped : port -> why it was not computed in this frame; `unchanged` and `at_rest` repeat the last
+        value.
+
+    Attributes
+    ----------
     image : (H, W, 3) uint8 BGR, the processed frame.
     contact, flow, markers : contact with the gel, displacement of the gel inside it, and markers.
     contact_mask : (H, W) uint8, 255 in contact.

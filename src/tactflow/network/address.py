@@ -10,8 +10,10 @@ from typing import NamedTuple
 class Address(NamedTuple):
     """`tcp://HOST:PORT` or `ipc://PATH`.
 
-    host : name, number or `*` (all interfaces); None for ipc. port : None where the system picks one (`*`, 0)
-    and for ipc.
+    Attributes
+    ----------
+    host : name, number or `*` (all interfaces); None for ipc.
+    port : None where the system picks one (`*`, 0) and for ipc.
 
     >>> Address.parse("tcp://127.0.0.1:*")
     Address(text='tcp://127.0.0.1:*', host='127.0.0.1', port=None)

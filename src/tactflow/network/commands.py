@@ -51,6 +51,8 @@ class RefusedError(Exception):
 class Commands:
     """Executes commands on a run, from any thread.
 
+    Parameters
+    ----------
     control : handle on the run; None refuses every command.
     """
 
@@ -122,7 +124,12 @@ class Commands:
 class ControlSocket(BoundSocket):
     """Serves the commands of a run over ZeroMQ, in a thread of its own, until it is closed.
 
-    endpoint, keys, Raises : as for `BoundSocket`. sensor : name in replies. control : handle on the run.
+    endpoint, keys, Raises : as for `BoundSocket`.
+
+    Parameters
+    ----------
+    sensor : name in replies.
+    control : handle on the run.
     """
 
     def __init__(self, endpoint: str, keys: str | None, sensor: str, control: Control | None) -> None:

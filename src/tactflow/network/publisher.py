@@ -108,7 +108,13 @@ def _refuse_taken_path(path: Path) -> None:
 class Publisher(BoundSocket):
     """A bound XPUB socket. Any thread may send; sending never waits for subscribers.
 
-    backlog : messages queued for each subscriber at most. subscriptions : number of distinct prefixes.
+    Parameters
+    ----------
+    backlog : messages queued for each subscriber at most.
+
+    Attributes
+    ----------
+    subscriptions : number of distinct prefixes.
     """
 
     def __init__(self, endpoint: str, backlog: int, keys: str | None = None) -> None:

@@ -38,10 +38,16 @@ FALSE_FREEZE_PROBABILITY: Final = 1e-3
 class Glance(NamedTuple):
     """What a frame tells about the recording.
 
-    t : s. seq : its number at the source. change : mean absolute difference to the frame before, grey levels.
-    repeated : whether it is bit-identical to that. clipped : share of the gel that is clipped, 0 to 1.
-    reference : whether it is a reference. empty : whether it shows no gel. damaged : whether it is no longer
-    as the camera took it.
+    Attributes
+    ----------
+    t : s.
+    seq : its number at the source.
+    change : mean absolute difference to the frame before, grey levels.
+    repeated : whether it is bit-identical to that.
+    clipped : share of the gel that is clipped, 0 to 1.
+    reference : whether it is a reference.
+    empty : whether it shows no gel.
+    damaged : whether it is no longer as the camera took it.
     """
 
     t: float
@@ -112,7 +118,13 @@ def clipped_share(picture: NDArray[np.uint8]) -> float:
 
 
 class Pause(NamedTuple):
-    """A time without a new frame. start : from the first frame, s. seconds : its length."""
+    """A time without a new frame.
+
+    Attributes
+    ----------
+    start : from the first frame, s.
+    seconds : its length.
+    """
 
     start: float
     seconds: float
@@ -121,9 +133,14 @@ class Pause(NamedTuple):
 class Timing(NamedTuple):
     """How evenly the frames come.
 
-    interval : median time between two frames, s. lost : frames that are missing by the times. pauses : of
-    `CONTACT_SECONDS` and more. irregular : share of the frames that are late or early, though none is missing
-    before them. slowest, fastest : local intervals, s. backwards : number of times that the clock went back.
+    Attributes
+    ----------
+    interval : median time between two frames, s.
+    lost : frames that are missing by the times.
+    pauses : of `CONTACT_SECONDS` and more.
+    irregular : share of the frames that are late or early, though none is missing before them.
+    slowest, fastest : local intervals, s.
+    backwards : number of times that the clock went back.
     """
 
     interval: float
@@ -136,7 +153,13 @@ class Timing(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Successive identical frames. first : index of the one that they repeat. repeats : their number."""
+    """Successive identical frames.
+
+    Attributes
+    ----------
+    first : index of the one that they repeat.
+    repeats : their number.
+    """
 
     first: int
     repeats: int
@@ -145,9 +168,13 @@ class Run(NamedTuple):
 class Course:
     """The course of a recording, with 12 bytes of memory for each frame.
 
-    frames : their number. missing : frames that are missing by their numbers. repeated : frames that are
-    identical to the one before. empty, damaged : indices of the first frames without a gel or damaged, and
-    their numbers. clipped : mean share of the gel that is clipped, 0 to 1.
+    Attributes
+    ----------
+    frames : their number.
+    missing : frames that are missing by their numbers.
+    repeated : frames that are identical to the one before.
+    empty, damaged : indices of the first frames without a gel or damaged, and their numbers.
+    clipped : mean share of the gel that is clipped, 0 to 1.
 
     >>> course = Course()
     >>> for seq in (0, 1, 2, 5, 6):
@@ -234,7 +261,13 @@ class Course:
 
 
 class Tally:
-    """Counts frames. count : their number. first : index of the first one."""
+    """Counts frames.
+
+    Attributes
+    ----------
+    count : their number.
+    first : index of the first one.
+    """
 
     def __init__(self) -> None:
         self.count = 0

@@ -23,8 +23,12 @@ from tactflow.recording.records import (
 class Contents:
     """Contents of a recording.
 
-    finished : whether it has an index. frame_topic, reference_topic : channels. frames : number, including
-    references; None if unknown. start, end : ns; None if unknown.
+    Attributes
+    ----------
+    finished : whether it has an index.
+    frame_topic, reference_topic : channels.
+    frames : number, including references; None if unknown.
+    start, end : ns; None if unknown.
     """
 
     finished: bool

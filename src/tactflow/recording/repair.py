@@ -20,8 +20,11 @@ CHUNK_BYTES = 1 << 22
 class Repaired:
     """The outcome of `repair`.
 
-    finished : whether the file was intact. messages : number of copied messages. lost : bytes that belong to
-    no intact record.
+    Attributes
+    ----------
+    finished : whether the file was intact.
+    messages : number of copied messages.
+    lost : bytes that belong to no intact record.
     """
 
     finished: bool

@@ -44,7 +44,13 @@ DOT_COLOURS = {
 
 
 class ChannelType(NamedTuple):
-    """Type of the messages of a channel. schema : encoding and bytes. packing : encoding of the messages."""
+    """Type of the messages of a channel.
+
+    Attributes
+    ----------
+    schema : encoding and bytes.
+    packing : encoding of the messages.
+    """
 
     name: str
     schema: tuple[str, bytes]

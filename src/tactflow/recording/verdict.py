@@ -33,9 +33,13 @@ MENTIONED_RATE_RATIO: Final = 1.5
 class Finding:
     """Result of a check.
 
-    number : measured value, in the unit of the check; None if the source cannot be checked. says : its
-    description, or why it is unknown. effect : consequence of a fault for the errors, advice : remedy; both
-    empty if good. limits : for warning and fault. verdict : `unknown` if the source cannot be checked.
+    Attributes
+    ----------
+    number : measured value, in the unit of the check; None if the source cannot be checked.
+    says : its description, or why it is unknown.
+    effect : consequence of a fault for the errors, advice : remedy; both empty if good.
+    limits : for warning and fault.
+    verdict : `unknown` if the source cannot be checked.
     """
 
     number: float | None
@@ -69,9 +73,14 @@ class Finding:
 class Recorded:
     """What is known about a recording, or the observation of a live source.
 
-    course : of its frames. timed : whether it has times; separate pictures have none. live : of a camera or
-    stream. stopped : the error that ended it, or "". remark : what is wrong with its file, though all its
-    frames can be read. lacking : frames that the file states but does not have.
+    Attributes
+    ----------
+    course : of its frames.
+    timed : whether it has times; separate pictures have none.
+    live : of a camera or stream.
+    stopped : the error that ended it, or "".
+    remark : what is wrong with its file, though all its frames can be read.
+    lacking : frames that the file states but does not have.
     """
 
     course: Course = field(default_factory=Course)
@@ -84,8 +93,14 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """word : good, usable or bad. reasons : what is wrong, the worst first; empty if good. text : of a good
-    recording: how much there is."""
+    """The verdict on a recording.
+
+    Attributes
+    ----------
+    word : good, usable or bad.
+    reasons : what is wrong, the worst first; empty if good.
+    text : of a good recording: how much there is.
+    """
 
     word: Literal["good", "usable", "bad"]
     reasons: tuple[str, ...]

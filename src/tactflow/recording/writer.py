@@ -25,8 +25,12 @@ UNLIMITED_CHUNK_BYTES = 1 << 62
 class Entry:
     """The encoded messages of a frame.
 
-    time : of the frame, ns. seq, reference, epoch : as in `Frame`. data : channel -> message; "frames" is the
-    frame itself. glance : for the verdict; None for a reference image that is not part of the source.
+    Attributes
+    ----------
+    time : of the frame, ns.
+    seq, reference, epoch : as in `Frame`.
+    data : channel -> message; "frames" is the frame itself.
+    glance : for the verdict; None for a reference image that is not part of the source.
     """
 
     time: int

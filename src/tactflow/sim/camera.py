@@ -41,11 +41,14 @@ apart."""
 class Camera:
     """Perspective followed by radial lens distortion, seen through a round aperture.
 
-    perspective : 0 to 0.4; fraction of half the width by which the lower corners of the gel move inwards, so
-    that it appears as the trapezoid of a tilted camera; the whole gel shrinks a little. distortion : -0.2 to
-    0.4; k of undistorted = distorted * (1 + k rho^2), rho = distance from the centre in half diagonals;
-    positive is a barrel (wide lens). aperture_radius : radius of the round picture in a black frame, in half
-    heights of the frame. 0: none, each.
+    Attributes
+    ----------
+    perspective : 0 to 0.4; fraction of half the width by which the lower corners of the gel move inwards,
+        so that it appears as the trapezoid of a tilted camera; the whole gel shrinks a little.
+    distortion : -0.2 to 0.4; k of undistorted = distorted * (1 + k rho^2), rho = distance from the centre
+        in half diagonals; positive is a barrel (wide lens).
+    aperture_radius : radius of the round picture in a black frame, in half heights of the frame. 0: none,
+        each.
     """
 
     perspective: float = 0.0

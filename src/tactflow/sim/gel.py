@@ -50,14 +50,20 @@ _FORCE_STEP_PX = 3.0
 class Press:
     """One indenter at one moment.
 
-    x, y : its origin in gel coordinates, px. angle : rotation, radians, clockwise on the screen (y down).
-    depth : px, 0 off the gel. shear : (sx, sy), displacement of the gel under it, px. twist : rotation of the
-    gel under it, radians. dilation : maximum outward displacement of the gel, px. sink, rim :
-    `SINK_IN_RATIO` and `RIM_SLOPE_RATIO`.
+    Attributes
+    ----------
+    x, y : its origin in gel coordinates, px.
+    angle : rotation, radians, clockwise on the screen (y down).
+    depth : px, 0 off the gel.
+    shear : (sx, sy), displacement of the gel under it, px.
+    twist : rotation of the gel under it, radians.
+    dilation : maximum outward displacement of the gel, px.
+    sink, rim : `SINK_IN_RATIO` and `RIM_SLOPE_RATIO`.
     stick : for a ball, radius of the stick region relative to `radius`, 0 to 1, with slip around it
-    (Mindlin). None: no slip. sliding : whether the indenter moves relative to the gel under it.
+        (Mindlin). None: no slip.
+    sliding : whether the indenter moves relative to the gel under it.
     tilt : rotation vector (x, y) about the indenter's centre before it was turned by `angle`, radians;
-    `shape` is the one after that.
+        `shape` is the one after that.
     """
 
     shape: Shape

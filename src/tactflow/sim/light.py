@@ -25,13 +25,17 @@ from tactflow.sim.shapes import Array
 class Light:
     """The illumination of a type of sensor.
 
-    azimuth : of the blue, green and red light, degrees, counter-clockwise on the screen. level : grey level
-    of the untouched gel at the centre, blue, green, red. falloff : decrease of brightness with the distance
-    from a light, 0 for uniform light. slope_gain : cotangent of the lights' elevation, common or per light.
-    ambient : fraction of diffuse light, 0 to 1. brightening : change of all channels in a contact of full
-    depth, grey levels. onset : depth range of this change beyond the contact's edge, relative to full depth.
-    halo : brightening just outside a contact of full depth, grey levels. absorption : part of the light per
-    raw px of depth, for gels that darken with it.
+    Attributes
+    ----------
+    azimuth : of the blue, green and red light, degrees, counter-clockwise on the screen.
+    level : grey level of the untouched gel at the centre, blue, green, red.
+    falloff : decrease of brightness with the distance from a light, 0 for uniform light.
+    slope_gain : cotangent of the lights' elevation, common or per light.
+    ambient : fraction of diffuse light, 0 to 1.
+    brightening : change of all channels in a contact of full depth, grey levels.
+    onset : depth range of this change beyond the contact's edge, relative to full depth.
+    halo : brightening just outside a contact of full depth, grey levels.
+    absorption : part of the light per raw px of depth, for gels that darken with it.
     """
 
     azimuth: tuple[float, float, float]

@@ -26,8 +26,13 @@ FIXED_POINT_STEPS = 64.0
 class Layout:
     """The markers printed on the gel.
 
-    rest : (N, 2) float64, positions on the untouched gel, px. contrast : (N,), 0 to 1, 1 for a fresh marker.
-    group : (N,) int; markers of the same group never overlap. radii : (N,), px. pitch, radius : mean, px.
+    Attributes
+    ----------
+    rest : (N, 2) float64, positions on the untouched gel, px.
+    contrast : (N,), 0 to 1, 1 for a fresh marker.
+    group : (N,) int; markers of the same group never overlap.
+    radii : (N,), px.
+    pitch, radius : mean, px.
     """
 
     rest: NDArray[np.float64]

@@ -34,17 +34,28 @@ _MAX_JUMP_PITCHES = 0.45
 class Programme:
     """A series of contacts; lengths of time are in frames.
 
-    indenters : functions that make them. offsets : their positions, px.
-    period : time between contacts. rise : time from touch to full depth, and back. hold : time at full depth.
-    contacts : number spread over the recording; 0: as many as fit. depths : relative ones of successive
-    contacts. place : mean position as a fraction of the frame. wander : maximum deviation from it, px.
-    angles : range of the indenter's angle, degrees. dilation : outward displacement by a press, pitches.
-    travel : distance the indenter slides during a hold, px. partial : whether a ball slips at the edge of the
-    contact first. rolls : whether a ball turns as it travels, without slip.
-    jumps : whether the gel is dragged to a new position every third frame. creep : its drag, px per frame.
+    Attributes
+    ----------
+    indenters : functions that make them.
+    offsets : their positions, px.
+    period : time between contacts.
+    rise : time from touch to full depth, and back.
+    hold : time at full depth.
+    contacts : number spread over the recording; 0: as many as fit.
+    depths : relative ones of successive contacts.
+    place : mean position as a fraction of the frame.
+    wander : maximum deviation from it, px.
+    angles : range of the indenter's angle, degrees.
+    dilation : outward displacement by a press, pitches.
+    travel : distance the indenter slides during a hold, px.
+    partial : whether a ball slips at the edge of the contact first.
+    rolls : whether a ball turns as it travels, without slip.
+    jumps : whether the gel is dragged to a new position every third frame.
+    creep : its drag, px per frame.
     tilts : rotation about the direction of motion and across it, from 0 to this and back during a hold,
-    degrees. holds : the indenter turns on during a hold, and the gel follows by up to this angle, degrees,
-    before it slips; None: it turns back, and the gel always follows.
+        degrees.
+    holds : the indenter turns on during a hold, and the gel follows by up to this angle, degrees, before it
+        slips; None: it turns back, and the gel always follows.
     """
 
     indenters: tuple[Callable[..., Shape], ...]
@@ -76,8 +87,13 @@ def _smooth(value: float) -> float:
 class _Timing:
     """Timing within a programme.
 
-    cycle : index of the contact. phase : frames since it began. rise : frames from touch to full depth.
-    envelope : current relative depth, 0 to 1. progress : elapsed fraction of the hold, 0 to 1.
+    Attributes
+    ----------
+    cycle : index of the contact.
+    phase : frames since it began.
+    rise : frames from touch to full depth.
+    envelope : current relative depth, 0 to 1.
+    progress : elapsed fraction of the hold, 0 to 1.
     """
 
     cycle: int

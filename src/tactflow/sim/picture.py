@@ -27,7 +27,12 @@ _BRIGHT_MARKER_GREY = 225.0
 
 
 class Painter:
-    """Draws the camera's view of the gel. layout : the markers as printed."""
+    """Draws the camera's view of the gel.
+
+    Parameters
+    ----------
+    layout : the markers as printed.
+    """
 
     def __init__(self, settings: Settings, camera: Camera, layout: markers.Layout) -> None:
         self._settings = settings

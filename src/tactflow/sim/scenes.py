@@ -47,8 +47,16 @@ def open_scene(spec: str) -> Scene:
 class Scene:
     """A simulated recording with random access to frames; the same spec gives bit-identical frames.
 
-    name, settings : of the scene. size : (width, height), px. fps : frames per second.
-    camera : maps the gel to the raw frame. layout : the markers as printed.
+    Parameters
+    ----------
+    name, settings : of the scene.
+
+    Attributes
+    ----------
+    size : (width, height), px.
+    fps : frames per second.
+    camera : maps the gel to the raw frame.
+    layout : the markers as printed.
     """
 
     fps = FPS

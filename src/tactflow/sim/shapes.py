@@ -26,12 +26,15 @@ _BUMPS_PER_CIRCUMFERENCE = 25.0
 class Shape:
     """An indenter.
 
+    Attributes
+    ----------
     gap : (x, y) float32 arrays, px -> height of the surface above the lowest point, px, >= 0.
     reach : distance from the origin beyond which it does not visibly affect the gel, px.
-    depth : full depth, px. sources : (K, 2) float64, px, points from which a press dilates the gel.
-    spread : standard deviation of the dilation, px. center : height above the lowest point of the point
-    about which it is tilted or rolls, px. tilted : makes the shape after a rotation (3, 3) about that point;
-    None: see `tilt_surface`.
+    depth : full depth, px.
+    sources : (K, 2) float64, px, points from which a press dilates the gel.
+    spread : standard deviation of the dilation, px.
+    center : height above the lowest point of the point about which it is tilted or rolls, px.
+    tilted : makes the shape after a rotation (3, 3) about that point; None: see `tilt_surface`.
     """
 
     gap: Callable[[Array, Array], Array]

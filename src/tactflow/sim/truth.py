@@ -27,6 +27,8 @@ an axis ratio of 1.02. Chosen by hand."""
 class Truth:
     """Ground truth of one frame. Coordinates as in `tactflow.vision.types`.
 
+    Attributes
+    ----------
     touching : whether the contact covers at least one pixel of the frame.
     contact_mask : (H, W) bool, true where an indenter lies below the untouched gel at the pixel's centre.
     center : (x, y) centroid of the contact region, px; None without a contact.
@@ -36,7 +38,8 @@ class Truth:
     area : of that hull, px^2.
     depth : of the deepest indenter, raw px, 0 without a contact.
     stick_ratio : share of the contact's area that sticks to the indenter, minimum over indenters; None
-        without a contact. slipping : whether an indenter slides over the gel.
+        without a contact.
+    slipping : whether an indenter slides over the gel.
     origin, position : (N, 2) float64, printed markers on the untouched gel and now.
     visible : (N,) bool, whether a marker is visible: centre inside the frame, lit, not vanished.
     """

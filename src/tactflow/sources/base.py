@@ -37,10 +37,13 @@ BgrImage = NDArray[np.uint8]
 class Arrival(NamedTuple):
     """A frame of a source.
 
-    image, t : as from `FrameReader.read`. seq, reference, epoch : as in `Frame`; for a live source, seq also
-    counts frames that were never read. paced : False for a reference that is delivered ahead of its time.
-    captured : monotonic time (`time.perf_counter`) of its arrival, s; 0 for a recording. damaged : as in
-    `Frame`.
+    Attributes
+    ----------
+    image, t : as from `FrameReader.read`.
+    seq, reference, epoch : as in `Frame`; for a live source, seq also counts frames that were never read.
+    paced : False for a reference that is delivered ahead of its time.
+    captured : monotonic time (`time.perf_counter`) of its arrival, s; 0 for a recording.
+    damaged : as in `Frame`.
     """
 
     image: BgrImage
@@ -59,6 +62,12 @@ class FrameReader:
     A subclass yields its pictures from `_frames`, with any type of pixels; `read` converts them and checks
     their size.
 
+    Parameters
+    ----------
+    name : for messages.
+
+    Attributes
+    ----------
     live : whether frames arrive at the camera's pace; a recording waits until it is read.
     fps : frames per second, or None if unknown.
     size : (width, height) of the frames, px, or None before the first one.
@@ -70,9 +79,7 @@ class FrameReader:
     remark : what is wrong with a file that can be read all the same, or "".
     lacking : frames that the file states but does not have; known at its end.
     stamped : whether the frames already passed through `capture`, which then uses their seq, reference,
-    epoch and paced, as in `Arrival`, unchanged; `_frames` yields these too.
-
-    name : for messages.
+        epoch and paced, as in `Arrival`, unchanged; `_frames` yields these too.
     """
 
     live = False
@@ -175,7 +182,11 @@ class FrameReader:
 class CaptureReader(FrameReader):
     """A source opened by OpenCV: a video, a camera, a stream.
 
-    name : for messages. failure : error message if it cannot be opened. arguments : of `cv2.VideoCapture`.
+    Parameters
+    ----------
+    name : for messages.
+    failure : error message if it cannot be opened.
+    *arguments : of `cv2.VideoCapture`.
     """
 
     def __init__(self, name: str, failure: str, *arguments: Any) -> None:

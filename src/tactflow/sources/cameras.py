@@ -33,10 +33,15 @@ HAS_DEVICE_CAPS = 0x80000000
 class CameraInfo:
     """A camera of this machine.
 
-    source : its most persistent name, for use as a source. device : `/dev/videoN`. index : N.
-    names : all links to it. name : by its driver; empty if that cannot be asked, because of `problem`.
+    Attributes
+    ----------
+    source : its most persistent name, for use as a source.
+    device : `/dev/videoN`.
+    index : N.
+    names : all links to it.
+    name : by its driver; empty if that cannot be asked, because of `problem`.
     pictures : whether it delivers any; many cameras have a second device with metadata only. Assumed where
-    the driver cannot be asked.
+        the driver cannot be asked.
     """
 
     source: str

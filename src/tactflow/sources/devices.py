@@ -34,7 +34,11 @@ SETTING_TOLERANCE = 0.01
 class CameraRequest:
     """Requested settings of a camera; None for its default.
 
-    width, height : px. fps : frames per second. format : four characters, such as MJPG or YUYV.
+    Attributes
+    ----------
+    width, height : px.
+    fps : frames per second.
+    format : four characters, such as MJPG or YUYV.
     """
 
     width: int | None = None
@@ -46,9 +50,11 @@ class CameraRequest:
 class Camera(CaptureReader):
     """A camera of this machine. Frames are stamped on arrival.
 
-    device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/..."). request : settings, which a
-    camera may ignore; this is reported. Raises SourceError if it cannot be opened, and from `read` if it
-    stops delivering.
+    Parameters
+    ----------
+    device : an index ("0") or a path ("/dev/video0", "/dev/v4l/by-id/...").
+    request : settings, which a camera may ignore; this is reported. Raises SourceError if it cannot be
+        opened, and from `read` if it stops delivering.
     """
 
     live = True

@@ -98,8 +98,14 @@ def _is_cut_off(data: bytes) -> bool:
 class ImageFiles(FrameReader):
     """A recording of one image file per frame; frame i is taken at i / fps.
 
-    files : in order. name : folder or pattern, for messages. first : name of the first file without its
-    folder.
+    Parameters
+    ----------
+    files : in order.
+    name : folder or pattern, for messages.
+
+    Attributes
+    ----------
+    first : name of the first file without its folder.
     """
 
     def __init__(self, files: Sequence[Path], name: str, fps: float | None = None) -> None:

@@ -26,8 +26,11 @@ class Recording(FrameReader):
     A recording includes its references, so that capture's parameters `reference` and `skip` do not apply.
     With `start`, the references of that time come first.
 
-    spec : `file.mcap`, or `file.mcap?start=2.5`. directory : as for `open_source`. Raises SourceError if it
-    does not exist, is not a recording of tactflow, or an option is invalid.
+    Parameters
+    ----------
+    spec : `file.mcap`, or `file.mcap?start=2.5`.
+    directory : as for `open_source`. Raises SourceError if it does not exist, is not a recording of
+        tactflow, or an option is invalid.
     """
 
     stamped = True

@@ -33,8 +33,12 @@ class _FirstFrames:
     Frames without gel may not, nor may a picture that is repeated bit by bit at first although the source has
     noise: it was left in a buffer.
 
-    held : all frames. shown : indices in `held` of those that show gel; the first `frozen` of them were
-    repeated. settling : has examined those after. blank : number of frames without gel.
+    Attributes
+    ----------
+    held : all frames.
+    shown : indices in `held` of those that show gel; the first `frozen` of them were repeated.
+    settling : has examined those after.
+    blank : number of frames without gel.
     """
 
     def __init__(self, count: int, settle: float, *, keep_blank: bool, video: bool) -> None:
@@ -131,9 +135,15 @@ class _FirstFrames:
 class References:
     """Chooses the reference frames, and reports if they are not the first ones. Finds damaged frames.
 
-    name : of the source, for messages. count : number of reference frames. settle : longest time until the
-    light is steady, s; 0 takes the first frames that show gel. skip_damaged : whether to look for damage.
+    Parameters
+    ----------
+    name : of the source, for messages.
+    count : number of reference frames.
+    settle : longest time until the light is steady, s; 0 takes the first frames that show gel.
+    skip_damaged : whether to look for damage.
 
+    Attributes
+    ----------
     left_out : number of frames of a live source that were examined but not delivered.
     repeated : number of frames if all of them so far are the same picture, else 0.
     """

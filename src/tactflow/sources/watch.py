@@ -37,6 +37,8 @@ POLL_SECONDS = 0.1
 class Watch:
     """Faults of a live source, and their handling. All times in s.
 
+    Attributes
+    ----------
     reconnect : reopen the source after a fault. If False, a camera that stops is an error, and the end of a
         stream is the end of the source.
     no_frame_timeout : time without a good frame after which reading fails; None or 0: never.
@@ -56,8 +58,16 @@ class Watch:
 
 @dataclass(slots=True)
 class _Fault:
-    """kind : in words. since : time of the clock, s. hour : the same as text. retry_at : time of the next
-    attempt to open the source, s. detail : the last error. attempts : number so far.
+    """A fault of a source that lasts.
+
+    Attributes
+    ----------
+    kind : in words.
+    since : time of the clock, s.
+    hour : the same as text.
+    retry_at : time of the next attempt to open the source, s.
+    detail : the last error.
+    attempts : number so far.
     """
 
     kind: str
@@ -73,7 +83,10 @@ class Watched(FrameReader):
 
     The constructor opens it and must succeed, so that a wrong address is an error immediately.
 
-    opener : opens the source; also called for each reconnection, in another thread. name : for messages.
+    Parameters
+    ----------
+    opener : opens the source; also called for each reconnection, in another thread.
+    name : for messages.
     clock : for time, and for waiting between attempts.
 
     Raises SourceError if the source cannot be opened, and from `read` if there was no good frame for

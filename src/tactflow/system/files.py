@@ -175,6 +175,8 @@ def lock_folder(folder: Path) -> int | None:
 class LossyStream(io.TextIOWrapper):
     """Standard error that discards its output after its reader has closed it, instead of raising.
 
+    Parameters
+    ----------
     stream : the standard error that it replaces.
     """
 

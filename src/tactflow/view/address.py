@@ -51,7 +51,10 @@ def bind(host: str, port: int, *, tries: int = 20) -> socket.socket:
 class Neighbours:
     """Discovery between the views of several sensors (one process each), through files in a folder.
 
-    folder : shared by these views only. sensor : name of this view's sensor.
+    Parameters
+    ----------
+    folder : shared by these views only.
+    sensor : name of this view's sensor.
     """
 
     def __init__(self, folder: Path, sensor: str) -> None:

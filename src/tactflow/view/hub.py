@@ -28,7 +28,12 @@ STATS_SECONDS = 0.5
 
 
 class Packet(NamedTuple):
-    """An encoded frame. number : counts from 1."""
+    """An encoded frame.
+
+    Attributes
+    ----------
+    number : counts from 1.
+    """
 
     number: int
     data: bytes
@@ -38,9 +43,14 @@ class Packet(NamedTuple):
 class Page:
     """State of one open page.
 
-    credit : whether the next frame may be sent. sent : number of the last frame sent. texts : unsent
-    messages, only the newest of each kind, which bounds the queue of a page that does not read. wake : set
-    when there is something to send. ended : the run is over.
+    Attributes
+    ----------
+    credit : whether the next frame may be sent.
+    sent : number of the last frame sent.
+    texts : unsent messages, only the newest of each kind, which bounds the queue of a page that does not
+        read.
+    wake : set when there is something to send.
+    ended : the run is over.
     """
 
     socket: ServerConnection

@@ -36,11 +36,15 @@ Choices = Mapping[str, str]
 class Questions:
     """Asks, shows pictures, and takes the first answer from the terminal or a page.
 
+    Parameters
+    ----------
     port : of the page, the next free one if it is taken; None: nobody is asked, every proposal is taken.
     say : shows lines in the terminal.
 
-    url : of the page, None if there is none. reader : live source that is shown while an answer is waited
-    for; None shows the last picture.
+    Attributes
+    ----------
+    url : of the page, None if there is none.
+    reader : live source that is shown while an answer is waited for; None shows the last picture.
     """
 
     def __init__(self, port: int | None, say: Callable[[str], None]) -> None:

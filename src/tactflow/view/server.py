@@ -46,8 +46,10 @@ TYPES = {
 class Server:
     """Serves the page and the hub's messages on a listening socket, which it owns.
 
-    host : configured name or address; requests must address it or loopback. token : required of pages; None
-    admits all pages of this origin.
+    Parameters
+    ----------
+    host : configured name or address; requests must address it or loopback.
+    token : required of pages; None admits all pages of this origin.
     """
 
     def __init__(self, hub: Hub, listener: socket.socket, host: str, token: str | None) -> None:

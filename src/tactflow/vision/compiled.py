@@ -46,7 +46,12 @@ _kernels: list[Kernel[..., Any]] = []
 
 
 class Kernel(Generic[P, R]):
-    """A function that numba compiles before its first call. plain : the Python function."""
+    """A function that numba compiles before its first call.
+
+    Parameters
+    ----------
+    plain : the Python function.
+    """
 
     def __init__(self, plain: Callable[P, R], signature: str) -> None:
         self.plain = plain

@@ -37,7 +37,10 @@ class MarkerStatus(IntEnum):
 class Ellipse:
     """An ellipse.
 
-    center : (x, y), px. axes : full lengths (major, minor), px, major >= minor > 0.
+    Attributes
+    ----------
+    center : (x, y), px.
+    axes : full lengths (major, minor), px, major >= minor > 0.
     angle : of the major axis, degrees in (-90, 90]; None for a circle.
     """
 
@@ -50,17 +53,21 @@ class Ellipse:
 class Contact:
     """Geometry of the contact region.
 
+    Attributes
+    ----------
     area : of the convex hull, px^2, >= 0.
     center : centroid (x, y) of the contact region itself, px.
     angle : principal axis of the region, degrees in (-90, 90]; None where the region has no direction.
-    slope : dy/dx of that axis in image coordinates (y down), -tan(angle); None where vertical or undirected.
+    slope : dy/dx of that axis in image coordinates (y down), -tan(angle); None where vertical or
+        undirected.
     hull : (N, 2) float64, vertices of the convex hull in order, px.
     ellipse : fitted ellipse, or None where none can be fitted.
     confidence : of the direction, in [0, 1]: 0 for a disc, towards 1 for a line.
     region_area : number of pixels of the region, px^2.
-    evidence : what shows it. probability : of being a contact, 0 to 1; None where that is not known.
-    separate : every separate contact of the frame, that with the most pixels first; empty where there is only
-        this one.
+    evidence : what shows it.
+    probability : of being a contact, 0 to 1; None where that is not known.
+    separate : every separate contact of the frame, that with the most pixels first; empty where there is
+        only this one.
 
     >>> square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
     >>> Contact(4.0, (1.0, 1.0), None, None, square, None).center
@@ -86,13 +93,15 @@ class Markers:
 
     Markers that are found later come last.
 
+    Attributes
+    ----------
     origin : (N, 2) float64, position in the reference frame, px.
     position : (N, 2) float64, position in this frame, px. Finite for every status.
     status : (N,) uint8, values of `MarkerStatus`.
     stderr : (N,) float64, standard error of each coordinate of `position`, px; NaN where unknown.
     radius : of a marker in the reference frame, px; None where the method does not know it.
-    probability : (N,) float64, of being a marker at all, 0 to 1, by its looks in the reference frame and its
-        motion since; NaN where unknown. None where the method does not tell.
+    probability : (N,) float64, of being a marker at all, 0 to 1, by its looks in the reference frame and
+        its motion since; NaN where unknown. None where the method does not tell.
 
     >>> origin = np.array([[10.0, 20.0]])
     >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(1, np.uint8), np.array([0.01]))
@@ -117,6 +126,8 @@ class Markers:
 class Flow:
     """How the gel inside the contact has moved.
 
+    Attributes
+    ----------
     mean : (dx, dy), px: the mean displacement; None where it is not known, as where count is 0.
     count : number of markers inside. A mean over markers is one of so many; that of the displacement field
         also rests on markers around.
@@ -126,7 +137,9 @@ class Flow:
     divergence : relative growth in area (press), 1; None where rotation is None.
     residual : RMS of what mean, rotation and divergence leave unexplained, px; None where rotation is None.
     shear : (du/dx - dv/dy, du/dy + dv/dx) of the displacement (u, v), 1; None where no field is known.
-    rotation_stderr : degrees. divergence_stderr : 1. shear_stderr : of each part, 1. None where unknown.
+    rotation_stderr : degrees.
+    divergence_stderr : 1.
+    shear_stderr : of each part, 1. None where unknown.
 
     >>> Flow((1.2, -0.3), 9).mean
     (1.2, -0.3)
@@ -148,16 +161,20 @@ class Flow:
 class Slip:
     """Motion of the object relative to the gel.
 
+    Attributes
+    ----------
     slipping : whether it slides over the gel: whether `probability` is above a half.
     stick_ratio : share of the contact on which the gel still moves with it, 0 to 1; 0 while it slides.
-    probability : that it has moved farther over the gel in the last 0.1 s than a contact that sticks, and in
-        the direction in which it drags the gel, 0 to 1.
+    probability : that it has moved farther over the gel in the last 0.1 s than a contact that sticks, and
+        in the direction in which it drags the gel, 0 to 1.
     translation : (x, y), px: how far the middle of the contact has moved over the gel since frame `since`.
-    rotation : how far it has turned on the gel since then, degrees, counter-clockwise as seen on the screen.
+    rotation : how far it has turned on the gel since then, degrees, counter-clockwise as seen on the
+        screen.
     speed : RMS over the contact in the last 0.1 s, px/s; None in the first frame.
     since : seq of the frame in which it was touched, or measured anew.
-    translation_stderr : (x, y), px. rotation_stderr : degrees. speed_stderr : px/s. Standard errors; None
-        where unknown.
+    translation_stderr : (x, y), px.
+    rotation_stderr : degrees.
+    speed_stderr : px/s. Standard errors; None where unknown.
 
     >>> Slip(False, 0.7).stick_ratio
     0.7
@@ -179,11 +196,14 @@ class Slip:
 class Scale:
     """Millimetres of the gel's surface per pixel of the processed frame.
 
-    x, y : mm per px along each axis of the picture, > 0. stderr : (x, y) of their standard errors, mm per px.
-    origin : (x, y), px: where the mm coordinates are 0.
-
     The axes of the mm coordinates are those of the picture, x right and y down; z points out of the gel,
     away from the camera and towards the object, so that the three are right-handed.
+
+    Attributes
+    ----------
+    x, y : mm per px along each axis of the picture, > 0.
+    stderr : (x, y) of their standard errors, mm per px.
+    origin : (x, y), px: where the mm coordinates are 0.
 
     >>> scale = Scale(0.1, 0.1, (0.001, 0.001), (159.5, 119.5))
     >>> scale.point((169.5, 119.5)), scale.area(100.0)
@@ -231,9 +251,13 @@ class Scale:
 class Depth:
     """How far the gel's surface has been pushed in.
 
+    Attributes
+    ----------
     heights : (H, W) float32, mm, >= 0; 0 where nothing touches. Of the processed frame's size.
-    greatest : the largest of them, mm. greatest_stderr : its standard error, mm; None where unknown.
-    volume : between the untouched surface and this one, mm^3. volume_stderr : the same for it.
+    greatest : the largest of them, mm.
+    greatest_stderr : its standard error, mm; None where unknown.
+    volume : between the untouched surface and this one, mm^3.
+    volume_stderr : the same for it.
     pressed : the part of the volume that lies in the contact, mm^3.
 
     >>> Depth(np.zeros((2, 3), np.float32), 0.0, None, 0.0, None).heights.shape
@@ -252,6 +276,8 @@ class Depth:
 class Force:
     """The force on the gel.
 
+    Attributes
+    ----------
     value : (x, y, z), N, along the axes of `Scale`: z is how hard the object presses, >= 0; x and y are how
         it drags the gel. None for a component that the calibration does not know.
     stderr : standard error of each component, N; None where `value` is, NaN where it is not known.
@@ -270,16 +296,18 @@ class Force:
 class Pose:
     """How an object has moved since it was touched.
 
-    status : "tracked", or "lost" where what touches the gel now cannot be matched; then the motion is that of
-        the last frame before, and the next frame is a new start.
+    Attributes
+    ----------
+    status : "tracked", or "lost" where what touches the gel now cannot be matched; then the motion is that
+        of the last frame before, and the next frame is a new start.
     since : seq of the frame in which it started.
-    center : (x, y, z), mm, the middle of the contact in that frame, in the axes of `Scale`. The object's own
-        axes were parallel to these, from there.
+    center : (x, y, z), mm, the middle of the contact in that frame, in the axes of `Scale`. The object's
+        own axes were parallel to these, from there.
     translation : (x, y, z), mm, by how much this point of the object has moved since.
     rotation : (x, y, z), degrees, rotation vector of the object about it.
     covariance : (6, 6) float64, of translation (mm) and of a small rotation about the axes of the sensor
-        (degrees). What is not seen has large variances: 57 degrees, and as many mm as that
-        turns the object's surface by.
+        (degrees). What is not seen has large variances: 57 degrees, and as many mm as that turns the
+        object's surface by.
 
     >>> Pose("tracked", 12, (0, 0, -0.3), (0.1, 0, 0), (0, 0, 5), np.eye(6)).stderr[0]
     1.0
@@ -302,7 +330,10 @@ class Pose:
 class Features:
     """What a network says about a frame, in numbers of its own.
 
-    values : (N,) float32. unit : of them.
+    Attributes
+    ----------
+    values : (N,) float32.
+    unit : of them.
 
     >>> Features(np.zeros(2, np.float32), "1").values.shape
     (2,)

@@ -31,6 +31,11 @@ class Output(StrEnum):
 class TactflowCameraConfig(CameraConfig):
     """A tactile sensor; `width` and `height`, if set, must be those of the output.
 
+    Cameras with the same source, pipeline, settings and pace share one run, so that a sensor can have several
+    outputs.
+
+    Attributes
+    ----------
     source : as for `tactflow run --source`: a camera, a recording, `sim:press`.
     pipeline : a file, or the name of a shipped pipeline such as "mini"; None is tactflow's default.
     output : what the camera returns, see `Output`.
@@ -40,9 +45,6 @@ class TactflowCameraConfig(CameraConfig):
     realtime : play a recording at its own pace, like a camera. Otherwise the next frame waits until all
         cameras have read the last one, and no frame is dropped.
     timeout_s : longest wait for the first frame, s; the very first run compiles for a minute.
-
-    Cameras with the same source, pipeline, settings and pace share one run, so that a sensor can have several
-    outputs.
     """
 
     source: str

@@ -27,8 +27,15 @@ class AskForPictures(Sink):
 class SharedRun:
     """The newest result of a pipeline, for several readers.
 
-    config : of the first camera. counter : number of results so far. arrived : monotonic time of the last
-    one, s. failure : why there will be no more results; empty while the run goes on.
+    Parameters
+    ----------
+    config : of the first camera.
+
+    Attributes
+    ----------
+    counter : number of results so far.
+    arrived : monotonic time of the last one, s.
+    failure : why there will be no more results; empty while the run goes on.
     """
 
     _running: ClassVar[dict[str, SharedRun]] = {}

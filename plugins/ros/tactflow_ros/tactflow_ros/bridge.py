@@ -77,8 +77,12 @@ ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
 class Counts:
     """Statistics of the messages, for /diagnostics.
 
-    frames, missing : numbers so far. last : `time.monotonic` of the last message, or of the start.
-    latency_s : of the last message since its capture; NaN for a recording. lost_markers : share of all.
+    Attributes
+    ----------
+    frames, missing : numbers so far.
+    last : `time.monotonic` of the last message, or of the start.
+    latency_s : of the last message since its capture; NaN for a recording.
+    lost_markers : share of all.
     """
 
     def __init__(self) -> None:

@@ -54,7 +54,11 @@ FIELDS = [
 class Unit(NamedTuple):
     """A unit of length.
 
-    per_pixel : units per pixel in (x, y). origin : (x, y), px. suffix : of topic names.
+    Attributes
+    ----------
+    per_pixel : units per pixel in (x, y).
+    origin : (x, y), px.
+    suffix : of topic names.
     """
 
     per_pixel: tuple[float, float]

@@ -20,8 +20,10 @@ from tactflow.system.files import expanded, is_utf8
 class Recording:
     """One recording.
 
-    source : as for `tactflow run --source`, with an absolute path. name : short display name, unique within a
-    call.
+    Attributes
+    ----------
+    source : as for `tactflow run --source`, with an absolute path.
+    name : short display name, unique within a call.
     """
 
     source: str

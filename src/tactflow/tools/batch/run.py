@@ -24,8 +24,15 @@ MAX_WORKER_DEATHS = 3
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """done : source -> outcome of an earlier call. left : recordings to process. changed : number of these
-    that are done for another input, pipeline or version; the others are new or failed."""
+    """What a call has to do.
+
+    Attributes
+    ----------
+    done : source -> outcome of an earlier call.
+    left : recordings to process.
+    changed : number of these that are done for another input, pipeline or version; the others are new or
+        failed.
+    """
 
     done: Mapping[str, Outcome]
     left: Sequence[Recording]
@@ -62,8 +69,11 @@ def make_plan(store: Store, recordings: Iterable[Recording], request: Request) -
 class Result:
     """How a batch ended.
 
-    outcomes : by source. undone : number of recordings not started or aborted. ended : reason for an early
-    end, or None.
+    Attributes
+    ----------
+    outcomes : by source.
+    undone : number of recordings not started or aborted.
+    ended : reason for an early end, or None.
     """
 
     outcomes: dict[str, Outcome]
@@ -80,8 +90,10 @@ class Result:
 class Batch:
     """One call of a batch.
 
-    signals : returns the number of stop signals received. on_outcome : called with each
-    outcome.
+    Attributes
+    ----------
+    signals : returns the number of stop signals received.
+    on_outcome : called with each outcome.
     """
 
     store: Store

@@ -38,12 +38,24 @@ Fingerprint = tuple[int, int]
 class Outcome:
     """Outcome of processing a recording: a row of the table of runs.
 
-    error : reason for a failure. frames : number processed. duration_s : time of the last frame. contacts :
-    number of separate touches; touching_frames : frames with contact. largest_area_px2 : of all contacts.
-    started_unix, took_s : start time and processing time. worker : host and process. result : path relative
-    to `--out`. warnings : one per line. tactflow : version. pipeline : `pipeline_digest`. recording_is,
-    result_is : fingerprints. disk_full : whether a full disk caused the failure. pictures : times of its
-    pictures, s. trace : a few quantities over time, see `Trace`.
+    Attributes
+    ----------
+    error : reason for a failure.
+    frames : number processed.
+    duration_s : time of the last frame.
+    contacts : number of separate touches;
+    touching_frames : frames with contact.
+    largest_area_px2 : of all contacts.
+    started_unix, took_s : start time and processing time.
+    worker : host and process.
+    result : path relative to `--out`.
+    warnings : one per line.
+    tactflow : version.
+    pipeline : `pipeline_digest`.
+    recording_is, result_is : fingerprints.
+    disk_full : whether a full disk caused the failure.
+    pictures : times of its pictures, s.
+    trace : a few quantities over time, see `Trace`.
     """
 
     recording: str
@@ -86,7 +98,12 @@ def fingerprint(path: Path) -> Fingerprint:
 
 
 class Store:
-    """The output folder of a batch. path : absolute."""
+    """The output folder of a batch.
+
+    Parameters
+    ----------
+    path : absolute.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -26,7 +26,13 @@ _JPEG_QUALITY = 70
 
 
 class Picture(NamedTuple):
-    """A contact at its largest. t : s. area : px^2."""
+    """A contact at its largest.
+
+    Attributes
+    ----------
+    t : s.
+    area : px^2.
+    """
 
     t: float
     area: float
@@ -36,6 +42,8 @@ class Picture(NamedTuple):
 class Trace:
     """A few quantities of a run, thinned out evenly so that they stay few.
 
+    Attributes
+    ----------
     values : name of `TRACE_LABELS` -> a number or None for each kept frame; "t" -> its time, s.
     """
 

@@ -46,7 +46,11 @@ _OUTPUT_ONLY = {"path", "overwrite", "append", "flush"}
 class Request:
     """A pipeline that any process can load.
 
-    file : absolute path. overrides : as for `--set`. sensor : None for a pipeline with a single sensor.
+    Attributes
+    ----------
+    file : absolute path.
+    overrides : as for `--set`.
+    sensor : None for a pipeline with a single sensor.
     digest : expected `pipeline_digest`.
     """
 
@@ -59,7 +63,13 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A recording to process. out : output folder. scratch : folder for unfinished results."""
+    """A recording to process.
+
+    Attributes
+    ----------
+    out : output folder.
+    scratch : folder for unfinished results.
+    """
 
     recording: Recording
     request: Request

@@ -32,25 +32,37 @@ ONE_THREAD = dict.fromkeys(
 
 
 class Workers(Protocol):
-    """Run tasks. description : for log messages. slots : number of tasks that keeps all workers busy.
+    """Run tasks.
 
-    submit : start a task as soon as a worker is free. The future raises BrokenProcessPool if its worker died,
-    possibly because of another task, and CancelledError if the scheduler is lost; StageError if it is lost
-    already. close : stop the workers; kill : immediately, aborting running tasks.
+    Attributes
+    ----------
+    description : for log messages.
     """
 
     description: str
 
     @property
-    def slots(self) -> int: ...
+    def slots(self) -> int:
+        """Number of tasks that keeps all workers busy."""
 
-    def submit(self, task: Task) -> Future[Outcome]: ...
+    def submit(self, task: Task) -> Future[Outcome]:
+        """Start a task as soon as a worker is free.
 
-    def close(self, *, kill: bool) -> None: ...
+        The future raises BrokenProcessPool if its worker died, possibly because of another task, and
+        CancelledError if the scheduler is lost. Raises StageError if it is lost already.
+        """
+
+    def close(self, *, kill: bool) -> None:
+        """Stop the workers; with `kill` immediately, aborting running tasks."""
 
 
 class LocalProcesses:
-    """Processes on this machine. count : number of processes."""
+    """Processes on this machine.
+
+    Parameters
+    ----------
+    count : number of processes.
+    """
 
     def __init__(self, count: int) -> None:
         self.description = f"{count} {'process' if count == 1 else 'processes'}"

@@ -38,8 +38,14 @@ Pictures = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """The cost of a frame against one size. x : its values. ms : median CPU time of each, ms, and the
-    quartiles around it. left_out : x -> why there is no time."""
+    """The cost of a frame against one size.
+
+    Attributes
+    ----------
+    x : its values.
+    ms : median CPU time of each, ms, and the quartiles around it.
+    left_out : x -> why there is no time.
+    """
 
     title: str
     unit: str

@@ -37,7 +37,10 @@ from tactflow.vision.geometry import PixelMapping
 class TimedResult(Result):
     """The result of a pipeline for a frame, and its cost.
 
-    mapping : from raw to processed pixels, or None. cpu_s : CPU time, s.
+    Attributes
+    ----------
+    mapping : from raw to processed pixels, or None.
+    cpu_s : CPU time, s.
     """
 
     mapping: PixelMapping | None
@@ -47,6 +50,8 @@ class TimedResult(Result):
 class LockstepPipeline:
     """One pipeline, run a few frames at a time.
 
+    Parameters
+    ----------
     pipeline : as loaded; its source must be the recording to run on. Its sinks do not run.
     """
 

@@ -65,6 +65,8 @@ def alternatives(pipelines: Mapping[str, Pipeline], stage: str) -> dict[str, Nod
 class _Inputs:
     """Ports of the default pipeline in one frame, and the truth about it.
 
+    Attributes
+    ----------
     clean : (H, W, 3) uint8, the processed frame without markers.
     """
 

@@ -33,12 +33,17 @@ TOLERANCE_SHARE = 0.1
 class Quantity:
     """One measured error.
 
-    key : name in results. title : for people. unit : "" for none. summary : makes one number of the values
-    (N,) of all frames, N > 0. best : the perfect value: 0 for an error, of which less is better; otherwise
-    more is. slack : a stored result may be exceeded by slack + `TOLERANCE_SHARE` * |stored - best| before
-    it counts as worse:
-        by what other CPUs change in the last bits of floating-point sums (a marker or a pixel at a threshold
-        falls to the other side). For shares of frames, a little more than one frame of the quick run's 30.
+    Attributes
+    ----------
+    key : name in results.
+    title : for people.
+    unit : "" for none.
+    summary : makes one number of the values (N,) of all frames, N > 0.
+    best : the perfect value: 0 for an error, of which less is better; otherwise more is.
+    slack : a stored result may be exceeded by slack + `TOLERANCE_SHARE` * |stored - best| before it counts
+        as worse: by what other CPUs change in the last bits of floating-point sums (a marker or a pixel at
+        a threshold falls to the other side). For shares of frames, a little more than one frame of the
+        quick run's 30.
     """
 
     key: str
@@ -108,6 +113,8 @@ QUANTITIES: Mapping[str, Quantity] = {quantity.key: quantity for quantity in _AL
 class Tally:
     """Values of quantities, frame by frame.
 
+    Attributes
+    ----------
     values : key of `QUANTITIES` -> one array (N,) float64 for each frame that has values.
     """
 

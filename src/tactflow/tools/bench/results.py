@@ -33,10 +33,13 @@ LEFT_OUT = "frames_left_out"
 class Measurement:
     """The numbers of one method on one scene.
 
-    group : what is compared: "pipeline", or the id of a stage. method : name of the pipeline, or of the way
-    to do the stage's work. scene : simulated scene.
+    Attributes
+    ----------
+    group : what is compared: "pipeline", or the id of a stage.
+    method : name of the pipeline, or of the way to do the stage's work.
+    scene : simulated scene.
     values : finite numbers: errors by their keys in `QUANTITIES`; median CPU times by those in `TIMES`, and
-    their quartiles with `_low` and `_high` behind; "frames", the number of frames; and `LEFT_OUT`.
+        their quartiles with `_low` and `_high` behind; "frames", the number of frames; and `LEFT_OUT`.
     """
 
     group: str
@@ -64,10 +67,16 @@ class Measurement:
 class BenchResult:
     """A whole run of the bench.
 
-    quick : whether it was the short one. machine : what it ran on. wall_s : how long the run took, s.
-    failures : group/method/scene -> why there are no numbers. costs : pipeline -> kind of frame -> stage ->
-    median CPU time, ms. grasp : name, and pipeline -> the frames of a recording, for the page. growth : cost
-    of a frame against sizes. latency_ms : ages of results at a camera's pace.
+    Attributes
+    ----------
+    quick : whether it was the short one.
+    machine : what it ran on.
+    wall_s : how long the run took, s.
+    failures : group/method/scene -> why there are no numbers.
+    costs : pipeline -> kind of frame -> stage -> median CPU time, ms.
+    grasp : name, and pipeline -> the frames of a recording, for the page.
+    growth : cost of a frame against sizes.
+    latency_ms : ages of results at a camera's pace.
     pictures : scene -> pipeline (or `TRUTH`) -> JPEG of its deepest frame, for the page; not in the JSON.
     """
 

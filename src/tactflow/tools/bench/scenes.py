@@ -20,7 +20,11 @@ from tactflow.vision.geometry import PixelMapping
 class Case:
     """A scene and how much of it is used.
 
-    name : of the scene. frames : of its recording, all of which are used. query : further settings.
+    Attributes
+    ----------
+    name : of the scene.
+    frames : of its recording, all of which are used.
+    query : further settings.
     suffix : distinguishes it from the same scene with other settings.
     """
 

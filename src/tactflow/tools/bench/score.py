@@ -180,6 +180,8 @@ class MarkerScore:
 class PipelineScore:
     """Compares the results of a whole pipeline on one scene.
 
+    Parameters
+    ----------
     tally : gets the errors; may be shared by several scenes.
     """
 

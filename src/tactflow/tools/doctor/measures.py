@@ -31,7 +31,11 @@ MIN_CLOSED_SHARE: Final = 0.7
 class Pair(NamedTuple):
     """Two consecutive frames.
 
-    number : index of the first. image : (H, W, 3) uint8. after : the next frame, None at the end.
+    Attributes
+    ----------
+    number : index of the first.
+    image : (H, W, 3) uint8.
+    after : the next frame, None at the end.
     """
 
     number: int
@@ -40,9 +44,15 @@ class Pair(NamedTuple):
 
 
 class Lattice(NamedTuple):
-    """found : number of dots. closed : share of the parallelograms of neighbours that close. missing : share
-    of empty positions in a regular grid. contrast : median difference between a dot and its surroundings,
-    grey levels."""
+    """How regular and how distinct the dots of a gel are.
+
+    Attributes
+    ----------
+    found : number of dots.
+    closed : share of the parallelograms of neighbours that close.
+    missing : share of empty positions in a regular grid.
+    contrast : median difference between a dot and its surroundings, grey levels.
+    """
 
     found: int
     closed: float

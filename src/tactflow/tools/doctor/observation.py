@@ -41,8 +41,14 @@ without dots."""
 class Observation:
     """Observation of a source over some seconds, or of a whole recording.
 
-    source : as given by the user. description : of its kind. live : a camera or stream. nominal : frame rate
-    that it reports, 1/s, or None. begins : Unix time of t = 0, s, or None. recorded : how its frames came.
+    Attributes
+    ----------
+    source : as given by the user.
+    description : of its kind.
+    live : a camera or stream.
+    nominal : frame rate that it reports, 1/s, or None.
+    begins : Unix time of t = 0, s, or None.
+    recorded : how its frames came.
     pairs : kept frames.
     """
 

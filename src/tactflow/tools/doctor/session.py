@@ -17,8 +17,14 @@ from tactflow.tools.doctor.step import Track, examine_session
 
 @dataclass(frozen=True)
 class Examined:
-    """What was found in one source. description : of its kind. size : (width, height), px. extent : how much
-    there is of it."""
+    """What was found in one source.
+
+    Attributes
+    ----------
+    description : of its kind.
+    size : (width, height), px.
+    extent : how much there is of it.
+    """
 
     source: str
     description: str
@@ -31,7 +37,12 @@ class Examined:
 
 @dataclass(frozen=True)
 class Session:
-    """What was found in the sources of a session. together : about several of them as a whole."""
+    """What was found in the sources of a session.
+
+    Attributes
+    ----------
+    together : about several of them as a whole.
+    """
 
     parts: list[Examined]
     together: list[Finding]

@@ -44,7 +44,12 @@ BAD_ABSENCE_PERCENT: Final = 50.0
 
 @dataclass(frozen=True)
 class Track:
-    """The course of one sensor of a session. begins : Unix time of t = 0, s; None if unknown."""
+    """The course of one sensor of a session.
+
+    Attributes
+    ----------
+    begins : Unix time of t = 0, s; None if unknown.
+    """
 
     name: str
     course: Course
@@ -52,8 +57,14 @@ class Track:
 
 
 class Lag(NamedTuple):
-    """How far a sensor is behind another. seconds : negative if it is ahead. halves : in the first and the
-    second half of the session, s. proven : in step or not, this is significant."""
+    """How far a sensor is behind another.
+
+    Attributes
+    ----------
+    seconds : negative if it is ahead.
+    halves : in the first and the second half of the session, s.
+    proven : in step or not, this is significant.
+    """
 
     seconds: float
     halves: tuple[float, float]

@@ -126,7 +126,10 @@ def _taken(node: Node, sensor: str) -> Iterator[tuple[str, str, str]]:
 class Shared(NamedTuple):
     """An address at which several sinks publish.
 
-    sinks : (sensor, sink, its parameters) of each. together : parameters of a sink that publishes for all.
+    Attributes
+    ----------
+    sinks : (sensor, sink, its parameters) of each.
+    together : parameters of a sink that publishes for all.
     """
 
     sinks: Sequence[tuple[str, Node, PublisherParams]]

@@ -56,7 +56,11 @@ class Member(NamedTuple):
 class Supervisor:
     """Keeps the processes of several sensors running until each has ended for good.
 
-    start : starts a command. clock : returns the time, s. pause : sleeps, s.
+    Parameters
+    ----------
+    start : starts a command.
+    clock : returns the time, s.
+    pause : sleeps, s.
     """
 
     def __init__(

@@ -54,8 +54,12 @@ camera."""
 class Sample:
     """Frames of a sensor, divided into those at rest and those with a press.
 
-    frames : (H, W, 3) uint8 each. reference : index of the frame of the untouched gel. rest, pressed :
-    indices of frames. changes : largest relative change of light of each frame from the reference.
+    Attributes
+    ----------
+    frames : (H, W, 3) uint8 each.
+    reference : index of the frame of the untouched gel.
+    rest, pressed : indices of frames.
+    changes : largest relative change of light of each frame from the reference.
     """
 
     frames: list[ColorImage]
@@ -74,10 +78,16 @@ class Sample:
 class Attempt:
     """What a pipeline reports on the frames.
 
-    pipeline : its name. settings : values that differ from its file. found : share of pressed frames with a
-    contact. false : share of frames at rest with a contact. dots : median number of dots at rest.
-    steady : 95th percentile of their displacement at rest, px. picture : result of the strongest press, with
-    its image. failure : error message if it does not run.
+    Attributes
+    ----------
+    pipeline : its name.
+    settings : values that differ from its file.
+    found : share of pressed frames with a contact.
+    false : share of frames at rest with a contact.
+    dots : median number of dots at rest.
+    steady : 95th percentile of their displacement at rest, px.
+    picture : result of the strongest press, with its image.
+    failure : error message if it does not run.
     """
 
     pipeline: str

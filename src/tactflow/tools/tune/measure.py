@@ -43,10 +43,13 @@ FLOW_SETTINGS: Final = frozenset({"stages.field", "stages.flow_in_mask", "stages
 class Trial:
     """A pipeline that is tried, and what was measured.
 
+    Attributes
+    ----------
     settings : values that differ from the user's file, as `stages.preprocess.downsample` -> value.
-    errors : by kind (`ERROR_KINDS`), px of the camera image. quantities : errors by their names in the bench,
-    processed pixels. ms : median CPU time of a frame with contact, on the recording; infinite if not
-    measured. fault : why it cannot be chosen, or "".
+    errors : by kind (`ERROR_KINDS`), px of the camera image.
+    quantities : errors by their names in the bench, processed pixels.
+    ms : median CPU time of a frame with contact, on the recording; infinite if not measured.
+    fault : why it cannot be chosen, or "".
     """
 
     name: str

@@ -77,8 +77,13 @@ class Kept:
 class Recording:
     """The extracted part of a recording.
 
-    source : as given by the user. path : `.npy` file of the frames. frames : number of frames. size : (width,
-    height), px, before downsampling. observation : some of the frames, for the doctor's measures.
+    Attributes
+    ----------
+    source : as given by the user.
+    path : `.npy` file of the frames.
+    frames : number of frames.
+    size : (width, height), px, before downsampling.
+    observation : some of the frames, for the doctor's measures.
     """
 
     source: str

@@ -72,7 +72,10 @@ class Goal:
 class Tuned:
     """Result of a search.
 
-    trials : all candidates, best first. chosen : None if none is within the budgets.
+    Attributes
+    ----------
+    trials : all candidates, best first.
+    chosen : None if none is within the budgets.
     """
 
     recording: Recording

@@ -33,9 +33,13 @@ MAX_COLUMNS: Final = 60
 class Look:
     """Simulator settings that reproduce the look of a sensor.
 
-    size : (width, height) of the frames, px. query : scene settings, as for `open_scene`. noise : grey
-    levels. blur : px, in addition to the simulator's own. levels : (3,) factors on the simulator's light,
-    BGR.
+    Attributes
+    ----------
+    size : (width, height) of the frames, px.
+    query : scene settings, as for `open_scene`.
+    noise : grey levels.
+    blur : px, in addition to the simulator's own.
+    levels : (3,) factors on the simulator's light, BGR.
     """
 
     size: tuple[int, int]
@@ -93,8 +97,11 @@ def _levels(image: ColorImage) -> NDArray[np.float64]:
 class Fitted(Rendered):
     """A simulated recording with the look of the sensor, and its truth.
 
-    case : scene and length; its query extends that of the look. folder : for the frames. seed : for the
-    noise.
+    Parameters
+    ----------
+    case : scene and length; its query extends that of the look.
+    folder : for the frames.
+    seed : for the noise.
     """
 
     def __init__(self, look: Look, case: Case, folder: Path, seed: int) -> None:

@@ -129,6 +129,8 @@ class DamageTest:
     an eighth of them show it displaced. It is examined only if it differs from the last whole one in one
     point of 100. After 30 displaced pictures, the displacement is taken for the camera's own.
 
+    Parameters
+    ----------
     reference : (H, W, 3) uint8 BGR, a whole picture.
 
     Raises ValueError for a picture of another type or shape.

@@ -56,6 +56,8 @@ ROUNDING_VARIANCE: Final = 1 / 12
 class Look(NamedTuple):
     """What has to be computed for a frame.
 
+    Attributes
+    ----------
     changed : whether anything may have moved by more than the tolerance; if not, all results are repeated.
     suspect : whether a contact may have begun since the last frame that was processed in full; implies
         `changed`. If not, the contact stays the same, and only the dots are measured.
@@ -66,9 +68,15 @@ class Look(NamedTuple):
 
 
 class _Measurement(NamedTuple):
-    """Measurements of a frame. departure : (rows, columns) float32, deviation of the light from that of the
-    untouched gel, in thresholds. shift : (2, rows, columns) float32, of the edges along x and y, in units of
-    `_px_per_edge`, in which the noise is uniform."""
+    """Measurements of a frame.
+
+    Attributes
+    ----------
+    departure : (rows, columns) float32, deviation of the light from that of the untouched gel, in
+        thresholds.
+    shift : (2, rows, columns) float32, of the edges along x and y, in units of `_px_per_edge`, in which the
+        noise is uniform.
+    """
 
     departure: Floats32
     shift: Floats32
@@ -83,6 +91,8 @@ class RestTest:
     edges near them have, beyond the sensor's own noise, since the last frame in which they were measured; on
     a sensor whose noise hides 0.05 px, they always may have.
 
+    Parameters
+    ----------
     frame : (H, W, 3) uint8 BGR, the untouched gel.
     repeatability, tint : see `ContactDetector`.
     false_alarms : share of still frames in which the dots are measured nevertheless, in (0, 0.5].
@@ -204,8 +214,10 @@ class RestTest:
 class _LightTest:
     """The test of `ContactDetector` on tiles instead of cells; its threshold is half of the detector's.
 
-    untouched : (3, rows, columns) float32, light of the untouched gel, grey levels. repeatability, tint : see
-    `ContactDetector`.
+    Parameters
+    ----------
+    untouched : (3, rows, columns) float32, light of the untouched gel, grey levels.
+    repeatability, tint : see `ContactDetector`.
     """
 
     def __init__(self, untouched: Floats32, repeatability: float, tint: float) -> None:

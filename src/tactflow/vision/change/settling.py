@@ -63,8 +63,13 @@ franka_mini, where darker pictures have less contrast."""
 
 
 class Look(NamedTuple):
-    """Summary of a frame. light : (h, w, channels) float32, logarithm of the mean of each cell. seen : bool
-    of the same shape, whether the cell is neither black nor saturated."""
+    """Summary of a frame.
+
+    Attributes
+    ----------
+    light : (h, w, channels) float32, logarithm of the mean of each cell.
+    seen : bool of the same shape, whether the cell is neither black nor saturated.
+    """
 
     light: Floats32
     seen: NDArray[np.bool_]

@@ -48,12 +48,18 @@ _NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
 class Change(NamedTuple):
     """How a frame differs from the background.
 
-    half : (2h, 2w, 3) uint8, the frame at half resolution. cells : (3, h, w) float32, grey levels.
-    illumination : (3, 4) float32, coefficients of `IlluminationModel.fit`. squared : (h, w) float32, squared
-    deviation of each cell, chi-square with three degrees of freedom where nothing touches. colour : the
-    same for colour alone, with two degrees of freedom. evidence : the larger of the two. largest,
-    largest_colour : maxima of `squared` and `colour`. remaining : ratio of this change to that of the
-    previous frame, over the cells that were in contact then; 1 if none was.
+    Attributes
+    ----------
+    half : (2h, 2w, 3) uint8, the frame at half resolution.
+    cells : (3, h, w) float32, grey levels.
+    illumination : (3, 4) float32, coefficients of `IlluminationModel.fit`.
+    squared : (h, w) float32, squared deviation of each cell, chi-square with three degrees of freedom where
+        nothing touches.
+    colour : the same for colour alone, with two degrees of freedom.
+    evidence : the larger of the two.
+    largest, largest_colour : maxima of `squared` and `colour`.
+    remaining : ratio of this change to that of the previous frame, over the cells that were in contact
+        then; 1 if none was.
     """
 
     half: NDArray[np.uint8]
@@ -71,7 +77,10 @@ class Change(NamedTuple):
 class _Untouched:
     """The untouched gel at half resolution, for outlines; (h, 3 w) float32 each.
 
-    mean : grey levels. scale : one over the standard deviation.
+    Attributes
+    ----------
+    mean : grey levels.
+    scale : one over the standard deviation.
     """
 
     mean: Floats32
@@ -82,10 +91,13 @@ class _Untouched:
 class Derived:
     """Quantities derived from the mean and noise of the untouched gel; (3, h, w) float32 of cells.
 
-    weight : one over the standard deviation. brightness : (h, w), one over the squared length of the weighted
-    mean. colour_factor : (h, w), how much more a change of colour counts than one of brightness. scale :
-    (h, w), one over the standard deviation for `signed_change`; 0 where all channels are saturated, or where
-    there is no gel.
+    Attributes
+    ----------
+    weight : one over the standard deviation.
+    brightness : (h, w), one over the squared length of the weighted mean.
+    colour_factor : (h, w), how much more a change of colour counts than one of brightness.
+    scale : (h, w), one over the standard deviation for `signed_change`; 0 where all channels are saturated,
+        or where there is no gel.
     """
 
     illumination: IlluminationModel

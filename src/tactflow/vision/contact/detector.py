@@ -61,7 +61,10 @@ ENDED_FRACTION: Final = 0.5
 class ContactResult:
     """Where a frame shows contact.
 
-    mask : (H, W) uint8, 255 in contact, else 0. touching : whether any pixel is in contact.
+    Attributes
+    ----------
+    mask : (H, W) uint8, 255 in contact, else 0.
+    touching : whether any pixel is in contact.
     strength : largest change anywhere, in standard deviations of the untouched gel.
     deviations : (2, h, w) float32, squared changes of each cell that belongs to a contact, of its light and
         of its colour alone, in variances of the untouched gel; 0 elsewhere. Where all channels change alike

@@ -36,7 +36,10 @@ _TRACKED: Final = np.uint8(MarkerStatus.TRACKED)
 class FusedContact(NamedTuple):
     """The contact of a frame.
 
-    mask : (H, W) uint8, 255 in contact. evidence : what showed it; None without contact.
+    Attributes
+    ----------
+    mask : (H, W) uint8, 255 in contact.
+    evidence : what showed it; None without contact.
     light_changed : whether a change of the light is not a contact.
     """
 

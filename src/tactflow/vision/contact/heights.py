@@ -50,9 +50,12 @@ frames. With 0.02 to 0.3, outlines overlap equally well with real ones within 0.
 class Heights(NamedTuple):
     """The shape of a gel.
 
+    Attributes
+    ----------
     values : (h, w) float32, height of each cell above the gel at rest, in an arbitrary unit, or the size of
-    its change. mixtures : (k, 3) float32, weights of the channels: two are the slopes along x and y; one is
-    the depth; three, the identity, if neither is known yet.
+        its change.
+    mixtures : (k, 3) float32, weights of the channels: two are the slopes along x and y; one is the depth;
+        three, the identity, if neither is known yet.
     """
 
     values: Floats32
@@ -142,8 +145,12 @@ class HeightModel:
 class _Waves(NamedTuple):
     """Fourier basis along one padded side of the picture: cosines, then sines.
 
-    values : (k, n) float32, at each cell. slopes : (k, n) float32, their derivatives per cell. frequencies :
-    (k,) float32, radians per cell, from 0. The squares of a wave sum up to 1 over the padded side.
+    Attributes
+    ----------
+    values : (k, n) float32, at each cell.
+    slopes : (k, n) float32, their derivatives per cell.
+    frequencies : (k,) float32, radians per cell, from 0. The squares of a wave sum up to 1 over the padded
+        side.
     """
 
     values: Floats32

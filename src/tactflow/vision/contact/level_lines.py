@@ -45,12 +45,16 @@ changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap equa
 class LevelLines(NamedTuple):
     """The level lines of a surface, from the highest level down.
 
-    above : (h, w) int32, number of levels below each cell; holes are filled up to the line around them.
+    For each line, (n,): level : index of its level.
 
-    For each line, (n,): level : index of its level. inside : a cell inside, as y w + x. encloses : whether
-    it encloses changed cells. slope : mean slope of the surface along it, per cell; 0 if it is too wide or
-    too open for a contact. salience : slope in standard errors, up to a factor. outer : index of the line
-    around it, or -1.
+    Attributes
+    ----------
+    above : (h, w) int32, number of levels below each cell; holes are filled up to the line around them.
+    inside : a cell inside, as y w + x.
+    encloses : whether it encloses changed cells.
+    slope : mean slope of the surface along it, per cell; 0 if it is too wide or too open for a contact.
+    salience : slope in standard errors, up to a factor.
+    outer : index of the line around it, or -1.
     """
 
     above: NDArray[np.int32]
@@ -91,8 +95,11 @@ def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
 class ContactRegion(NamedTuple):
     """A region that holds the outline of a contact.
 
-    rows, columns : window of cells. inside : (h, w) bool, cells that may belong to the contact. core :
-    (h, w) uint8, 1 in cells that certainly do.
+    Attributes
+    ----------
+    rows, columns : window of cells.
+    inside : (h, w) bool, cells that may belong to the contact.
+    core : (h, w) uint8, 1 in cells that certainly do.
     """
 
     rows: slice
@@ -128,7 +135,12 @@ class ContactFinder:
 
 
 class _Contacts(NamedTuple):
-    """The contacts of a surface, the most salient first. slope : of the first one's line; 0 without any."""
+    """The contacts of a surface, the most salient first.
+
+    Attributes
+    ----------
+    slope : of the first one's line; 0 without any.
+    """
 
     regions: list[ContactRegion]
     slope: float

@@ -26,6 +26,8 @@ is released before another contact begins. Chosen by hand."""
 class ReferenceCheck:
     """Compares the roughness of changed regions with that of the same places in the reference.
 
+    Parameters
+    ----------
     reference : (H, W, 3) uint8 BGR, without markers.
 
     >>> from tactflow.sim import open_scene

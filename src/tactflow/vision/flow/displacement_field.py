@@ -76,9 +76,11 @@ class Grid(NamedTuple):
 class Samples(NamedTuple):
     """A grid of cells over which the field is summed.
 
-    to_markers : (rows, columns, N) float64, the kernel between cells and markers. between : (2 rows - 1, 2
-    columns - 1) float64, the kernel between two cells, by how many rows and columns they are apart; 0 in the
-    middle.
+    Attributes
+    ----------
+    to_markers : (rows, columns, N) float64, the kernel between cells and markers.
+    between : (2 rows - 1, 2 columns - 1) float64, the kernel between two cells, by how many rows and
+        columns they are apart; 0 in the middle.
     """
 
     grid: Grid
@@ -89,6 +91,8 @@ class Samples(NamedTuple):
 class Gradient(NamedTuple):
     """How a part of the gel is turned, pressed apart and sheared: its displacement gradient.
 
+    Attributes
+    ----------
     dx, dy : (du/dx, dv/dx) and (du/dy, dv/dy), 1: gradient of the displacement (u, v).
     dx_stderr, dy_stderr : of each of their components, 1.
     """
@@ -117,6 +121,8 @@ class Gradient(NamedTuple):
 class GelMotion(NamedTuple):
     """How a part of the gel has moved as a whole.
 
+    Attributes
+    ----------
     mean : (dx, dy), px: the integral of the displacement over the part, over its area at rest.
     stderr : of each component of the mean, px, for a region whose outline is exact.
     outline_stderr : what the outline of a contact adds to that, (dx, dy), px.
@@ -227,9 +233,16 @@ class DisplacementField:
     Coordinates are those of the gel at rest: `displacement[row, column]` is how far the bit of gel has moved
     that was at `grid.points[row, column]` in the reference frame.
 
-    model : of the reference. markers : of the frame. seen : (N,) bool, those that are tracked, three or more.
+    Parameters
+    ----------
+    model : of the reference.
+    markers : of the frame.
+    seen : (N,) bool, those that are tracked, three or more.
 
-    grid : where the field is known. noise : median standard error of a marker, px; 0 where none is known.
+    Attributes
+    ----------
+    grid : where the field is known.
+    noise : median standard error of a marker, px; 0 where none is known.
     """
 
     def __init__(self, model: FieldModel, markers: Markers, seen: Flags) -> None:

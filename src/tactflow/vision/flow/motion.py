@@ -41,11 +41,14 @@ _TRACKED: Final = int(MarkerStatus.TRACKED)
 class Motion(NamedTuple):
     """Motion of the markers in one frame.
 
+    Attributes
+    ----------
     moving : whether neighbouring markers have moved in a way that no motion of the whole gel explains.
     clearly : whether they have moved so far that it is a contact, whatever the light shows.
     largest : the third largest of their motions, px; 0 with fewer than three tracked markers.
-    left : (N,) float64, the motion of each tracked marker that no motion of the whole gel explains, px; 0 of
-    others. bound : (N,) float64, threshold for motion, px.
+    left : (N,) float64, the motion of each tracked marker that no motion of the whole gel explains, px; 0
+        of others.
+    bound : (N,) float64, threshold for motion, px.
     """
 
     moving: bool

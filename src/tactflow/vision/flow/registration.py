@@ -77,12 +77,19 @@ def cells(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 class Template(NamedTuple):
     """The picture of a contact, with which later ones are compared; lengths in cells.
 
-    center : (2,), mean of its cells. radius : RMS distance from it. moments : (2, 2), second moments of the
-    cells. away : (N, 2) float32, from the centre. patches : (N,) int64, to which each cell belongs, in order.
-    light : (N, 3) float32, grey levels. by : (N, 3, 5) float32, derivatives of the difference by a small
-    motion and by a gain. power : (5, 5), sum of the products of `by`. lamps : (5, 5), covariance of the sum
-    of `by` times the effect of the lamps. contrast : standard deviation of the light. noise : variance of the
-    difference of the light of two pictures.
+    Attributes
+    ----------
+    center : (2,), mean of its cells.
+    radius : RMS distance from it.
+    moments : (2, 2), second moments of the cells.
+    away : (N, 2) float32, from the centre.
+    patches : (N,) int64, to which each cell belongs, in order.
+    light : (N, 3) float32, grey levels.
+    by : (N, 3, 5) float32, derivatives of the difference by a small motion and by a gain.
+    power : (5, 5), sum of the products of `by`.
+    lamps : (5, 5), covariance of the sum of `by` times the effect of the lamps.
+    contrast : standard deviation of the light.
+    noise : variance of the difference of the light of two pictures.
     """
 
     center: Floats
@@ -106,10 +113,14 @@ class Template(NamedTuple):
 class Registration(NamedTuple):
     """A motion from a template to a picture.
 
-    motion : (5,), shift (x, y) of the centre, turn from +x to +y and growth, as far as they move the cells at
-    the RMS radius, cells; relative change of the contrast. covariance : (5, 5). error : (N, 3) float32, how
-    the light differs then, grey levels, 0 where it is not seen. residual : standard deviation of the
-    difference over that of the change of light. seen : share of the template's cells.
+    Attributes
+    ----------
+    motion : (5,), shift (x, y) of the centre, turn from +x to +y and growth, as far as they move the cells
+        at the RMS radius, cells; relative change of the contrast.
+    covariance : (5, 5).
+    error : (N, 3) float32, how the light differs then, grey levels, 0 where it is not seen.
+    residual : standard deviation of the difference over that of the change of light.
+    seen : share of the template's cells.
     """
 
     motion: Floats

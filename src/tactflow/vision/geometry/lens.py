@@ -22,6 +22,8 @@ _undistort: Final[Any] = getattr(cv2, "undistortPointsIter", cv2.undistortPoints
 class Lens:
     """A camera's intrinsic calibration, as `cv2.calibrateCamera` or `cv2.fisheye.calibrate` gives it.
 
+    Parameters
+    ----------
     camera_matrix : (3, 3), px, without skew: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
     distortion : 4, 5, 8, 12 or 14 coefficients of the polynomial model, or 4 of the fisheye model.
     fisheye : which of the two models.

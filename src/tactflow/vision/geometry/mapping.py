@@ -29,6 +29,8 @@ finite one keeps every later number finite. Chosen by hand."""
 class PixelMapping:
     """The exact relation between raw and processed pixel coordinates.
 
+    Attributes
+    ----------
     raw_size, size : (width, height) of the raw and of the processed frame, px.
     matrix : (3, 3) float64, homogeneous, from undistorted raw to processed pixels.
     lens : whose distortion was removed before, or None.

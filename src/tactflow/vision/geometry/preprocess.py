@@ -31,13 +31,15 @@ _ROTATIONS: Final = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.
 class Preprocessor:
     """Turns raw frames of one size into processed frames, all steps in one pass where that is exact.
 
+    Parameters
+    ----------
     raw_size : (width, height) of the raw frames, px.
     rotate : 0, 90, 180 or 270, degrees clockwise.
     downsample : 1, 2, 4, ...; the factor by which both sides shrink.
-    method : "area" averages blocks: fast, and the mean of k x k pixels has 1 / k of their noise. Where a side
-        is not a multiple of the factor, the last columns or rows of the unrotated picture are left out.
-        "pyramid" is the original script's: rotate, then `cv2.pyrDown` for each factor of two (sides round
-        up); three times the time, smoother, and its pixels lie half a raw pixel elsewhere.
+    method : "area" averages blocks: fast, and the mean of k x k pixels has 1 / k of their noise. Where a
+        side is not a multiple of the factor, the last columns or rows of the unrotated picture are left
+        out. "pyramid" is the original script's: rotate, then `cv2.pyrDown` for each factor of two (sides
+        round up); three times the time, smoother, and its pixels lie half a raw pixel elsewhere.
     crop : (x, y, width, height), whole px of the undistorted and rectified, not yet rotated frame; without
         lens and homography these are raw pixels. None keeps everything.
     lens : whose distortion is removed.

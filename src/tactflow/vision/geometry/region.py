@@ -40,7 +40,10 @@ class Moments(NamedTuple):
 class Region(NamedTuple):
     """The pixels of a mask that are set.
 
-    left, top, width, height : their bounding box, px; all 0 if there are none. pixels : how many.
+    Attributes
+    ----------
+    left, top, width, height : their bounding box, px; all 0 if there are none.
+    pixels : how many.
     window : (height, width) uint8, the part of the mask in that box.
     """
 

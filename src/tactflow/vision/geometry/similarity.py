@@ -20,9 +20,13 @@ _MIN_SPREAD: Final = 1e-9
 class Similarity(NamedTuple):
     """Vectors as mean + slope * away, by weighted least squares.
 
-    middle : weighted mean of the places. mean : that of the vectors. slope : growth + i turn, from +x to +y,
-    where the vectors are displacements. away : (n,), places from the middle. spread : weighted mean of its
-    squares.
+    Attributes
+    ----------
+    middle : weighted mean of the places.
+    mean : that of the vectors.
+    slope : growth + i turn, from +x to +y, where the vectors are displacements.
+    away : (n,), places from the middle.
+    spread : weighted mean of its squares.
     """
 
     middle: complex

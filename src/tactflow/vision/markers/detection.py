@@ -60,7 +60,12 @@ _FEW_MARKERS: Final = " (if it has only a few marks, give their radius in pixels
 
 
 class NoMarkersError(ValueError):
-    """The image shows no trackable marks. best : the best candidate, or None."""
+    """The image shows no trackable marks.
+
+    Parameters
+    ----------
+    best : the best candidate, or None.
+    """
 
     def __init__(self, message: str, best: Candidate | None = None) -> None:
         super().__init__(message)
@@ -71,12 +76,16 @@ class NoMarkersError(ValueError):
 class Detection:
     """The marks of an image.
 
-    centers : (N, 2) float64, px. dot_radius : of a disc with the response of most marks, px.
+    Attributes
+    ----------
+    centers : (N, 2) float64, px.
+    dot_radius : of a disc with the response of most marks, px.
     polarity : whether the marks are darker or brighter than the gel.
     pitch : median distance of a mark to its nearest neighbour, px; with one mark, eight radii.
     edges : (E, 2) int64, pairs of neighbouring marks, each pair once, smaller index first.
     radii : (N,) float64, of each mark, px; None if all have the same size.
-    chosen : the candidate that the marks were grown from. rival : the next best one elsewhere, or None.
+    chosen : the candidate that the marks were grown from.
+    rival : the next best one elsewhere, or None.
     evidence : (N, 3) float64, features behind the probability of each mark (see `selection.evidence`).
     """
 

@@ -44,7 +44,10 @@ more of 121 pictures without dots show a lattice."""
 class Corners(NamedTuple):
     """Fourth corners of the parallelograms spanned by two neighbours of a mark.
 
-    points : (M, 2) float64, px. reach : (M,) float64, maximum distance of a mark that closes it, px.
+    Attributes
+    ----------
+    points : (M, 2) float64, px.
+    reach : (M,) float64, maximum distance of a mark that closes it, px.
     first, middle, last : (M,) int64, the marks that span it.
     """
 
@@ -58,6 +61,8 @@ class Corners(NamedTuple):
 class Lattice:
     """The lattice of a set of marks: their links, and the parallelograms of these. Computed lazily.
 
+    Parameters
+    ----------
     points : (N, 2) float64, px.
 
     >>> x, y = np.meshgrid(np.arange(0, 100, 10.0), np.arange(0, 100, 10.0))

@@ -39,8 +39,12 @@ MIN_CONTRAST_GREY: Final = 6.0
 class Dot:
     """Appearance of the markers of a gel.
 
-    radius : px, > 0. polarity : darker or brighter than the gel. contrast : minimum difference of a marker to
-    the gel, grey levels, > 0. others : radii of markers of other sizes, px, each > 0.
+    Attributes
+    ----------
+    radius : px, > 0.
+    polarity : darker or brighter than the gel.
+    contrast : minimum difference of a marker to the gel, grey levels, > 0.
+    others : radii of markers of other sizes, px, each > 0.
     """
 
     radius: float

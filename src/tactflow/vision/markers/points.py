@@ -105,8 +105,11 @@ class NearestTracker:
     A pair counts if each is the nearest to the other, no farther apart than `max_displacement`. A mark
     without a partner is lost, and keeps its last known position.
 
-    origin : (N, 2) float64, px. max_displacement : between two frames, px, > 0; beyond half the distance of
-    neighbouring marks, the nearest detection may be the neighbour.
+    Parameters
+    ----------
+    origin : (N, 2) float64, px.
+    max_displacement : between two frames, px, > 0; beyond half the distance of neighbouring marks, the
+        nearest detection may be the neighbour.
 
     >>> tracker = NearestTracker(np.array([[10.0, 10.0], [30.0, 10.0]]), 8.0)
     >>> markers = tracker.link(np.array([[12.0, 11.0], [90.0, 90.0]]))

@@ -79,8 +79,12 @@ Chosen on sts_640 and sts_torque160, where glare correlates less with marks than
 class Candidate(NamedTuple):
     """Spots of one scale and polarity that may be the marks of a gel.
 
-    spots : of similar strength, apart from each other. radius : of a disc with the same response, px. score :
-    rank among the candidates of a picture. lattice : of their centres.
+    Attributes
+    ----------
+    spots : of similar strength, apart from each other.
+    radius : of a disc with the same response, px.
+    score : rank among the candidates of a picture.
+    lattice : of their centres.
     """
 
     spots: Spots

@@ -60,10 +60,14 @@ BORDER_MARGIN_RADII: Final = 0.8
 class Spots(NamedTuple):
     """Spots and their properties.
 
-    points : (N, 2) float64, px. radius : (N,) float64, of discs of that scale, px. strength : (N,) float64,
-    response, grey levels. clear : (N,) float64, smallest contrast with the surrounding ring over the median
-    one, at most 1; an isolated spot on an even background has 1. bend : (N,) float64, smallest curvature of
-    the peak of the response, grey levels per squared scale.
+    Attributes
+    ----------
+    points : (N, 2) float64, px.
+    radius : (N,) float64, of discs of that scale, px.
+    strength : (N,) float64, response, grey levels.
+    clear : (N,) float64, smallest contrast with the surrounding ring over the median one, at most 1; an
+        isolated spot on an even background has 1.
+    bend : (N,) float64, smallest curvature of the peak of the response, grey levels per squared scale.
     """
 
     points: Floats

@@ -52,8 +52,11 @@ since it would not converge. Chosen by hand."""
 class Alignment(NamedTuple):
     """Positions of marks.
 
-    position : (n, 2) float64, px. stderr : (n,) float32, standard error of each coordinate, px. seen : (n,)
-    bool, whether the template fits.
+    Attributes
+    ----------
+    position : (n, 2) float64, px.
+    stderr : (n,) float32, standard error of each coordinate, px.
+    seen : (n,) bool, whether the template fits.
     """
 
     position: Floats
@@ -74,9 +77,13 @@ class Alignment(NamedTuple):
 class _Model(NamedTuple):
     """Precomputed terms for the alignment of marks of one size.
 
-    weights : (PHASES^2 N, 5, p) int16, of the pixels of a disc. terms : (PHASES^2 N, 15) float32: the 9
-    elements of the Gram matrix, the variance per pixel, and the units of the 5 weights. widths : (rows,)
-    int64, of the disc's rows, px. radius : of a mark, px.
+    Attributes
+    ----------
+    weights : (PHASES^2 N, 5, p) int16, of the pixels of a disc.
+    terms : (PHASES^2 N, 15) float32: the 9 elements of the Gram matrix, the variance per pixel, and the
+        units of the 5 weights.
+    widths : (rows,) int64, of the disc's rows, px.
+    radius : of a mark, px.
     """
 
     weights: Levels
