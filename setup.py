@@ -1,10 +1,12 @@
-"""What pyproject.toml cannot say: packages beside src/, and a README whose links work on a package index."""
+"""What pyproject.toml cannot say: loops in C, packages beside src/, a README whose links work on an index."""
 
 import os
 import re
+import sys
+import sysconfig
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
 
 REPOSITORY = os.environ.get("GITHUB_REPOSITORY")
 """Owner and name, as set where the packages of a release are built. Without it, links stay relative."""
@@ -19,9 +21,30 @@ def absolute(link: re.Match[str]) -> str:
     return f"]({ADDRESS}/{'raw' if path.endswith('.jpg') else 'blob'}/{VERSION}/{path})"
 
 
+ORDER = [
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fassociative-math",
+    "-fno-signed-zeros",
+    "-freciprocal-math",
+]
+"""Sums of floats in any order, so that they run in vector registers; NaN and infinity still count."""
+STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
+"""Whether the stable interface of Python 3.11 can be used: then one wheel serves that and all later ones."""
+kernels = Extension(
+    "tactflow.vision._kernels",
+    ["src/tactflow/vision/kernels.c"],
+    define_macros=[("Py_LIMITED_API", "0x030B0000")] if STABLE else [],
+    extra_compile_args=["/O2", "/fp:fast"] if sys.platform == "win32" else ["-O3", "-g0", *ORDER],
+    py_limited_api=STABLE,
+    optional=True,  # where there is no C compiler, loops run in NumPy
+)
+
 readme = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
 published = {"Source": ADDRESS, "Changes": f"{ADDRESS}/blob/{VERSION}/CHANGELOG.md"}
 setup(
+    ext_modules=[kernels],
+    options={"bdist_wheel": {"py_limited_api": "cp311"}} if STABLE else {},
     packages=[
         *find_packages("src"),
         "tactflow.view.page",

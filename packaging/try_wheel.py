@@ -73,7 +73,7 @@ def attempt(wheel: Path, python: str, folder: Path) -> tuple[float, float, float
 
     Returns
     -------
-    download, installed : MB. compiling : s.
+    download, installed : MB. start : s, of the first command.
     """
     run([python, "-m", "venv", "venv"], folder)
     pip = [str(folder / "venv/bin/python"), "-m", "pip", "--disable-pip-version-check", "--no-cache-dir"]
@@ -87,12 +87,12 @@ def attempt(wheel: Path, python: str, folder: Path) -> tuple[float, float, float
     programs = folder / "venv/bin"
     started = time.monotonic()
     run("tactflow warmup", folder, programs)
-    compiling = time.monotonic() - started
+    start = time.monotonic() - started
     commands, program = first_screen(README.read_text(encoding="utf-8"))
     (folder / "results.py").write_text(program, encoding="utf-8")
     for command in (*commands, "python results.py"):
         run(command, folder, programs)
-    return *sizes, compiling
+    return *sizes, start
 
 
 def main() -> int:
@@ -105,19 +105,19 @@ def main() -> int:
     args = parser.parse_args()
     failed = False
     print(
-        "| Python | download, MB | installed, MB | first compilation, s |\n| --- | --- | --- | --- |",
+        "| Python | download, MB | installed, MB | first start, s |\n| --- | --- | --- | --- |",
         flush=True,
     )
     for python in args.python:
         version = subprocess.check_output([python, "-c", "import platform; print(platform.python_version())"])
         with tempfile.TemporaryDirectory() as folder:
             try:
-                download, installed, compiling = attempt(args.wheel.resolve(), python, Path(folder))
+                download, installed, start = attempt(args.wheel.resolve(), python, Path(folder))
             except subprocess.CalledProcessError as error:
                 failed = True
                 print(f"{python}: {error.cmd} failed\n{error.stdout}{error.stderr}", file=sys.stderr)
                 continue
-        row = f"| {version.decode().strip()} | {download:.0f} | {installed:.0f} | {compiling:.0f} |"
+        row = f"| {version.decode().strip()} | {download:.0f} | {installed:.0f} | {start:.0f} |"
         print(row, flush=True)
     return failed
 

@@ -22,7 +22,7 @@ OUTER = ("tactflow.tools", "tactflow.plugins", "lab")
 """Tools, plug-ins and the laboratory, which the core does not import."""
 
 ROOMS = {
-    "src/tactflow/engine": ("cv2", "zmq", "numba", "tactflow.vision", "tactflow.config", "tactflow.stages"),
+    "src/tactflow/engine": ("cv2", "zmq", "tactflow.vision", "tactflow.config", "tactflow.stages"),
     "src/tactflow/config": ("cv2", "zmq", "tactflow.vision", "tactflow.cli", "tactflow.tools"),
     "src/tactflow/vision": ("zmq", "tactflow.engine", "tactflow.config", "tactflow.stages"),
     "src/tactflow/calibration": ("zmq", "tactflow.stages", "tactflow.sinks", "tactflow.cli"),

@@ -175,12 +175,12 @@ def run(
 
 
 def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
-    """A run of a pipeline; loops are compiled, and OpenCV has the threads that the pipeline sets.
+    """A run of a pipeline; OpenCV has the threads that the pipeline sets.
 
     options : passed to `Runner`. Raises ConfigError if the calibration cannot be read.
     """
     _warn_of_opencv()
-    compiled.load()
+    compiled.warn_if_plain()
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
     pipeline = with_recorded_calibration(pipeline)

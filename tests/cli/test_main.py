@@ -71,10 +71,10 @@ def test_a_wrong_command_line_gives_a_message_and_exit_code_2(
 @pytest.mark.parametrize(
     ("imports", "without"),
     [
-        ("import tactflow", {"cv2", "numba", "zmq", "pydantic"}),
+        ("import tactflow", {"cv2", "zmq", "pydantic"}),
         ("import tactflow.network.subscriber", {"cv2"}),
         ("from tactflow.cli.main import main; main(['--help'])", {"cv2", "numpy", "pydantic"}),
-        ("import tactflow.cli.run", {"asyncio", "numba", "pyarrow", "rich", "scipy", "ssl", "websockets"}),
+        ("import tactflow.cli.run", {"asyncio", "pyarrow", "rich", "scipy", "ssl", "websockets"}),
     ],
 )
 def test_what_is_not_needed_at_the_start_is_not_imported(imports: str, without: set[str]) -> None:

@@ -109,7 +109,7 @@ def test_the_file_says_how_it_was_made(recording: Path, tmp_path: Path) -> None:
         reader = make_reader(file)
         texts = {item.name: item.data.decode() for item in reader.iter_attachments()}
         (facts,) = (item.metadata for item in reader.iter_metadata() if item.name == "tactflow")
-    assert {"tactflow", "numpy", "numba", "opencv", "python"} <= set(facts)
+    assert {"tactflow", "numpy", "opencv", "python"} <= set(facts)
     assert facts["opencv"] == cv2.__version__
     settings = yaml.safe_load(texts["pipeline.yaml"])
     assert settings["stages"]["capture"]["source"] == "sim:press?frames=12"

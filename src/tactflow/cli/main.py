@@ -40,7 +40,7 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
     "keys": Command("make keys that encrypt results sent over a network", "tactflow.cli.control", "keys"),
     "warmup": Command(
-        "compile what `run` would compile on its first use", "tactflow.cli.pipelines", "warmup"
+        "load a pipeline, and say whether its loops are compiled", "tactflow.cli.pipelines", "warmup"
     ),
     "record": Command("run a pipeline and record its frames and results", "tactflow.cli.run", "record"),
     "export": Command(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import platform
-from importlib.metadata import version
 
 import cv2
 import numpy as np
@@ -27,7 +26,6 @@ def facts(sensor: str, control: Control | None) -> dict[str, str]:
     texts = {
         "tactflow": __version__,
         "numpy": np.__version__,
-        "numba": version("numba"),
         "opencv": cv2.__version__,
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",

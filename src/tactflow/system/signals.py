@@ -19,7 +19,7 @@ Handler = Callable[[int, FrameType | None], object]
 class Interrupted(KeyboardInterrupt):
     """Raised by a handler in the main thread to end pending work.
 
-    After a KeyboardInterrupt within `exec` of a text, as used by numba, `python -m` would end by SIGINT,
+    After a KeyboardInterrupt within `exec` of a text, as in dataclasses, `python -m` would end by SIGINT,
     whatever the exit code, even if the exception was caught.
     """
 

@@ -116,12 +116,10 @@ def test_no_dot_can_be_known_better_than_noise_allows(default: Subject) -> None:
 
 def test_loops_are_strict_within_the_block_only() -> None:
     assert compiled.kernels()
-    before = [loop.__dict__.get("compiled") for loop in compiled.kernels()]
+    before = [loop.compiled for loop in compiled.kernels()]
     with strict():
-        assert not any(
-            loop.__dict__["compiled"] is old for loop, old in zip(compiled.kernels(), before, strict=True)
-        )
-    assert [loop.__dict__.get("compiled") for loop in compiled.kernels()] == before
+        assert not any(loop.compiled is old for loop, old in zip(compiled.kernels(), before, strict=True))
+    assert [loop.compiled for loop in compiled.kernels()] == before
 
 
 def test_a_long_run_touches_the_gel_and_ends_at_rest(default: Subject) -> None:

@@ -222,6 +222,6 @@ def machine() -> dict[str, str]:
     cpuinfo = Path("/proc/cpuinfo")
     models = re.findall(r"model name\s*: (.*)", cpuinfo.read_text()) if cpuinfo.exists() else []
     model = models[0] if models else platform.processor() or platform.machine()
-    versions = {name: metadata.version(name) for name in ("numpy", "numba")}
+    versions = {name: metadata.version(name) for name in ("numpy",)}
     cpu = f"{model} ({os.cpu_count()} cores, one thread used)"
     return {"CPU": cpu, "Python": platform.python_version(), "OpenCV": cv2.__version__, **versions}

@@ -264,7 +264,7 @@ def _used_lines(energy: Floats32, number: int) -> NDArray[np.intp]:
     return np.asarray((inside + lines * np.arange(rows)[:, None]).ravel())
 
 
-@kernel("void(uint8[:, ::1], uint8[:, ::1], float32[:, :, ::1], float32[:, :, ::1])")
+@kernel
 def sum_tiles(lines: NDArray[np.uint8], resting: NDArray[np.uint8], slopes: Floats32, sums: Floats32) -> None:
     """Sums over tiles of blue, green and red, and of the change of green times its slopes along x and y.
 
@@ -272,21 +272,8 @@ def sum_tiles(lines: NDArray[np.uint8], resting: NDArray[np.uint8], slopes: Floa
     gel. slopes : (2, n * rows, m * columns), levels per px. sums : (5, rows, columns), filled.
     """
     _, rows, columns = sums.shape
-    thick, wide = resting.shape[0] // rows, resting.shape[1] // columns
-    light, shift = np.empty(lines.shape[1], np.uint16), np.empty((2, resting.shape[1]), np.float32)
-    for row in range(rows):
-        light[:] = 0
-        shift[:] = 0
-        for y in range(row * thick, (row + 1) * thick):
-            for x in range(light.size):
-                light[x] += lines[y, x]
-            for x in range(resting.shape[1]):
-                more = np.float32(lines[y, 3 * x + 1]) - np.float32(resting[y, x])
-                shift[0, x] += more * slopes[0, y, x]
-                shift[1, x] += more * slopes[1, y, x]
-        for column in range(columns):
-            begin, end = column * wide, (column + 1) * wide
-            for c in range(3):
-                sums[c, row, column] = light[3 * begin + c : 3 * end : 3].sum()
-            for axis in range(2):
-                sums[3 + axis, row, column] = shift[axis, begin:end].sum()
+    tiles = rows, len(resting) // rows, columns, resting.shape[1] // columns
+    pictures = lines.reshape(*tiles, 3)
+    sums[:3] = pictures.sum(axis=(1, 3)).transpose(2, 0, 1)
+    more = pictures[..., 1].astype(np.float32) - resting.reshape(tiles)
+    sums[3:] = (slopes.reshape(2, *tiles) * more).sum(axis=(2, 4))

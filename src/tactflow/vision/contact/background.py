@@ -269,12 +269,13 @@ class BackgroundModel:
             self._untouched.mean,
             self._untouched.scale,
             scaled,
+            NEIGHBOUR_WEIGHT,
         )
         smooth = cv2.sepFilter2D(
             scaled,
             cv2.CV_32F,
             np.ones(1, np.float32),
-            np.array([NEIGHBOUR_WEIGHT, CENTER_WEIGHT, NEIGHBOUR_WEIGHT]),
+            np.array([NEIGHBOUR_WEIGHT, CENTER_WEIGHT, NEIGHBOUR_WEIGHT], np.float32),
         )
         smooth *= inside.repeat(2, axis=0).repeat(6, axis=1)
         return np.asarray(smooth.reshape(high, wide, 3), np.float32)

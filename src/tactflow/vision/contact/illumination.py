@@ -18,8 +18,6 @@ CLIP_STDDEVS: Final = 2.0
 REJECT_CLIP_RATIO: Final = 6.0
 """Residuals above this multiple of the clipping limit are rejected in the second fit. Chosen on the simulated
 bright_cable, whose centre moves by 0.1 px more the lower it is, down to 2."""
-NO_REJECTION_RATIO: Final = 1e6
-"""The same for the first fit, which rejects no residuals."""
 MAX_STEPS: Final = 12
 """Maximum number of least-squares steps. Chosen by hand; the fit usually converges earlier."""
 MIN_STEP_GREY: Final = 0.05
@@ -116,8 +114,20 @@ class IlluminationModel:
             excess,
             limit,
             coefficients,
+            SATURATED_GREY,
         )
-        fit_robustly(excess, self._basis, self._step, self._shrink, limit, self._center, coefficients)
+        fit_robustly(
+            excess,
+            self._basis,
+            self._step,
+            self._shrink,
+            limit,
+            self._center,
+            coefficients,
+            MAX_STEPS,
+            MIN_STEP_GREY,
+            REJECT_CLIP_RATIO,
+        )
         return coefficients
 
     def _fitted_blocks(self, gel: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -159,10 +169,7 @@ def _block_weights(blocks: int, count: int) -> Floats32:
     return np.asarray(np.maximum(covered, 0) * (blocks / count), np.float32)
 
 
-@kernel(
-    "void(float32[:, :, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1],"
-    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])",
-)
+@kernel
 def compare_blocks(
     cells: Floats32,
     row_weights: Floats32,
@@ -173,57 +180,27 @@ def compare_blocks(
     excess: Floats32,
     limit: Floats32,
     coefficients: Floats32,
+    saturated: float,
 ) -> None:
     """Initialise a fit: fill `excess` and `limit`, (3, n), and the gains in `coefficients`, (3, 4).
 
     cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference :
-    (3, n), their means, subtracted to give `excess`. usual_limit : (3, n); `limit` is 0 for saturated blocks.
-    per_brightness : (3, n), one over the brightness, 0 where it is unlit: a gain is the median of the
-    relative changes of lit, unsaturated blocks, or the largest one if all are saturated.
+    (3, n), their means, subtracted to give `excess`. usual_limit : (3, n); `limit` is 0 for blocks that are
+    saturated, at this grey level. per_brightness : (3, n), one over the brightness, 0 where it is unlit: a
+    gain is the median of the relative changes of lit, unsaturated blocks, or the largest one if all are
+    saturated.
     """
-    _, high, wide = cells.shape
-    down, across = len(row_weights), len(column_weights)
-    line, ratios = np.empty(wide, np.float32), np.empty(down * across, np.float32)
-    for c in range(3):
-        count, most = 0, np.float32(0)
-        for row in range(down):
-            line[:] = 0
-            # Only the lines and columns of the block have a weight.
-            for y in range(row * high // down, -(-(row + 1) * high // down)):
-                for x in range(wide):
-                    line[x] += row_weights[row, y] * cells[c, y, x]
-            for column in range(across):
-                mean, at = np.float32(0), row * across + column
-                for x in range(column * wide // across, -(-(column + 1) * wide // across)):
-                    mean += line[x] * column_weights[column, x]
-                excess[c, at] = mean - reference[c, at]
-                limit[c, at] = usual_limit[c, at] if mean < SATURATED_GREY else np.float32(0)
-                if per_brightness[c, at] > 0:
-                    ratios[count] = excess[c, at] * per_brightness[c, at]
-                    most = max(most, ratios[count])
-                    count += limit[c, at] > 0
-        # The median by bisection: skip candidates outside the current bounds.
-        least, largest = np.float32(-np.inf), np.float32(np.inf)
-        for i in range(count):
-            if least < ratios[i] < largest:
-                below = up_to = 0
-                for j in range(count):
-                    below += ratios[j] < ratios[i]
-                    up_to += ratios[j] <= ratios[i]
-                if below > count // 2:
-                    largest = ratios[i]
-                elif up_to <= count // 2:
-                    least = ratios[i]
-                else:
-                    most = ratios[i]
-                    break
-        coefficients[c, 0] = most
+    means = (row_weights @ cells @ column_weights.T).reshape(excess.shape)
+    excess[:] = means - reference
+    limit[:] = np.where(means < saturated, usual_limit, 0)
+    for ratios, lit, free, into in zip(
+        excess * per_brightness, per_brightness > 0, limit > 0, coefficients, strict=True
+    ):
+        used = np.sort(ratios[lit & free])
+        into[0] = used[len(used) // 2] if len(used) else ratios[lit].max(initial=0)
 
 
-@kernel(
-    "void(float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1],"
-    " float32[::1], float32[:, ::1])",
-)
+@kernel
 def fit_robustly(
     excess: Floats32,
     basis: Floats32,
@@ -232,41 +209,25 @@ def fit_robustly(
     limit: Floats32,
     center: Floats32,
     coefficients: Floats32,
+    max_steps: int,
+    min_step: float,
+    reject: float,
 ) -> None:
     """Least-squares steps with clipped residuals; `coefficients`, (3, 4), holds the start and the result.
 
     excess, limit : (3, n), the data and the limits of their residuals; the second fit rejects residuals above
-    `REJECT_CLIP_RATIO` times the limit. basis, step : (3, 4, n), the model and its pseudo-inverse. shrink :
+    `reject` times the limit. basis, step : (3, 4, n), the model and its pseudo-inverse. shrink :
     (3, 4, 4), effect of the ridge on the coefficients in a step. center : (3,), divides the first three
-    coefficients at the end.
+    coefficients at the end. A fit ends after `max_steps`, or when no coefficient moves by `min_step`.
     """
-    change = np.empty(4, np.float32)
-    for reject in (np.float32(NO_REJECTION_RATIO), np.float32(REJECT_CLIP_RATIO)):
-        for _ in range(MAX_STEPS):
-            longest = np.float32(0)
-            for c in range(3):
-                f0, f1 = coefficients[c, 0], coefficients[c, 1]
-                f2, f3 = coefficients[c, 2], coefficients[c, 3]
-                s0 = s1 = s2 = s3 = np.float32(0)
-                for i in range(excess.shape[1]):
-                    model = f0 * basis[c, 0, i] + f1 * basis[c, 1, i]
-                    model = model + f2 * basis[c, 2, i] + f3 * basis[c, 3, i]
-                    beyond = excess[c, i] - model
-                    residual = min(max(beyond, -limit[c, i]), limit[c, i])
-                    residual = residual if abs(beyond) < reject * limit[c, i] else np.float32(0)
-                    s0 += residual * step[c, 0, i]
-                    s1 += residual * step[c, 1, i]
-                    s2 += residual * step[c, 2, i]
-                    s3 += residual * step[c, 3, i]
-                change[0], change[1], change[2], change[3] = s0, s1, s2, s3
-                for k in range(4):
-                    for j in range(4):
-                        change[k] -= (f0, f1, f2, f3)[j] * shrink[c, j, k]
-                for k in range(4):
-                    coefficients[c, k] += change[k]
-                    longest = max(longest, abs(change[k]))
-            if longest < np.float32(MIN_STEP_GREY):
+    for rejects in (False, True):
+        for _ in range(max_steps):
+            beyond = excess - (coefficients[:, None] @ basis)[:, 0]
+            residual = np.clip(beyond, -limit, limit)
+            if rejects:
+                residual[np.abs(beyond) >= reject * limit] = 0
+            change = (step @ residual[:, :, None])[:, :, 0] - (coefficients[:, None] @ shrink)[:, 0]
+            coefficients += change
+            if np.abs(change).max() < min_step:
                 break
-    for c in range(3):
-        for k in range(3):
-            coefficients[c, k] /= center[c]
+    coefficients[:, :3] /= center[:, None]

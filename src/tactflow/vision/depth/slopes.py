@@ -25,8 +25,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.arrays import Floats32, Indices
+from tactflow.vision.compiled import kernel
 
 Bytes = NDArray[np.uint8]
 
@@ -83,96 +83,81 @@ class SlopeModel:
         a unit normal up to which the polynomial holds, `SurfaceErrors.steepest`.
         """
         slope = np.zeros((2, *change.shape[:2]), np.float32)
-        slopes_of_colour(change, self._by_place, x, y, near, np.float32(steepest), slope)
+        slopes_of_colour(
+            change,
+            self._by_place,
+            x,
+            y,
+            near,
+            steepest,
+            slope,
+            FACTORS,
+            BAND,
+            HALVINGS,
+            STEEPEST,
+        )
         return slope
 
 
-@kernel(
-    "void(float32[:, :, ::1], float32[:, :, ::1], float32[::1], float32[::1], uint8[:, ::1], "
-    "float32, float32[:, :, ::1])"
-)
+@kernel
 def slopes_of_colour(
     change: Floats32,
     coefficients: Floats32,
     x: Floats32,
     y: Floats32,
     near: Bytes,
-    steepest: np.float32,
+    steepest: float,
     slope: Floats32,
+    factors: Indices,
+    band: int,
+    halvings: int,
+    most: float,
 ) -> None:
     """Add the slopes of the pixels near the contact to 0.
 
     change, x, y, near, steepest : of `SlopeModel.slopes`. coefficients : (2, 19, 6).
-    slope : (2, h, w), all 0.
+    slope : (2, h, w), all 0. factors : pairs of terms, `FACTORS`. band : rows per row of `near`. halvings :
+    of the search for `steepest`. most : largest horizontal part of a unit normal.
     """
-    terms = np.empty((COLOUR_TERMS, x.size), np.float32)
-    # The parts of the normals of the first two degrees.
-    first, second = np.empty((2, 2, x.size), np.float32)
-    most, tiny, unit = np.float32(STEEPEST), np.float32(1e-9), np.float32(1)
-    for row in range(y.size):
-        band = near[row // BAND]
-        start, end = 0, x.size
-        while start < end and band[start] == 0:
-            start += 1
-        while end > start and band[end - 1] == 0:
-            end -= 1
-        count = end - start
-        v, places = y[row], x[start:]
-        right, down = slope[0, row, start:], slope[1, row, start:]
-        for k in range(COLOUR_TERMS):
-            term = terms[k]
-            if k < 3:
-                channel = change[row, start:, k]
-                for i in range(count):
-                    term[i] = channel[i]
-            else:
-                one, other = terms[FACTORS[k - 3, 0]], terms[FACTORS[k - 3, 1]]
-                for i in range(count):
-                    term[i] = one[i] * other[i]
-            # Of a row, a coefficient is a quadratic polynomial of x alone.
-            a, b = coefficients[0, k], coefficients[1, k]
-            a0, a1, a2 = a[0] + v * (a[2] + v * a[5]), a[1] + v * a[4], a[3]
-            b0, b1, b2 = b[0] + v * (b[2] + v * b[5]), b[1] + v * b[4], b[3]
-            for i in range(count):
-                right[i] += term[i] * (a0 + places[i] * (a1 + places[i] * a2))
-                down[i] += term[i] * (b0 + places[i] * (b1 + places[i] * b2))
-            if k in (2, 8):
-                part = first if k == 2 else second
-                for i in range(count):
-                    part[0, i], part[1, i] = right[i], down[i]
-        for i in range(count):
-            if right[i] * right[i] + down[i] * down[i] > steepest * steepest:
-                right[i], down[i] = _beyond(first[:, i], second[:, i], right[i], down[i], steepest)
-            length = np.sqrt(right[i] * right[i] + down[i] * down[i])
-            normal = min(length, most)
-            longer = normal / (max(length, tiny) * np.sqrt(unit - normal * normal))
-            right[i] *= longer
-            down[i] *= longer
+    dtype = coefficients.dtype
+    for row in range(len(y)):
+        columns = np.flatnonzero(near[row // band])
+        if not len(columns):
+            continue
+        part = slice(columns[0], columns[-1] + 1)
+        terms = colour_terms(change[row, part], factors).astype(dtype)
+        place = np.array([np.ones_like(x[part]), x[part], np.full_like(x[part], y[row]), x[part] ** 2,
+                          x[part] * y[row], np.full_like(x[part], y[row] ** 2)], dtype)  # fmt: skip
+        parts = terms * (coefficients @ place)
+        # The parts of the normals of the first degree, of the first two, and of all.
+        first, second, normal = parts[:, :3].sum(axis=1), parts[:, :9].sum(axis=1), parts.sum(axis=1)
+        steep = (normal**2).sum(axis=0) > steepest**2
+        if steep.any():
+            normal[:, steep] = _beyond(
+                first[:, steep], second[:, steep], normal[:, steep], steepest, halvings
+            )
+        length = np.sqrt((normal**2).sum(axis=0))
+        flat = np.minimum(length, most)
+        slope[:, row, part] = normal * (flat / (np.maximum(length, 1e-9) * np.sqrt(1 - flat**2)))
 
 
-@helper
-def _beyond(
-    first: Floats32, second: Floats32, right: np.float32, down: np.float32, steepest: np.float32
-) -> tuple[np.float32, np.float32]:
-    """A normal in proportion to where, on the line of colours from no change, it is as steep as `steepest`.
+def _beyond(first: Floats32, second: Floats32, normal: Floats32, steepest: float, halvings: int) -> Floats32:
+    """Normals (2, n) in proportion to where, on the line of colours from no change, they are as steep as
+    `steepest`.
 
-    first, second : (2,), of the terms up to the first and the second degree. right, down : of all.
+    first, second, normal : (2, n), of the terms up to the first and the second degree, and of all.
     """
-    low, high = np.float32(0), np.float32(1)
-    ax, ay = first[0], first[1]
-    bx, by = second[0] - ax, second[1] - ay
-    cx, cy = right - second[0], down - second[1]
-    for _ in range(HALVINGS):
-        t = (low + high) / np.float32(2)
-        right, down = ax + t * (bx + t * cx), ay + t * (by + t * cy)
-        if t * t * (right * right + down * down) > steepest * steepest:
-            high = t
-        else:
-            low = t
-    return right, down
+    low, high = np.zeros_like(normal[0]), np.ones_like(normal[0])
+    found = normal
+    for _ in range(halvings):
+        t = (low + high) / 2
+        found = first + t * (second - first + t * (normal - second))
+        steep = t * t * (found**2).sum(axis=0) > steepest**2
+        high, low = np.where(steep, t, high), np.where(steep, low, t)
+    return found
 
 
-def colour_terms(change: Floats32) -> Floats32:
+def colour_terms(change: Floats32, factors: Indices = FACTORS) -> Floats32:
     """(19, n) float32: all products of one to three channels of (..., 3), pixel by pixel.
 
     >>> float(colour_terms(np.full((1, 1, 3), 2, np.float32)).sum())
@@ -180,7 +165,7 @@ def colour_terms(change: Floats32) -> Floats32:
     """
     terms = np.empty((COLOUR_TERMS, change.size // 3), np.float32)
     terms[:3] = change.reshape(-1, 3).T
-    for term, (one, other) in zip(terms[3:], FACTORS, strict=True):
+    for term, (one, other) in zip(terms[3:], factors, strict=True):
         np.multiply(terms[one], terms[other], out=term)
     return terms
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Indices, Mask, Points, check_mask
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -382,10 +382,7 @@ class DisplacementField:
         return slices[1], slices[0]
 
 
-@kernel(
-    "void(float64[:, ::1], float64[:, :, ::1], float64, float64[:, :, ::1], int64, float64[:, ::1],"
-    " float64[:, ::1], float64[:, ::1], float64[:, ::1])"
-)
+@kernel
 def sum_cells(
     weight: Floats,
     moved: Floats,
@@ -408,63 +405,25 @@ def sum_cells(
     v_i times the kernel to each marker, for the first three. prior : (3, 3) of 0, filled with the sums of v_i
     v_j over pairs of cells, times the kernel between the two.
     """
-    rows, columns = weight.shape
-    planes, values = np.zeros((3, rows, columns)), np.empty(7)
-    x = y = 0.0
-    for row in range(rows):
-        for column in range(columns):
-            x += weight[row, column] * column
-            y += weight[row, column] * row
-    for row in range(rows):
-        for column in range(columns):
-            if weight[row, column] == 0:
-                continue
-            before, after = moved[row, max(column - 1, 0)], moved[row, min(column + 1, columns - 1)]
-            above, below = moved[max(row - 1, 0), column], moved[min(row + 1, rows - 1), column]
-            wide = 2 if 0 < column < columns - 1 else 1
-            high = 2 if 0 < row < rows - 1 else 1
-            values[0] = 1
-            values[1], values[2] = spacing * (column - x), spacing * (row - y)
-            for k in range(2):
-                values[3 + k] = moved[row, column, k]
-                across, down = (after[k] - before[k]) / wide, (below[k] - above[k]) / high
-                values[5 + k] = (column - x) * across + (row - y) * down
-            near = to_markers[row, first_column + column]
-            for i in range(7):
-                part = weight[row, column] * values[i]
-                for j in range(7):
-                    products[i, j] += part * values[j]
-                if i < 3:
-                    planes[i, row, column] = part
-                    for n in range(near.size):
-                        to_region[i, n] += part * near[n]
-    _sum_pairs(planes, between, prior)
-
-
-@helper
-def _sum_pairs(weights: Floats, between: Floats, sums: Floats) -> None:
-    """Sums (3, 3) over pairs of cells of products of weights (3, r, c), times the kernel between the two."""
-    _, rows, columns = weights.shape
-    for row in range(rows):
-        for column in range(columns):
-            if weights[0, row, column] == 0:
-                continue
-            for other in range(row + 1):
-                line = between[between.shape[0] // 2 + row - other, between.shape[1] // 2 - column :]
-                one = x = y = 0.0
-                for n in range(columns):
-                    one += weights[0, other, n] * line[n]
-                    x += weights[1, other, n] * line[n]
-                    y += weights[2, other, n] * line[n]
-                for j in range(3):
-                    # The sums over `other` above and below `row` are each other's transpose.
-                    part = weights[j, row, column] * (0.5 if other == row else 1.0)
-                    sums[0, j] += one * part
-                    sums[1, j] += x * part
-                    sums[2, j] += y * part
-    for i in range(3):
-        for j in range(i + 1):
-            sums[i, j] = sums[j, i] = sums[i, j] + sums[j, i]
+    rows, columns = (np.asarray(each) for each in np.indices(weight.shape))
+    way = np.stack([columns - (weight * columns).sum(), rows - (weight * rows).sum()])
+    # Differences of neighbours, one-sided at the border of the region.
+    change = np.zeros_like(moved)
+    for axis, steps in ((1, way[0]), (0, way[1])):
+        if weight.shape[axis] > 1:
+            change += steps[:, :, None] * np.gradient(moved, axis=axis)
+    values = np.stack(
+        [np.ones_like(weight), *(spacing * way), *np.moveaxis(moved, 2, 0), *np.moveaxis(change, 2, 0)]
+    )
+    inside = weight > 0
+    v, w = values[:, inside], weight[inside]
+    products += (v * w) @ v.T
+    near = to_markers[:, first_column : first_column + weight.shape[1]][inside]
+    to_region += (v[:3] * w) @ near
+    y, x = rows[inside], columns[inside]
+    middle_y, middle_x = between.shape[0] // 2, between.shape[1] // 2
+    pairs = between[middle_y + y[:, None] - y, middle_x + x - x[:, None]]
+    prior += (v[:3] * w) @ pairs @ (v[:3] * w).T
 
 
 def _fit(

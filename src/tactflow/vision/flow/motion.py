@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats, Indices, Points
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, neighbour_graph, pitch_of
 from tactflow.vision.types import Markers, MarkerStatus
 
@@ -149,9 +149,12 @@ class MotionTest:
             np.ascontiguousarray(markers.stderr, np.float64),
             self._rest,
             self._links,
-            (self._limit, self._variance, self._relaxation * self._strongest),
+            self._limit,
+            self._variance,
+            self._relaxation * self._strongest,
             left,
             bound,
+            MIN_MOVING_NEIGHBOURS,
         )
         self._lasted = min(self._lasted + 1, MAX_AVERAGED_FRAMES) if self._moving else 1
         alone = (
@@ -181,87 +184,48 @@ class MotionTest:
         return np.asarray(markers.position[np.unique(most)], np.float64)
 
 
-@kernel(
-    "UniTuple(float64, 2)(float64[:, ::1], boolean[::1], float64[::1], float64[:, ::1], int64[:, ::1],"
-    " UniTuple(float64, 3), float64[::1], float64[::1])"
-)
+@kernel
 def rate_motion(
     position: Points,
     tracked: Flags,
     stderr: Floats,
     rest: Floats,
     links: Indices,
-    limits: tuple[float, float, float],
+    limit: float,
+    variance: float,
+    resting: float,
     left: Floats,
     bound: Floats,
+    min_count: int,
 ) -> tuple[float, float]:
     """The third largest motion, px, and the largest multiple of its threshold that each marker of a chain of
     three neighbours reaches.
 
     position : (N, 2), px. tracked : (N,). stderr : (N,), px, NaN where unknown. rest : (6, N), of each marker
     in the reference: x and y, and its arm, x and y from the middle of all, px; the arm over its square, 1/px.
-    links : (L, 2), neighbours. limits : threshold, standard deviations; variance of markers of an untouched
-    gel, px^2; motion up to which a marker of a released gel is at rest, px. left : (N,) of 0, filled, see
-    `Motion`; stays 0 with fewer than three tracked markers. bound : (N,), filled, see `Motion`.
+    links : (L, 2), neighbours. limit : threshold, standard deviations. variance : of markers of an untouched
+    gel, px^2. resting : motion up to which a marker of a released gel is at rest, px. left : (N,) of 0,
+    filled, see `Motion`; stays 0 with fewer than `min_count` tracked markers. bound : (N,), filled, see
+    `Motion`.
     """
-    shift_x = shift_y = middle = 0.0
-    count: Any = np.int64(0)
-    # The shift by x and by y, then the turn: each marker's motion across its arm, over the arm's length.
-    for part in range(3):
-        count = np.int64(0)
-        for i in range(left.size):
-            if tracked[i]:
-                x, y = position[i, 0] - rest[0, i] - shift_x, position[i, 1] - rest[1, i] - shift_y
-                bound[count] = x if part == 0 else y if part == 1 else y * rest[4, i] - x * rest[5, i]
-                count += 1
-        middle = _median(bound, count) if count else 0.0
-        shift_x, shift_y = middle if part == 0 else shift_x, middle if part == 1 else shift_y
-    most = second = third = chain = 0.0
-    # The two largest ratios among the neighbours of each marker.
-    ratio, largest, second_largest = np.zeros((3, left.size))
-    for i in range(left.size):
-        if tracked[i] and count >= MIN_MOVING_NEIGHBOURS:
-            x = position[i, 0] - rest[0, i] - shift_x + middle * rest[3, i]
-            y = position[i, 1] - rest[1, i] - shift_y - middle * rest[2, i]
-            left[i] = math.sqrt(x * x + y * y)
-        third = max(third, min(left[i], second))
-        second = max(second, min(left[i], most))
-        most = max(most, left[i])
-        bound[i] = limits[0] * math.sqrt(stderr[i] * stderr[i] + limits[1])
-        # Nothing exceeds an unknown standard error, NaN.
-        if left[i] > limits[2] and bound[i] > 0:
-            ratio[i] = left[i] / bound[i]
-    for k in range(len(links)):
-        for end in range(2):
-            i, other = links[k, end], ratio[links[k, 1 - end]]
-            second_largest[i] = max(second_largest[i], min(other, largest[i]))
-            largest[i] = max(largest[i], other)
-    for i in range(left.size):
-        chain = max(chain, min(ratio[i], second_largest[i]))
-    return third, chain
-
-
-@helper
-def _median(values: Floats, count: int) -> float:
-    """The median of the first `count` values, which it reorders (Hoare's selection).
-
-    With `np.median`, the kernel takes several times as long to compile.
-    """
-    upper = count // 2
-    first, last = 0, count - 1
-    while first < last:
-        middle, i, j = values[upper], first, last
-        while i <= j:
-            while values[i] < middle:
-                i += 1
-            while values[j] > middle:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        first, last = i if j < upper else first, j if i > upper else last
-    lower = values[upper if count % 2 else 0]
-    for i in range(0 if count % 2 else upper):
-        lower = max(lower, values[i])
-    return float(lower + values[upper]) / 2
+    at, arm, lever = rest[:2].T, rest[2:4].T, rest[4:].T
+    moved = position - at
+    if tracked.any():
+        moved = moved - np.median(moved[tracked], axis=0)
+        turn = np.median((moved[:, 1] * lever[:, 0] - moved[:, 0] * lever[:, 1])[tracked])
+        moved = moved + turn * np.column_stack([arm[:, 1], -arm[:, 0]])
+    if tracked.sum() >= min_count:
+        left[tracked] = np.hypot(*moved[tracked].T)
+    bound[:] = limit * np.sqrt(stderr * stderr + variance)
+    # Nothing exceeds an unknown standard error, NaN.
+    counts = (left > resting) & (bound > 0)
+    ratio = np.divide(left, bound, out=np.zeros_like(left), where=counts)
+    both = np.vstack([links, links[:, ::-1]])
+    order = np.lexsort((-ratio[both[:, 1]], both[:, 0]))
+    of, beside = both[order, 0], ratio[both[order, 1]]
+    # Of each marker with two neighbours, the place of the second one.
+    again = np.flatnonzero(of[1:] == of[:-1]) + 1
+    again = again[(again < 2) | (of[again - 2] != of[again])]
+    chain = np.minimum(ratio[of[again]], beside[again])
+    largest = np.sort(left)[::-1]
+    return float(largest[2]) if len(largest) > 2 else 0.0, float(chain.max(initial=0.0))

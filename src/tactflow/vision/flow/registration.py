@@ -242,10 +242,7 @@ def register(
     return Registration(motion, covariance, error, residual, count / len(error))
 
 
-@kernel(
-    "int64(float32[:, :, ::1], float64[::1], float64, float32[:, ::1], float32[:, ::1], float32[:, :, ::1],"
-    " int64[::1], float32[:, ::1], float64[::1])"
-)
+@kernel
 def compare_light(
     change: Floats32,
     warp: Floats,
@@ -265,32 +262,24 @@ def compare_light(
     error : (N, 3), filled: picture less template, 0 where not visible. sums : (10,), filled: `by` times the
     error; its square; the squares of its sums over patches; the error of each channel.
     """
-    count, patch = 0, np.zeros(3)
-    sums[:] = 0
-    for i in range(len(away)):
-        if i > 0 and patches[i] != patches[i - 1]:
-            sums[6] += patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2
-            patch[:] = 0
-        error[i] = 0
-        x = warp[0] * away[i, 0] - warp[1] * away[i, 1] + warp[2]
-        y = warp[1] * away[i, 0] + warp[0] * away[i, 1] + warp[3]
-        if not (0 <= x < change.shape[1] - 1 and 0 <= y < change.shape[0] - 1):
-            continue
-        column, row = int(x), int(y)
-        upper, lower = change[row, column : column + 2], change[row + 1, column : column + 2]
-        if min(upper[0, 3], upper[1, 3], lower[0, 3], lower[1, 3]) < 1:
-            continue
-        count += 1
-        right, down = x - column, y - row
-        for channel in range(3):
-            above = upper[0, channel] + right * (upper[1, channel] - upper[0, channel])
-            below = lower[0, channel] + right * (lower[1, channel] - lower[0, channel])
-            left = above + down * (below - above) - gain * light[i, channel]
-            error[i, channel] = left
-            patch[channel] += left
-            sums[5] += left * left
-            sums[7 + channel] += left
-            for k in range(5):
-                sums[k] += by[i, channel, k] * left
-    sums[6] += patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2
-    return count
+    x = warp[0] * away[:, 0] - warp[1] * away[:, 1] + warp[2]
+    y = warp[1] * away[:, 0] + warp[0] * away[:, 1] + warp[3]
+    high, wide = change.shape[0] - 1, change.shape[1] - 1
+    inside = np.flatnonzero((x >= 0) & (x < wide) & (y >= 0) & (y < high))
+    column, row = x[inside].astype(int), y[inside].astype(int)
+    corners = [[change[row + k, column + j] for j in (0, 1)] for k in (0, 1)]
+    shown = np.min([corner[:, 3] for line in corners for corner in line], axis=0) >= 1
+    (upper, upper_right), (lower, lower_right) = ([corner[shown, :3] for corner in line] for line in corners)
+    seen = inside[shown]
+    right, down = (x[inside] - column)[shown, None], (y[inside] - row)[shown, None]
+    above, below = upper + right * (upper_right - upper), lower + right * (lower_right - lower)
+    rest = above + down * (below - above) - gain * light[seen]
+    error[:] = 0
+    error[seen] = rest
+    sums[:5] = np.einsum("nck,nc->k", by[seen].astype(np.float64), rest)
+    sums[5] = (rest * rest).sum()
+    totals = np.zeros((int(patches.max(initial=0)) + 1, 3))
+    np.add.at(totals, patches[seen], rest)
+    sums[6] = (totals * totals).sum()
+    sums[7:] = rest.sum(axis=0)
+    return len(seen)

@@ -153,7 +153,7 @@ def _mask(whole: Bytes, dot: Dot, radius: float) -> Bytes:
     """The mask of dots of one size, of an image of even height and width."""
     mask = np.empty(whole.shape[:2], np.uint8)
     contrast = _contrast(whole, radius, dot.polarity)
-    _cover_spots(contrast, min(255, math.floor(dot.contrast)), _corner(radius), mask)
+    cover_spots(contrast, min(255, math.floor(dot.contrast)), _corner(radius), mask)
     return mask
 
 
@@ -198,34 +198,15 @@ def _circle(radius: float) -> Bytes:
     return circle
 
 
-@kernel("void(uint8[:, :, ::1], int64, int64, uint8[:, ::1])")
-def _cover_spots(contrast: Bytes, threshold: int, corner: int, mask: Bytes) -> None:
+@kernel
+def cover_spots(contrast: Bytes, threshold: int, corner: int, mask: Bytes) -> None:
     """Fill `mask`, (2 h, 2 w): 255 on and next to px whose median contrast exceeds a threshold, else 0.
 
     contrast : (h, w, 3). threshold : grey levels. corner : side of squares in the corners without spots, px.
     """
-    height, width, _ = contrast.shape
-    # One more px on all sides.
-    spots, line = np.empty((height + 2, width + 2), np.uint8), np.empty(width + 2, np.uint8)
-    spots[:] = 0
-    least = np.uint8(threshold)
-    for y in range(height):
-        row, values = spots[y + 1, 1:], contrast[y].reshape(-1)
-        for x in range(width):
-            first, second, third = values[3 * x], values[3 * x + 1], values[3 * x + 2]
-            median = max(min(first, second), min(max(first, second), third))
-            row[x] = np.uint8(255) if median > least else np.uint8(0)
-        if min(y, height - 1 - y) < corner:
-            for x in range(min(corner, width)):
-                row[x] = row[width - 1 - x] = 0
-    for y in range(height):
-        upper, here, lower = spots[y], spots[y + 1], spots[y + 2]
-        for x in range(width + 2):
-            line[x] = upper[x] | here[x] | lower[x]
-        first_row, second_row = mask[2 * y], mask[2 * y + 1]
-        for x in range(width):
-            near = line[x] | line[x + 1] | line[x + 2]
-            first_row[2 * x] = near
-            first_row[2 * x + 1] = near
-        for x in range(2 * width):
-            second_row[x] = first_row[x]
+    spots = np.where(np.median(contrast, axis=2) > threshold, np.uint8(255), np.uint8(0))
+    height, width = spots.shape
+    for rows in (slice(0, corner), slice(max(height - corner, 0), height)):
+        spots[rows, :corner] = spots[rows, max(width - corner, 0) :] = 0
+    near = cv2.dilate(spots, np.ones((3, 3), np.uint8))
+    mask[:] = near.repeat(2, axis=0).repeat(2, axis=1)

@@ -76,16 +76,22 @@ class MotionEvidence:
         displacement : (N, 2) float64, px. stderr : (N,) float32, px. seen : (N,) bool, visible marks.
         """
         around = self._around, self._share, self._rest
-        moves = weigh_motion(displacement, stderr, seen, *around, self.against)
+        moves = weigh_motion(
+            displacement,
+            stderr,
+            seen,
+            *around,
+            self.against,
+            NEIGHBOUR_COUNT,
+            MIN_KNOWN_SHARE,
+            MIN_RELATIVE_SCATTER,
+        )
         if moves and self.against.max() > LEAVING_EVIDENCE:
             self.left = self._leaving()
         return moves
 
 
-@kernel(
-    "boolean(float64[:, ::1], float32[::1], boolean[::1], int64[:, ::1], float64[:, ::1], float64,"
-    "float64[::1])"
-)
+@kernel
 def weigh_motion(
     displacement: Floats,
     stderr: Floats32,
@@ -94,33 +100,29 @@ def weigh_motion(
     share: Floats,
     rest: float,
     against: Floats,
+    nearest: int,
+    min_known: float,
+    scatter: float,
 ) -> bool:
     """Update `against`, (N,), with the evidence of a frame; returns whether a mark moves.
 
     displacement : (N, 2). stderr, seen : (N,). around, share : (N, K), the neighbours, nearest first, and
-    their weights in a mean. rest : maximum displacement of a resting mark along an axis.
+    their weights in a mean. rest : maximum displacement of a resting mark along an axis. nearest : number of
+    neighbours of which one must move. min_known : weight of the visible neighbours that is required.
+    scatter : minimum scatter of a mark about the mean of its neighbours, relative to it.
     """
-    moves, moving = np.empty(len(displacement), np.bool_), False
-    for n in range(len(displacement)):
-        moves[n] = max(abs(displacement[n, 0]), abs(displacement[n, 1])) > rest
-        moving = moving or moves[n]
-    for n in range(len(displacement) if moving else 0):
-        beside = False
-        for k in range(min(NEIGHBOUR_COUNT, around.shape[1])):
-            beside = beside or (moves[around[n, k]] and seen[around[n, k]])
-        if moves[n] or not (seen[n] and beside):
-            continue
-        total = mean_x = mean_y = squares = 0.0
-        for k in range(around.shape[1]):
-            if seen[around[n, k]]:
-                x, y = displacement[around[n, k]]
-                total, squares = total + share[n, k], squares + share[n, k] * (x * x + y * y)
-                mean_x, mean_y = mean_x + share[n, k] * x, mean_y + share[n, k] * y
-        if total < MIN_KNOWN_SHARE:
-            continue
-        mean_x, mean_y = mean_x / total, mean_y / total
-        length = mean_x * mean_x + mean_y * mean_y
-        expected = (squares / total - length) / 2 + stderr[n] * stderr[n] + MIN_RELATIVE_SCATTER**2 * length
-        along = mean_x * displacement[n, 0] + mean_y * displacement[n, 1]
-        against[n] = max(against[n], (length / 2 - along) / expected)
-    return moving
+    moves = np.abs(displacement).max(axis=1, initial=0) > rest
+    if not moves.any():
+        return False
+    near = around[:, :nearest]
+    part = share * seen[around]
+    total = part.sum(axis=1)
+    tested = ~moves & seen & (moves & seen)[near].any(axis=1) & (total >= min_known)
+    others, part, total = displacement[around[tested]], part[tested], total[tested]
+    mean = (part[:, :, None] * others).sum(axis=1) / total[:, None]
+    length = (mean * mean).sum(axis=1)
+    spread = (part * (others * others).sum(axis=2)).sum(axis=1) / total - length
+    expected = spread / 2 + stderr[tested].astype(np.float64) ** 2 + scatter**2 * length
+    ratio = (length / 2 - (mean * displacement[tested]).sum(axis=1)) / expected
+    against[tested] = np.maximum(against[tested], ratio)
+    return True

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
 from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.spots import SAME_SIZE_RATIO
 
 Bytes = NDArray[np.uint8]
@@ -40,11 +41,11 @@ are never accepted. Chosen by hand."""
 TINY: Final = np.finfo(np.float32).tiny
 """Keeps quotients finite."""
 
-MIN_GAIN: Final = np.float32(0.2)
+MIN_GAIN: Final = 0.2
 """Minimum contrast of a visible mark, relative to its template, and lower bound of the divisor of a step:
 that of a fainter mark would be all noise. Chosen by hand."""
 
-MIN_R_SQUARED: Final = np.float32(0.5)
+MIN_R_SQUARED: Final = 0.5
 """Minimum fraction of a visible mark's contrast that its template explains. Only then is another step made,
 since it would not converge. Chosen by hand."""
 
@@ -164,7 +165,18 @@ class MarkerTemplates:
         found = Alignment(np.empty((count, 2)), np.empty(count, np.float32), np.empty(count, np.bool_))
         for number, model in enumerate(self._models):
             which, places = self._all[number] if marks is None else self._those_of(number, marks)
-            align_marks(picture, start, which, places, *model, *found)
+            align_marks(
+                picture,
+                start,
+                which,
+                places,
+                *model,
+                *found,
+                MIN_GAIN,
+                MIN_R_SQUARED,
+                SAMPLING_ERROR_PX,
+                MAX_STEPS,
+            )
         return found
 
 
@@ -180,7 +192,7 @@ def _model(reference: Floats32, origin: Floats, radius: float, dark: bool) -> _M
     weights = np.empty((PHASES, PHASES, count, 5, pixels), np.int16)
     terms = np.empty((PHASES, PHASES, count, 15), np.float32)
     scaled = np.array([grid_x[disc], grid_y[disc]]) / radius
-    # The border is replicated, as in `read_patch`.
+    # The border is replicated, as in `_patches`.
     spline = spline_filter(np.pad(reference.astype(np.float64), reach, mode="edge"))
     at_y, at_x = origin[:, 1:] + grid_y[disc] + reach, origin[:, :1] + grid_x[disc] + reach
     # From one phase before the first to one after the last, for the slopes.
@@ -224,59 +236,23 @@ def _normal_equations(
     return weights, gram, 0.5 * (inverse[:, 1, 1] + inverse[:, 2, 2])
 
 
-@helper
-def nearest_phase(x: float, y: float, width: int, height: int) -> Any:
-    """The nearest phase to a point, per axis: PHASES times the pixel plus the phase."""
-    # Comparisons with NaN are false, so NaN becomes a point inside the image, too.
-    inside_x = min(x, width - 1.0) if x > 0.0 else 0.0
-    inside_y = min(y, height - 1.0) if y > 0.0 else 0.0
-    return int(inside_x * PHASES + PHASES / 2), int(inside_y * PHASES + PHASES / 2)
+def _nearest_phase(at: Floats, width: int, height: int) -> Indices:
+    """(n, 2) int64: the nearest phase to points (n, 2): PHASES times the pixel plus the phase."""
+    inside = np.clip(np.nan_to_num(at), 0, [width - 1.0, height - 1.0])
+    return (inside * PHASES + PHASES / 2).astype(np.int64)
 
 
-@helper
-def read_patch(image: Bytes, left: int, top: int, widths: Indices, patch: Floats32) -> float:
-    """Fill `patch` with the grey levels of a disc around a pixel; the border is replicated.
-
-    widths : of the disc's rows, px. Returns the sum of squares about the mean.
-    """
-    height, width, channels = image.shape
-    flat, reach, first = image.reshape(-1), widths.size // 2, 0
-    inside = left >= reach and top >= reach and left + reach < width and top + reach < height
-    for row in range(widths.size):
-        count, begin, y = widths[row], left - widths[row] // 2, top - reach + row
-        line = patch[first : first + count]
-        if inside:
-            to_gray(flat[(y * width + begin) * channels :], channels, line)
-        else:
-            y = min(max(y, 0), height - 1)
-            for column in range(count):
-                x = min(max(begin + column, 0), width - 1)
-                to_gray(flat[(y * width + x) * channels :], channels, line[column : column + 1])
-        first += count
-    total = squares = 0.0
-    for p in range(patch.size):
-        total, squares = total + patch[p], squares + patch[p] * patch[p]
-    return squares - total * total / patch.size
+def _patches(levels: Floats32, corner: Indices, widths: Indices) -> Floats:
+    """(n, p) float64: grey levels minus 128 of a disc around pixels (n, 2); the border is replicated."""
+    reach = len(widths) // 2
+    rows = np.repeat(np.arange(len(widths)) - reach, widths)
+    columns = np.concatenate([np.arange(width) - width // 2 for width in widths])
+    y = np.clip(corner[:, 1:] + rows, 0, levels.shape[0] - 1)
+    x = np.clip(corner[:, :1] + columns, 0, levels.shape[1] - 1)
+    return np.asarray(levels[y, x], np.float64)
 
 
-@helper
-def to_gray(pixels: Bytes, channels: int, levels: Floats32) -> None:
-    """Fill `levels` with grey levels minus 128; BGR is converted as in OpenCV."""
-    blue, green, red, half = np.int32(3735), np.int32(19235), np.int32(9798), np.int32(16384)
-    if channels == 1:
-        for x in range(levels.size):
-            levels[x] = np.float32(pixels[x]) - np.float32(128)
-        return
-    for x in range(levels.size):
-        level = blue * np.int32(pixels[3 * x]) + green * np.int32(pixels[3 * x + 1])
-        level += red * np.int32(pixels[3 * x + 2]) + half
-        levels[x] = np.float32(level >> np.int32(15)) - np.float32(128)
-
-
-@kernel(
-    "void(Array(uint8, 3, 'C', readonly=True), float64[:, ::1], int64[::1], int64[::1], int16[:, :, ::1],"
-    "float32[:, ::1], int64[::1], float64, float64[:, ::1], float32[::1], boolean[::1])",
-)
+@kernel
 def align_marks(
     image: Bytes,
     start: Floats,
@@ -289,68 +265,40 @@ def align_marks(
     position: Floats,
     stderr: Floats32,
     seen: Flags,
+    min_gain: float,
+    min_r_squared: float,
+    sampling_error: float,
+    max_steps: int,
 ) -> None:
     """Align `marks`; fill `position` (n, 2), `stderr` (n,) and `seen` (n,).
 
     image : (H, W, 3) BGR or (H, W, 1). start : (n, 2). places : indices of the marks in the model (see
-    `_Model`). Steps are limited to a radius along each axis.
+    `_Model`). Steps are limited to a radius along each axis. min_gain, min_r_squared : of a visible mark.
+    sampling_error : px, of a picture without noise. max_steps : after the first one.
     """
-    height, width, _ = image.shape
-    longest, count = np.float32(radius), weights.shape[0] // (PHASES * PHASES)
-    patch = np.empty(weights.shape[2], np.float32)
-    for number in range(len(marks)):
-        n, place = marks[number], places[number]
-        x, y = start[n, 0], start[n, 1]
-        seen_left, seen_top, varies = -1, -1, 0.0
-        phase_x, phase_y = nearest_phase(x, y, width, height)
-        before_x, before_y = -1, -1
-        for _ in range(MAX_STEPS + 1):
-            left, top = phase_x // PHASES, phase_y // PHASES
-            which = (phase_x % PHASES + phase_y % PHASES * PHASES) * count + place
-            # A step of less than a pixel often needs the same patch at another phase.
-            if left != seen_left or top != seen_top:
-                seen_left, seen_top = left, top
-                varies = read_patch(image, left, top, widths, patch)
-            gain, shift_x, shift_y, r_squared, rest = fit_template(
-                weights[which], terms[which], patch, varies
-            )
-            seen[n] = gain > MIN_GAIN and r_squared > MIN_R_SQUARED
-            safe = max(gain, MIN_GAIN)
-            now_x = (phase_x + 0.5) / PHASES - 0.5 + min(max(shift_x / safe, -longest), longest)
-            now_y = (phase_y + 0.5) / PHASES - 0.5 + min(max(shift_y / safe, -longest), longest)
-            next_x, next_y = nearest_phase(now_x, now_y, width, height)
-            if next_x == before_x and next_y == before_y:
-                # Two phases lead to each other: average them, so that the result does not depend on the
-                # start.
-                x, y = (x + now_x) / 2, (y + now_y) / 2
-                break
-            x, y = now_x, now_y
-            if not seen[n] or (next_x == phase_x and next_y == phase_y):
-                break
-            before_x, before_y, phase_x, phase_y = phase_x, phase_y, next_x, next_y
-        position[n, 0], position[n, 1] = x, y
-        noise = rest * terms[which, 9] / (safe * safe)
-        stderr[n] = np.sqrt(noise + np.float32(SAMPLING_ERROR_PX * SAMPLING_ERROR_PX))
-
-
-@helper
-def fit_template(weight: Levels, term: Floats32, patch: Floats32, varies: float) -> Any:
-    """Gain, shift x and y times gain, r_squared, and the residual sum of squares of a patch.
-
-    varies : the patch's sum of squares about its mean.
-    """
-    gain = shift_x = shift_y = slope_x = slope_y = np.float32(0)
-    for p in range(patch.size):
-        gain += np.float32(weight[0, p]) * patch[p]
-        shift_x += np.float32(weight[1, p]) * patch[p]
-        shift_y += np.float32(weight[2, p]) * patch[p]
-        slope_x += np.float32(weight[3, p]) * patch[p]
-        slope_y += np.float32(weight[4, p]) * patch[p]
-    gain, shift_x, shift_y = gain * term[10], shift_x * term[11], shift_y * term[12]
-    slope_x, slope_y = slope_x * term[13], slope_y * term[14]
-    explained = gain * (term[0] * gain + term[1] * shift_x + term[2] * shift_y)
-    explained += shift_x * (term[3] * gain + term[4] * shift_x + term[5] * shift_y)
-    explained += shift_y * (term[6] * gain + term[7] * shift_x + term[8] * shift_y)
-    contrast = varies - slope_x * slope_x - slope_y * slope_y
-    rest = max(contrast - explained, float(TINY))
-    return gain, shift_x, shift_y, explained / (explained + rest), rest
+    height, width, channels = image.shape
+    gray = image[:, :, 0] if channels == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    levels, count = gray.astype(np.float32) - 128, len(weights) // PHASES**2
+    phase = _nearest_phase(start[marks], width, height)
+    before, going = np.full_like(phase, -1), np.arange(len(marks))
+    position[marks] = start[marks]
+    for _ in range(max_steps + 1):
+        those, here = marks[going], phase[going]
+        which = (here % PHASES) @ [1, PHASES] * count + places[going]
+        term, patch = terms[which].astype(np.float64), _patches(levels, here // PHASES, widths)
+        sums = np.einsum("nkp,np->nk", weights[which].astype(np.float64), patch) * term[:, 10:]
+        gram = term[:, :9].reshape(-1, 3, 3)
+        explained = np.einsum("ni,nij,nj->n", sums[:, :3], gram, sums[:, :3])
+        varies = (patch**2).sum(axis=1) - patch.sum(axis=1) ** 2 / patch.shape[1]
+        rest = np.maximum(varies - (sums[:, 3:] ** 2).sum(axis=1) - explained, TINY)
+        safe = np.maximum(sums[:, 0], min_gain)
+        seen[those] = (sums[:, 0] > min_gain) & (explained / (explained + rest) > min_r_squared)
+        stderr[those] = np.sqrt(rest * term[:, 9] / safe**2 + sampling_error**2)
+        moved = (here + 0.5) / PHASES - 0.5 + np.clip(sums[:, 1:3] / safe[:, None], -radius, radius)
+        following = _nearest_phase(moved, width, height)
+        # Two phases that lead to each other are averaged, so that the result does not depend on the start.
+        returns = (following == before[going]).all(axis=1)
+        position[those] = np.where(returns[:, None], (position[those] + moved) / 2, moved)
+        stays = returns | ~seen[those] | (following == here).all(axis=1)
+        before[going], phase[going] = here, following
+        going = going[~stays]

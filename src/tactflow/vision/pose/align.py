@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from tactflow.vision.arrays import Floats, Floats32, Indices
-from tactflow.vision.compiled import helper, kernel
+from tactflow.vision.compiled import kernel
 from tactflow.vision.pose.imprint import MIN_PATCH_CELLS, PATCHES_PER_SIDE, Imprint, Template
 from tactflow.vision.pose.rigid import rigid, vector
 
@@ -150,10 +150,7 @@ def _compared(template: Template, now: Imprint, motion: Floats, gel: Gel | None)
     return _Comparison(shown, error, weight, normals[:6, :6], normals + rows.T @ rows)
 
 
-@kernel(
-    "void(float32[:, :, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], "
-    "float64[:, :, ::1], float64, float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], float64[::1])"
-)
+@kernel
 def compare_points(
     planes: Floats32,
     first: Floats,
@@ -178,50 +175,28 @@ def compare_points(
     height, totals : (8,) and (2,) of 0, to which sums over weighted points are added: of the derivatives of
         the height, of its error, and of how far points have sunk; how many points are shown, their weights.
     """
-    seen, row_of = np.empty(4), np.empty(7)
-    for n in range(points.shape[0]):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        moved_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z
-        moved_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z
-        column = (moved_x + motion[0, 3] - first[0]) / cell[0]
-        row = (moved_y + motion[1, 3] - first[1]) / cell[1]
-        if not (0 <= column < planes.shape[1] - 1 and 0 <= row < planes.shape[0] - 1):
-            continue
-        _interpolate(planes, column, row, seen)
-        share = points[n, 5] * seen[3]
-        if share <= 0:
-            continue
-        upright = math.sqrt(max(1 - seen[0] * seen[0] - seen[1] * seen[1], 0.0))
-        for k in range(2):
-            back = motion[0, k] * seen[0] + motion[1, k] * seen[1] + motion[2, k] * upright
-            error[n, k] = back - points[n, 3 + k]
-            row_of[:6], row_of[6] = by[n, k], error[n, k]
-            for i in range(7):
-                weighted = share * row_of[i]
-                for j in range(i + 1):
-                    normals[i, j] += weighted * row_of[j]
-        depth = seen[2] - middle - motion[2, 3]
-        for i in range(6):
-            height[i] += share * by[n, 2, i]
-        height[6] += share * (motion[0, 2] * moved_x + motion[1, 2] * moved_y + motion[2, 2] * depth - z)
-        height[7] += share * (depth - z)
-        weight[n] = share
-        totals[0] += 1
-        totals[1] += share
-    for i in range(7):
-        for j in range(i):
-            normals[j, i] = normals[i, j]
-
-
-@helper
-def _interpolate(planes: Floats32, column: float, row: float, values: Floats) -> None:
-    """Fill values (4,) with those of the planes between four cells, bilinearly."""
-    left, top = int(column), int(row)
-    right, low = column - left, row - top
-    for k in range(4):
-        above = (1 - right) * planes[top, left, k] + right * planes[top, left + 1, k]
-        below = (1 - right) * planes[top + 1, left, k] + right * planes[top + 1, left + 1, k]
-        values[k] = (1 - low) * above + low * below
+    turn, shift = motion[:3, :3], motion[:3, 3]
+    moved = points[:, :3] @ turn[:2].T
+    at = (moved + shift[:2] - first) / cell
+    high, wide = planes.shape[0] - 1, planes.shape[1] - 1
+    those = np.flatnonzero(((at >= 0) & (at < (wide, high))).all(axis=1))
+    left, top = at[those].astype(int).T
+    right, low = (at[those] - np.column_stack([left, top])).T[:, :, None]
+    above = (1 - right) * planes[top, left] + right * planes[top, left + 1]
+    below = (1 - right) * planes[top + 1, left] + right * planes[top + 1, left + 1]
+    seen = (1 - low) * above + low * below
+    share = points[those, 5] * seen[:, 3]
+    those, seen, share = those[share > 0], seen[share > 0], share[share > 0]
+    upright = np.sqrt(np.maximum(1 - (seen[:, :2] ** 2).sum(axis=1), 0))
+    error[those] = np.column_stack([seen[:, :2], upright]) @ turn[:, :2] - points[those, 3:5]
+    weight[those] = share
+    rows = np.concatenate([by[those, :2], error[those][:, :, None]], axis=2)
+    normals += np.einsum("n,nki,nkj->ij", share, rows, rows)
+    depth = seen[:, 2] - middle - shift[2]
+    height[:6] += share @ by[those, 2]
+    height[6] += share @ (np.column_stack([moved[those], depth]) @ turn[:, 2] - points[those, 2])
+    height[7] += share @ (depth - points[those, 2])
+    totals += len(those), share.sum()
 
 
 def _gel_rows(template: Template, now: Imprint, gel: Gel, motion: Floats) -> Floats:
