@@ -1,4 +1,4 @@
-"""Lines of Python per house and room: `python -m lab.lines [FOLDER]`, of this checkout or another one.
+"""Lines of Python and C per house and room: `python -m lab.lines [FOLDER]`, of this checkout or another one.
 
 A line of code is one that holds a token other than a comment or a docstring. Tests are counted apart,
 wherever they live."""
@@ -6,6 +6,7 @@ wherever they live."""
 from __future__ import annotations
 
 import ast
+import re
 import sys
 import tokenize
 from collections import Counter
@@ -48,6 +49,10 @@ def place(file: Path) -> tuple[str, str]:
 def code_lines(file: Path) -> int:
     """Number of lines with code."""
     text = file.read_text(encoding="utf-8")
+    if file.suffix == ".c":
+        return sum(
+            bool(line.strip()) for line in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines()
+        )
     docstrings: set[int] = set()
     for node in ast.walk(ast.parse(text)):
         if (
@@ -69,7 +74,7 @@ def code_lines(file: Path) -> int:
 def count(repository: Path) -> dict[tuple[str, str], Counter[str]]:
     """(house, room) -> numbers of files, lines and lines of code."""
     rooms: dict[tuple[str, str], Counter[str]] = {}
-    for file in sorted(repository.rglob("*.py")):
+    for file in sorted([*repository.rglob("*.py"), *repository.rglob("*.c")]):
         inside = file.relative_to(repository)
         if inside.parts[0].startswith(".") or inside.parts[0] in ("build", "dist"):
             continue

@@ -11,39 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tactflow.vision.contact import (
-    ContactDetector,
-    background,
-    illumination,
-)
+from tactflow.vision import compiled
+from tactflow.vision.contact import ContactDetector, background
 from tactflow.vision.contact.background import BackgroundModel, Change
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
-from tests.oracles.background import (
-    plain_scaled_change,
-    plain_smooth_cells,
-    plain_weigh_change,
-)
-from tests.oracles.illumination import plain_compare_blocks, plain_fit_robustly
 
 Image = NDArray[np.uint8]
 
 SIZES = st.tuples(st.integers(1, 70), st.integers(1, 70))
 """Heights and widths: also of less than a cell, and of no whole number of cells."""
 
-ORACLES = (
-    (background, "weigh_change", plain_weigh_change),
-    (background, "scaled_change", plain_scaled_change),
-    (background, "smooth_cells", plain_smooth_cells),
-    (illumination, "compare_blocks", plain_compare_blocks),
-    (illumination, "fit_robustly", plain_fit_robustly),
-)
 
-
-def _with_oracles() -> Any:
-    """A context in which the plain versions take the place of the kernels."""
+def _with_numpy() -> Any:
+    """A context in which loops run in NumPy."""
     patch = pytest.MonkeyPatch()
-    for module, name, plain in ORACLES:
-        patch.setattr(module, name, plain)
+    for loop in compiled.kernels():
+        patch.setattr(loop, "compiled", loop.plain)
     return patch
 
 
@@ -81,7 +64,7 @@ def _close(fast: NDArray[np.float32], slow: NDArray[np.float32]) -> None:
 def test_the_loops_see_the_change_that_the_plain_version_sees(size: tuple[int, int], seed: int) -> None:
     frames = _pictures(size, seed, 3)
     _, fast = _compared(frames)
-    oracles = _with_oracles()
+    oracles = _with_numpy()
     try:
         _, slow = _compared(frames)
     finally:
@@ -118,7 +101,7 @@ def test_the_loops_find_a_window_as_changed_as_the_plain_version(
     inside = np.random.default_rng(seed).random((bottom - top, right - left)) < 0.8
     window = slice(top, bottom), slice(left, right), inside
     fast = model.window_change(changes[1], *window)
-    oracles = _with_oracles()
+    oracles = _with_numpy()
     try:
         slow = model.window_change(changes[1], *window)
     finally:
@@ -153,7 +136,7 @@ def _contacts(seed: int) -> list[Image]:
 def test_the_loops_outline_a_contact_as_the_plain_version(seed: int) -> None:
     """Measured: no pixel differs; three may, whose level is zero to rounding."""
     fast = _contacts(seed)
-    oracles = _with_oracles()
+    oracles = _with_numpy()
     try:
         slow = _contacts(seed)
     finally:
