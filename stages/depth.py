@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pydantic import Field
+
 from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
@@ -16,7 +18,9 @@ class Depth(Stage):
     """Heights from the colour of the gel, or from its darkening, by the sensor's calibration, or from the
     gradients of a network.
 
-    Absent without a calibration, or with one that knows the scale alone and no network.
+    No depth exceeds the thickness of the gel, or half the width of the contact: what would is reported as
+    this bound, and its standard error contains the difference. Absent without a calibration, or with one that
+    knows the scale alone and no network.
 
     >>> import numpy as np
     >>> import tactflow
@@ -28,10 +32,22 @@ class Depth(Stage):
 
     memory = "pure"
 
-    def __init__(self, params: StageParams, calibration: Calibration | None = None) -> None:
+    class Params(StageParams):
+        """What is known about the gel."""
+
+        gel_thickness: float | None = Field(
+            None, gt=0, description="of the gel, mm, which no depth exceeds; default: that of the calibration"
+        )
+
+    params: Params
+
+    def __init__(self, params: Params, calibration: Calibration | None = None) -> None:
         """Prepare. calibration : of the sensor."""
         super().__init__(params)
         self._known = known = calibration
+        self._thickness = params.gel_thickness
+        if self._thickness is None and known is not None:
+            self._thickness = known.gel_thickness
         photometric = None if known is None else known.photometric
         self._errors = None if photometric is None else photometric.errors()
         self._darkness = None if known is None or known.darkness is None else known.darkness.model()
@@ -52,6 +68,7 @@ class Depth(Stage):
             return Absent("no_contact")
         rest = self.once(Rest, untouched)
         if known.darkness is not None and self._darkness is not None and gradients is None:
-            dark = DarkSurface(self._darkness, scale, known.darkness.stderr)
+            dark = DarkSurface(self._darkness, scale, known.darkness.stderr, self._thickness)
             return dark.depth(unmarked, rest, contact_mask)
-        return Surface(known.slopes, scale, self._errors).depth(unmarked, rest, contact_mask, gradients)
+        surface = Surface(known.slopes, scale, self._errors, self._thickness)
+        return surface.depth(unmarked, rest, contact_mask, gradients)

@@ -77,8 +77,14 @@ def test_several_presses_are_judged_by_the_others() -> None:
     assert fitted.misfit.max() < 0.06
     today = session(pressed(7, 0.5))
     assert darkness_error(today, fitted.found, SCALE) < 0.04
-    darker = [replace(press, image=(press.image * 0.7).astype(np.uint8)) for press in today.presses]
-    assert darkness_error(replace(today, presses=darker), fitted.found, SCALE) > 0.1
+    press = today.presses[0]
+
+    def error(light: np.ndarray | float) -> float:
+        lit = replace(press, image=(press.image * light).astype(np.uint8))
+        return darkness_error(replace(today, presses=[lit]), fitted.found, SCALE)
+
+    assert error(0.7) < 0.04, "exposure is no darkening"
+    assert error(np.where(press.mask > 0, 0.7, 1.0)[..., None]) > 0.1
 
 
 def test_a_gel_that_does_not_become_darker_is_refused() -> None:

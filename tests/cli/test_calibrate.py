@@ -81,8 +81,10 @@ def test_a_scale_from_an_irregular_grid_is_reported_as_inaccurate(
     for x, y in np.ndindex(10, 7):
         cv2.circle(picture, (25 + 30 * x, 25 + rows_apart * y), 5, (30, 30, 30), -1, cv2.LINE_AA)
     cv2.imwrite("gel.png", picture)
-    assert terminal("calibrate", "mini", "--from", "gel.png", "--pitch", "3") == 0
+    options = ["--pitch", "3", "--gel-thickness", "2.5"]
+    assert terminal("calibrate", "mini", "--from", "gel.png", *options) == 0
     output = terminal.err
+    assert yaml.safe_load(Path("calibration/mini.yaml").read_text())["gel_thickness"] == 2.5
     assert ("--pitch is for dots in a square grid" in output) == warned
 
 

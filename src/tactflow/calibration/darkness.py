@@ -100,8 +100,8 @@ def _rings(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> list[R
     contact = min(contact, ball_radius)
     fall = float(np.sqrt(ball_radius**2 - contact**2))
     window = surroundings(press.mask, rest.window).window
-    light = rest.around(press.image, press.mask).light
-    darkening = -colour_change(press.image, rest, window, light).mean(axis=2)
+    gain = rest.around(press.image, press.mask).gain
+    darkening = -colour_change(press.image, rest, window, gain).mean(axis=2)
     rows, columns = np.mgrid[window.part]
     # The centre of a pixel at half resolution lies between two of the processed frame.
     x, y = (2 * columns + 0.5 - press.center[0]) * scale.x, (2 * rows + 0.5 - press.center[1]) * scale.y

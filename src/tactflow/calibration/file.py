@@ -164,6 +164,7 @@ class Calibration(_Entry):
     scale_entry : millimetres per pixel. photometric, slopes : slopes from colours, and their errors.
     darkness : depth from darkening, for gels in white light. force : from contacts. None if not known.
     kind : of sensor that it is the default of, for frames of the same shape and any size; else None.
+    gel_thickness : mm, which no depth exceeds; None where it is not known.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
     recorded : whether it comes from a recording, which was made with it.
     information : (114, 114) float64, `Photometry.information`, to refine it for another sensor; None without
@@ -182,6 +183,7 @@ class Calibration(_Entry):
     size: Size
     corners: Annotated[list[Pair], Field(min_length=4, max_length=4)]
     scale_entry: ScaleEntry = Field(alias="scale")
+    gel_thickness: PositiveFloat | None = None
     photometric: PhotometricEntry | None = None
     darkness: DarknessEntry | None = None
     force: ForceEntry | None = None

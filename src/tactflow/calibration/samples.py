@@ -136,11 +136,11 @@ def _prepare(
     """smoothed : the picture of the press. rests : the untouched gel, as it is and smoothed."""
     rest = rests[0]
     window = surroundings(press.mask, rest.window).window
-    light = rest.around(press.image, press.mask).light
-    change = colour_change(smoothed, rests[1], window, light)
+    gain = rest.around(press.image, press.mask).gain
+    change = colour_change(smoothed, rests[1], window, gain)
     size = (window.width, window.height)
     dark = cv2.resize(smoothed[window.whole], size, interpolation=cv2.INTER_AREA).min(axis=2) < DARK
-    change[dark] = colour_change(press.image, rest, window, light)[dark]
+    change[dark] = colour_change(press.image, rest, window, gain)[dark]
     place = place_terms((rest.window.right, rest.window.bottom))[(slice(None), *window.part)]
     terms = place.reshape(PLACE_TERMS, 1, -1) * colour_terms(change)
     rows, columns = np.mgrid[window.part]

@@ -63,6 +63,7 @@ class Wish:
 
     pitch : spacing of the dots, mm. area : width and height of the processed picture, mm; at most one of the
     two, and for `refine` maybe neither. ball_radius : mm; None for the scale alone. method : of the depth.
+    gel_thickness : mm; None for that of the pipeline's calibration.
 
     Raises ConfigError if this gives no calibration.
     """
@@ -71,6 +72,7 @@ class Wish:
     area: tuple[float, float] | None = None
     ball_radius: float | None = None
     method: Method = "slopes"
+    gel_thickness: float | None = None
 
     def __post_init__(self) -> None:
         refines, ways = self.method == "refine", [self.pitch, self.area].count(None)
@@ -151,6 +153,7 @@ def learn(
         size=session.mapping.size,
         corners=raw_corners(session.mapping),
         scale=ScaleEntry.of(scale, found_by),
+        gel_thickness=wish.gel_thickness or (None if base is None else base.gel_thickness),
         look=small_picture(session.untouched),
         **depth,
     )

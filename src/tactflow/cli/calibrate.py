@@ -60,6 +60,11 @@ OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
         "metavar": "MM",
         "help": "radius of the ball; without it, only the scale is calibrated",
     },
+    "--gel-thickness": {
+        "type": _millimetres,
+        "metavar": "MM",
+        "help": "thickness of the gel: no depth exceeds it",
+    },
     "--presses": {
         "type": positive,
         "metavar": "N",
@@ -172,7 +177,7 @@ def _make(args: argparse.Namespace) -> int:
     if args.darkness and args.refine:
         raise ConfigError("calibrate --darkness: required --ball-radius MM, and not --refine")
     method: Method = "darkness" if args.darkness else "refine" if args.refine else "slopes"
-    wish = Wish(args.pitch, args.area, args.ball_radius, method)
+    wish = Wish(args.pitch, args.area, args.ball_radius, method, args.gel_thickness)
     base = _base(args, pipeline)
     loaded = _load(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"

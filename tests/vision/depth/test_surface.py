@@ -7,7 +7,7 @@ import pytest
 
 from tactflow.vision.depth.poisson import ALL_OPEN, Sides, integrate
 from tactflow.vision.depth.slopes import BAND, STEEPEST, SlopeModel, coordinates, place_terms
-from tactflow.vision.depth.surface import Rest, Surface, colour_change
+from tactflow.vision.depth.surface import Rest, Surface, SurfaceErrors, colour_change
 from tactflow.vision.depth.surroundings import resting, surroundings
 from tactflow.vision.types import Scale
 
@@ -80,14 +80,18 @@ def test_the_gel_is_at_rest_where_its_light_has_faded_and_a_change_of_all_the_li
     y, x = np.mgrid[:48, :64] * 8 + 4
     mask = np.where(np.hypot(x - 250, y - 200) < 40, 255, 0).astype(np.uint8).repeat(8, 0).repeat(8, 1)
     faded = np.clip(1 - (np.hypot(x - 250, y - 200) - 40) / reach, 0, 1)
-    light = np.array([0.1, 0.2, 0.3], np.float32)
-    change = faded[..., None] * np.array([0.3, -0.2, 0.1]) + light
-    found = resting(change.astype(np.float32), mask[::8, ::8].repeat(8, 0).repeat(8, 1)[:384, :512])
+    gain = np.array([0.7, 1.2, 1.3], np.float32)
+    # A gel that is darker to the right: exposure changes bright places by more.
+    level = np.broadcast_to((0.9 - 0.3 * x / 512)[..., None], (*x.shape, 3)).astype(np.float32)
+    change = faded[..., None] * np.array([0.3, -0.2, 0.1]) + (gain - 1) * level
+    pressed = mask[::8, ::8].repeat(8, 0).repeat(8, 1)[:384, :512]
+    found = resting(change.astype(np.float32), level, pressed)
     assert abs(2 * found.margin - reach) <= 12
-    assert found.light == pytest.approx(light, abs=1e-4)
+    assert found.gain == pytest.approx(gain, abs=1e-4)
 
 
-def test_a_press_has_no_step_along_the_border_of_its_heights() -> None:
+def pressed() -> tuple[SlopeModel, np.ndarray, np.ndarray, np.ndarray]:
+    """A model, a gel, a round press of it, and its mask. About 0.5 mm deep at 0.1 mm a pixel."""
     y, x = np.mgrid[:160, :200]
     model = np.zeros((6, 19, 2))
     # The first two channels are the two parts of the normal.
@@ -97,7 +101,47 @@ def test_a_press_has_no_step_along_the_border_of_its_heights() -> None:
     change = np.stack([inward * (x - 100), inward * (y - 80), 0 * x], axis=2) / 40
     image = np.rint(gel + 120 * change).astype(np.uint8)
     mask = np.where(np.hypot(x - 100, y - 80) < 20, 255, 0).astype(np.uint8)
-    depth = Surface(SlopeModel(model), Scale(0.1, 0.1, (0, 0), (0, 0))).depth(image, Rest(gel), mask)
+    return SlopeModel(model), gel, image, mask
+
+
+@pytest.mark.parametrize("gain", [(0.68, 0.66, 0.95), (1.2, 1.1, 1.15)])
+def test_a_change_of_exposure_and_white_balance_leaves_the_slopes_as_they_are(
+    gain: tuple[float, float, float],
+) -> None:
+    model, gel, image, mask = pressed()
+    # A gel that is darker to the right.
+    fall = np.linspace(1, 0.5, 200)[None, :, None]
+    gel, image = (np.rint(part * fall).astype(np.uint8) for part in (gel, image))
+    surface = Surface(model, Scale(0.1, 0.1, (0, 0), (0, 0)))
+    expected = surface.depth(image, Rest(gel), mask)
+    found = surface.depth(np.rint(image * gain).astype(np.uint8), Rest(gel), mask)
+    assert np.abs(found.heights - expected.heights).max() < 0.05 * expected.greatest
+
+
+@pytest.mark.parametrize(
+    ("thickness", "scale", "most"), [(0.2, 0.1, 0.2), (4.0, 0.1, None), (0.04, 0.01, 0.04)]
+)
+def test_no_depth_exceeds_the_gel_and_the_stated_error_contains_the_difference(
+    thickness: float, scale: float, most: float | None
+) -> None:
+    model, gel, image, mask = pressed()
+    mm = Scale(scale, scale, (0, 0), (0, 0))
+    errors = SurfaceErrors(0.9)
+    free = Surface(model, mm, errors).depth(image, Rest(gel), mask)
+    found = Surface(model, mm, errors, thickness).depth(image, Rest(gel), mask)
+    if most is None:
+        assert found.greatest == free.greatest
+        assert found.greatest_stderr == free.greatest_stderr
+        return
+    assert found.greatest == most
+    assert found.heights.max() == pytest.approx(most, rel=0.01)
+    assert found.greatest_stderr >= free.greatest - most
+    assert found.volume == pytest.approx(free.volume * most / free.greatest, rel=1e-4)
+
+
+def test_a_press_has_no_step_along_the_border_of_its_heights() -> None:
+    model, gel, image, mask = pressed()
+    depth = Surface(model, Scale(0.1, 0.1, (0, 0), (0, 0))).depth(image, Rest(gel), mask)
     rows, columns = (np.flatnonzero(depth.heights.any(axis=axis)) for axis in (1, 0))
     around = [depth.heights[rows[[0, -1]]].max(), depth.heights[:, columns[[0, -1]]].max()]
     assert max(around) < 0.01 * depth.greatest
@@ -130,7 +174,7 @@ def test_a_grainy_gel_that_is_not_touched_has_no_change_of_colour_however_its_me
 ) -> None:
     gel = np.random.default_rng(3).integers(80, 140, GEL.shape).astype(dtype)
     rest = Rest(gel)
-    assert np.abs(colour_change(gel, rest, rest.window, np.zeros(3, np.float32))).max() == 0
+    assert np.abs(colour_change(gel, rest, rest.window, np.ones(3, np.float32))).max() == 0
 
 
 def test_slopes_are_those_of_normals_that_are_a_polynomial_of_colour_and_place_and_never_too_steep() -> None:

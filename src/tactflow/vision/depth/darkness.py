@@ -66,20 +66,28 @@ class DarkSurface:
 
     model : of the depth. scale : mm per px of the processed frame. stderr : of the depth of a pixel, mm; None
     where it is not known. A contact that is at least as deep as the deepest press has no standard errors.
+    thickness : of the gel, mm, as in `Surface`.
     """
 
-    def __init__(self, model: DarknessModel, scale: Scale, stderr: float | None = None) -> None:
+    def __init__(
+        self,
+        model: DarknessModel,
+        scale: Scale,
+        stderr: float | None = None,
+        thickness: float | None = None,
+    ) -> None:
         self._model = model
         self._scale = scale
         self._stderr = stderr
+        self._thickness = thickness
 
     def depth(self, image: Bytes, rest: Rest, mask: Bytes) -> Depth:
         """The height map of a frame, of the contact and its surroundings, see `Surface.depth`."""
         at_rest = rest.around(image, mask)
         window = surroundings(mask, rest.window, at_rest.margin).window
-        low = self._model(-colour_change(image, rest, window, at_rest.light).mean(axis=2))
+        low = self._model(-colour_change(image, rest, window, at_rest.gain).mean(axis=2))
         greatest, relative_error = float(low.max()), None
         # Errors of the curve are common to all pixels.
         if self._stderr is not None and 0 < greatest < self._model.deepest:
             relative_error = self._stderr / greatest
-        return measured(low, window, mask, self._scale, relative_error)
+        return measured(low, window, mask, self._scale, relative_error, self._thickness)

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Floats32
+from tactflow.vision.depth.possible import deepest_possible
 from tactflow.vision.depth.slopes import STEEPEST, Bytes, SlopeModel, coordinates
-from tactflow.vision.depth.surroundings import CELL, Resting, Window, resting, surroundings
+from tactflow.vision.depth.surroundings import CELL, LEAST_GAIN, Resting, Window, resting, surroundings
 from tactflow.vision.geometry.downsample import cell_means
 from tactflow.vision.types import Depth, Scale
 
@@ -60,26 +61,31 @@ class Rest:
         self.light = _halved(untouched, self.window)
         self.weight: Floats32 = np.reciprocal(self.light + np.float32(DIM), dtype=np.float32)
         self.x, self.y = coordinates((self.window.right, self.window.bottom))
+        self.level: Floats32 = self.light * self.weight
         self._cells = cell_means(untouched, CELL)
         self._cell_weight = np.reciprocal(self._cells + np.float32(DIM), dtype=np.float32)
+        self._cell_level: Floats32 = self._cells * self._cell_weight
 
     def around(self, image: Bytes | Floats32, mask: Bytes) -> Resting:
         """Where the gel around a contact is at rest. image, mask : as `Surface.depth` takes them."""
         change = np.asarray(cv2.subtract(cell_means(image, CELL), self._cells, dtype=cv2.CV_32F), np.float32)
-        return resting(change * self._cell_weight, mask)
+        return resting(change * self._cell_weight, self._cell_level, mask)
 
 
-def colour_change(image: Bytes | Floats32, rest: Rest, window: Window, light: Floats32) -> Floats32:
+def colour_change(image: Bytes | Floats32, rest: Rest, window: Window, gain: Floats32) -> Floats32:
     """(h, w, 3) float32: change of the light at half resolution, relative to the light at rest.
 
     image : (H, W, 3) uint8 or float32, grey levels, BGR, without markers; means of 2 x 2 pixels of uint8 are
-    rounded. light : (3,), `Resting.light`, a change of the light as a whole, which is taken out.
+    rounded. gain : (3,), `Resting.gain`: the picture is divided by it, so that a change of exposure or white
+    balance is not a change of colour, and does not make slopes steeper or flatter.
     """
     halved = _halved(image, window)
     change = np.asarray(cv2.subtract(halved, rest.light[window.part], dtype=cv2.CV_32F), np.float32)
     change *= rest.weight[window.part]
-    # In numpy this takes nine times as long, for the three channels are the inner loop.
-    cv2.subtract(change, (*light.tolist(), 0.0), change)  # type: ignore[call-overload]
+    gain = np.maximum(gain, np.float32(LEAST_GAIN))
+    # (image / gain - light) * weight, so that a gel that has not changed gives 0 exactly.
+    change -= (gain - 1) * rest.level[window.part]
+    change /= gain
     return change
 
 
@@ -91,6 +97,7 @@ class Surface:
     model : which colour is which slope; None where all slopes are given.
     scale : mm per px of the processed frame.
     errors : of the calibration; None where they are not known.
+    thickness : of the gel, mm, which no depth exceeds; None where it is not known. See `deepest_possible`.
 
     Examples
     --------
@@ -102,10 +109,17 @@ class Surface:
     0.0
     """
 
-    def __init__(self, model: SlopeModel | None, scale: Scale, errors: SurfaceErrors | None = None) -> None:
+    def __init__(
+        self,
+        model: SlopeModel | None,
+        scale: Scale,
+        errors: SurfaceErrors | None = None,
+        thickness: float | None = None,
+    ) -> None:
         self._model = model
         self._scale = scale
         self._errors = errors
+        self._thickness = thickness
 
     def depth(self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None) -> Depth:
         """The height map of a frame.
@@ -119,7 +133,7 @@ class Surface:
         if self._errors is not None and gradients is None:
             unexplained = UNEXPLAINED * self._unexplained(slope, low, mask[window.whole])
             relative = math.hypot(unexplained, STEEP_ERROR * math.sqrt(steep), self._errors.between, ROUNDED)
-        return measured(low, window, mask, self._scale, relative)
+        return measured(low, window, mask, self._scale, relative, self._thickness)
 
     def heights(self, image: Bytes, rest: Rest, mask: Bytes) -> Floats32:
         """(h, w) float32: how far the gel is pushed in, mm >= 0, at half resolution; see `depth`."""
@@ -138,7 +152,7 @@ class Surface:
         if gradients is not None:
             # The model's slopes fall where the gel is pushed in.
             return -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32), 0.0, window
-        change = colour_change(image, rest, window, at_rest.light)
+        change = colour_change(image, rest, window, at_rest.gain)
         assert self._model is not None, "without a model, gradients are given"
         rows, columns = window.part
         steepest = None if self._errors is None else self._errors.steepest
@@ -178,15 +192,32 @@ class Surface:
         return left / total if total else 0.0
 
 
-def measured(low: Floats32, window: Window, mask: Bytes, scale: Scale, relative_error: float | None) -> Depth:
+def measured(
+    low: Floats32,
+    window: Window,
+    mask: Bytes,
+    scale: Scale,
+    relative_error: float | None,
+    thickness: float | None = None,
+) -> Depth:
     """Height map, greatest depth and volumes, from heights (h, w) of a window at half resolution, mm.
 
+    Heights that exceed what is possible are scaled down to it, and what they exceed it by is part of the
+    standard error.
+
     mask : (H, W) uint8, 255 in contact. relative_error : standard error of depth and volume; None: unknown.
+    thickness : of the gel, mm; None: unknown.
     """
+    greatest, most = float(low.max()), deepest_possible(mask, scale, thickness)
+    if greatest > most:
+        low = low * np.float32(most / greatest)
+        if relative_error is not None:
+            relative_error = math.hypot(relative_error, greatest / most - 1)
+        greatest = most
     heights = np.zeros(mask.shape, np.float32)
     size = (2 * window.width, 2 * window.height)
     cv2.resize(low, size, heights[window.whole], interpolation=cv2.INTER_LINEAR)
-    greatest, cell = float(low.max()), scale.area(4.0)
+    cell = scale.area(4.0)
     volume = float(low.sum()) * cell
     pressed = float(low[mask[window.whole][::2, ::2] > 0].sum()) * cell
     if relative_error is None:

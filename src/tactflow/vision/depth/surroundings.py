@@ -21,6 +21,13 @@ FADED: Final = 0.05
 far away: what lies beyond adds a hundredth to the depth."""
 
 
+LIT: Final = 0.5
+"""Least `level` of a cell that shows how much the light has changed: its light at rest is then at least `DIM`
+of `surface`, so that grey levels of noise are a small part of it."""
+LEAST_GAIN: Final = 0.1
+"""Smallest gain that is divided by: a picture that is darker shows no gel."""
+
+
 class Window(NamedTuple):
     """Part of a picture at half resolution, px."""
 
@@ -81,39 +88,55 @@ def surroundings(mask: Bytes, whole: Window, margin: int = LEAST_MARGIN) -> Surr
 class Resting(NamedTuple):
     """Where the gel around a contact is at rest.
 
-    margin : distance from the contact, pixels at half resolution. light : (3,) float32, change of the light
-    there, relative to the light at rest.
+    margin : distance from the contact, pixels at half resolution. gain : (3,) float32, the light there, over
+    the light of the untouched gel.
     """
 
     margin: int
-    light: Floats32
+    gain: Floats32
 
 
-def resting(change: Floats32, mask: Bytes) -> Resting:
-    """Find the distance from a contact beyond which the gel is at rest.
+def resting(change: Floats32, level: Floats32, mask: Bytes) -> Resting:
+    """Find the distance from a contact beyond which the gel is at rest, and how its light has changed there.
 
     The change of the light decreases with the distance from the contact: the gel is at rest from the first
-    ring around it in which the mean change has faded (`FADED`).
+    ring around it in which the mean change has faded (`FADED`). Exposure and white balance multiply a channel
+    by a factor all over the picture, which the gel far from the contact shows.
 
-    change : (h, w, 3) float32, relative change of the light in cells of `CELL` x `CELL` pixels. mask : (H, W)
-    uint8, 255 in contact; not all 0.
+    change : (h, w, 3) float32, relative change of the light in cells of `CELL` x `CELL` pixels. level :
+    (h, w, 3) float32, by how much `change` grows if the light doubles. mask : (H, W) uint8, 255 in contact;
+    not all 0.
     """
     height, width = change.shape[:2]
     middle = CELL // 2
     contact = mask[middle : height * CELL : CELL, middle : width * CELL : CELL]
     if contact.all() or not contact.any():
-        return Resting(LEAST_MARGIN, np.zeros(3, np.float32))
+        return Resting(LEAST_MARGIN, np.ones(3, np.float32))
     ring = cv2.distanceTransform((contact == 0).view(np.uint8), cv2.DIST_L2, 5).astype(np.intp)
-    outside = change[ring >= min(2 * LEAST_MARGIN // CELL, ring.max())]
-    # The middle of three sorted columns; `np.median` takes three times as long.
-    light = np.sort(outside.T.copy(), axis=1)[:, len(outside) // 2]
-    off = change - light
+    outside = ring >= min(2 * LEAST_MARGIN // CELL, ring.max())
+    more = _relative_growth(change[outside], level[outside])
+    off = change - more * level
     strength = np.sqrt(np.einsum("ijk,ijk->ij", off, off)).ravel()
     rings = ring.ravel()
     profile = np.bincount(rings, strength) / np.maximum(np.bincount(rings), 1)
     far = float(profile[1:].min())
     faded = np.flatnonzero(profile[1:] <= far + FADED * (profile[1] - far))
-    return Resting(max(LEAST_MARGIN, (int(faded[0]) + 1) * CELL // 2), light)
+    return Resting(max(LEAST_MARGIN, (int(faded[0]) + 1) * CELL // 2), 1 + more)
+
+
+def _relative_growth(change: Floats32, level: Floats32) -> Floats32:
+    """(3,): by which part of itself each channel has grown, the median of n cells of the gel at rest.
+
+    change, level : (n, 3), see `resting`. Dark cells show noise instead; without others, nothing has grown.
+    """
+    growth = np.zeros(3, np.float32)
+    for channel in range(3):
+        lit = level[:, channel] >= LIT
+        if lit.any():
+            # The middle of a sorted column; `np.median` takes three times as long.
+            ratios = np.sort(change[lit, channel] / level[lit, channel])
+            growth[channel] = ratios[len(ratios) // 2]
+    return growth
 
 
 def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
