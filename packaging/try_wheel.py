@@ -1,7 +1,7 @@
 """Install the wheel of tactflow into an empty environment of each Python, and run the README's first screen.
 
     make packages
-    python packaging/try_wheel.py dist/tactflow-0.1.0-cp311-abi3-manylinux_2_28_x86_64.whl python3.11 python3.13
+    python packaging/try_wheel.py dist/tactflow-0.1.0-cp311-abi3-linux_x86_64.whl python3.11 python3.13
 
 Prints a Markdown table: megabytes of all files that pip downloads, megabytes in the environment without pip,
 seconds to compile what the first run needs. Exits with 1 if a step fails for one of the Pythons.

@@ -26,8 +26,8 @@ from tactflow.vision.geometry.resample import Resampler
 Method = Literal["area", "pyramid"]
 
 _ROTATION_FLIPS: Final = {90: 1, 180: -1, 270: 0}
-"""Degrees clockwise -> how `cv2.flip` mirrors a picture, transposed for a quarter turn, to turn it. Takes half
-the time of `cv2.rotate`."""
+"""Degrees clockwise -> how `cv2.flip` mirrors a picture, transposed for a quarter turn, to turn it. Takes
+half the time of `cv2.rotate`."""
 
 
 class Preprocessor:
