@@ -94,18 +94,15 @@ class Runner:
         """
         self._began = time.perf_counter()
         is_interrupted = False
-
-        def report() -> None:
-            if on_progress is not None:
-                on_progress(self.progress())
-
         try:
             source = self._open()
             # Opening a camera may take long.
             self._began = time.perf_counter()
             if not self._ending.stopping.is_set():
                 self._start(source)
-                self._threads.wait(report, interval_s)
+                for _ in self._threads.wait(interval_s):
+                    if on_progress is not None:
+                        on_progress(self.progress())
         except TactflowError as failure:
             self._ending.fail(failure)
         except KeyboardInterrupt:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 
 from tactflow.engine.ending import Ending
 from tactflow.engine.errors import StageError
@@ -100,15 +100,15 @@ class Threads:
         """Ids of the parts that threads are executing."""
         return {self._segments[name].current for name, t in self._threads.items() if t.is_alive()}
 
-    def wait(self, on_wait: Callable[[], None], interval_s: float) -> None:
+    def wait(self, interval_s: float) -> Iterator[None]:
         """Wait for the threads: without limit for the end of the source, with a limit after a stop.
 
-        on_wait : called about every `interval_s` seconds. Raises StageError that names what hangs.
+        Yields about every `interval_s` seconds. Raises StageError that names what hangs.
         """
         done, since = -1, time.perf_counter()
         while alive := [name for name, thread in self._threads.items() if thread.is_alive()]:
             self._threads[alive[0]].join(interval_s)
-            on_wait()
+            yield
             # Draining a long queue counts as progress.
             before, done = done, sum(s.calls for s in self._segments.values())
             done += sum(link.delivered for link in self.links)
