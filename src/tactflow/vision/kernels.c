@@ -147,10 +147,11 @@ LOOP smooth_cells(const Arg *a, double *out)
 
 LOOP sum_tiles(const Arg *a, double *out)
 {
-    const u8 *lines = a[0].data, *resting = a[1].data;
-    const float *slopes = a[2].data;
-    float *sums = a[3].data;
-    const i64 rows = a[3].shape[1], columns = a[3].shape[2], high = a[1].shape[0], width = a[1].shape[1];
+    const u8 *picture = a[0].data, *resting = a[2].data;
+    const i64 *used = a[1].data, stride = a[0].shape[1];
+    const float *slopes = a[3].data;
+    float *sums = a[4].data;
+    const i64 rows = a[4].shape[1], columns = a[4].shape[2], high = a[2].shape[0], width = a[2].shape[1];
     const i64 thick = high / rows, wide = width / columns;
     u16 *light = malloc(3 * width * sizeof(u16));
     float *shift = malloc(2 * width * sizeof(float));
@@ -164,7 +165,7 @@ LOOP sum_tiles(const Arg *a, double *out)
         memset(light, 0, 3 * width * sizeof(u16));
         memset(shift, 0, 2 * width * sizeof(float));
         for (i64 y = row * thick; y < (row + 1) * thick; y++) {
-            const u8 *restrict line = lines + y * 3 * width;
+            const u8 *restrict line = picture + used[y] * stride;
             const u8 *restrict rest = resting + y * width;
             const float *restrict along = slopes + y * width, *restrict down = slopes + (high + y) * width;
             u16 *restrict total = light;
@@ -1318,7 +1319,7 @@ typedef struct {
 static const Loop LOOPS[] = {
     {"halve", "B2 n n B2!", '-', halve},
     {"smooth_cells", "B2 f3!", '-', smooth_cells},
-    {"sum_tiles", "B2 B2 f3 f3!", '-', sum_tiles},
+    {"sum_tiles", "B2 q1 B2 f3 f3!", '-', sum_tiles},
     {"weigh_change", "f3 f2 f1 f1 f3 f3 f2 f2 B2 f2 f2! f2! f2!", '4', weigh_change},
     {"scaled_change", "B2 n n f2 f1 f1 f2 f2 f2! x", '-', scaled_change},
     {"compare_blocks", "f3 f2 f2 f2 f2 f2 f2! f2! f2! x", '-', compare_blocks},

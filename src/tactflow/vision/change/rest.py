@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32, check_color_image
+from tactflow.vision.arrays import Floats32, Indices, check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.background import Derived
 from tactflow.vision.contact.background_kernels import weigh_change
@@ -189,8 +189,8 @@ class RestTest:
     def _sums(self, frame: NDArray[np.uint8]) -> Floats32:
         """(5, rows, columns), see `sum_tiles`."""
         sums = np.empty((5, *self._px_per_edge.shape[1:]), np.float32)
-        lines = frame[self._used].reshape(len(self._resting), -1)
-        sum_tiles(lines, self._resting, self._slopes, sums)
+        picture = np.ascontiguousarray(frame).reshape(len(frame), -1)
+        sum_tiles(picture, self._used[0], self._resting, self._slopes, sums)
         return sums
 
     def _learn(self, step: Floats32) -> None:
@@ -265,15 +265,18 @@ def _used_lines(energy: Floats32, number: int) -> NDArray[np.intp]:
 
 
 @kernel
-def sum_tiles(lines: NDArray[np.uint8], resting: NDArray[np.uint8], slopes: Floats32, sums: Floats32) -> None:
+def sum_tiles(
+    picture: NDArray[np.uint8], used: Indices, resting: NDArray[np.uint8], slopes: Floats32, sums: Floats32
+) -> None:
     """Sums over tiles of blue, green and red, and of the change of green times its slopes along x and y.
 
-    lines : (n * rows, m * columns * 3), n < 258. resting : (n * rows, m * columns), green of the untouched
-    gel. slopes : (2, n * rows, m * columns), levels per px. sums : (5, rows, columns), filled.
+    picture : (H, 3 W). used : (n * rows,), its lines that are read, of W >= m * columns px; n < 258.
+    resting : (n * rows, m * columns), green of the untouched gel. slopes : (2, n * rows, m * columns), levels
+    per px. sums : (5, rows, columns), filled.
     """
     _, rows, columns = sums.shape
     tiles = rows, len(resting) // rows, columns, resting.shape[1] // columns
-    pictures = lines.reshape(*tiles, 3)
+    pictures = picture[used, : 3 * resting.shape[1]].reshape(*tiles, 3)
     sums[:3] = pictures.sum(axis=(1, 3)).transpose(2, 0, 1)
     more = pictures[..., 1].astype(np.float32) - resting.reshape(tiles)
     sums[3:] = (slopes.reshape(2, *tiles) * more).sum(axis=(2, 4))
