@@ -32,6 +32,7 @@ from tactflow.engine.graph import Pipeline
 from tactflow.engine.ports import Port
 from tactflow.engine.run import Runner, RunResult
 from tactflow.sources.memory import MemoryFrames
+from tactflow.system.memory import keep_freed_memory
 from tactflow.system.opencv import opencv_conflict
 from tactflow.system.redaction import public_address
 from tactflow.system.signals import INTERRUPTED_EXIT_CODE, Interrupted, ending_handled, on_ending
@@ -181,6 +182,7 @@ def make_runner(pipeline: Pipeline, **options: Any) -> Runner:
     """
     _warn_of_opencv()
     compiled.warn_if_plain()
+    keep_freed_memory()
     if pipeline.opencv_threads is not None:
         cv2.setNumThreads(pipeline.opencv_threads)
     pipeline = with_recorded_calibration(pipeline)
