@@ -599,21 +599,44 @@ LOOP cover_spots(const Arg *a, double *out)
 /* A line of cells has four sections: the sums of the three channels, and the weight. Each has `reach` cells more on
  * either side, and is padded to whole vector registers, so that one loop runs over all sections. */
 
+/* Write each of `count` bytes three times. */
+INLINE void triple(const u8 *restrict bytes, i64 count, u8 *restrict out)
+{
+    i64 x = 0;
+#if defined(SHUFFLES)
+    for (; x + 16 <= count; x += 16) {
+        Bytes16 b, one, two, three;
+        memcpy(&b, bytes + x, 16);
+        one = __builtin_shufflevector(b, b, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5);
+        two = __builtin_shufflevector(b, b, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8, 9, 9, 9, 10, 10);
+        three = __builtin_shufflevector(b, b, 10, 11, 11, 11, 12, 12, 12, 13, 13, 13, 14, 14, 14, 15, 15, 15);
+        memcpy(out + 3 * x, &one, 16);
+        memcpy(out + 3 * x + 16, &two, 16);
+        memcpy(out + 3 * x + 32, &three, 16);
+    }
+#endif
+    for (; x < count; x++)
+        out[3 * x] = out[3 * x + 1] = out[3 * x + 2] = bytes[x];
+}
+
 /* Sums over the valid ones of the 2 x 2 values of each cell of a line; returns whether a px is masked. A value is
  * valid where none of its 2 x 2 px is masked. valid : scratch, 12 width. sums : scratch, 6 width. */
 INLINE int sum_valid_line(const u8 *mask, const u8 *half, i64 width, i64 section, i64 reach,
                                  const i64 *columns, u16 *line, u8 *valid, u16 *restrict sums)
 {
-    u8 any = 0;
+    u16 any = 0;
     for (int part = 0; part < 2; part++) {
         const u8 *restrict first = mask + 8 * part * width, *restrict second = first + 4 * width;
-        u8 *restrict kept = valid + 6 * part * width;
-        for (i64 x = 0; x < 4 * width; x++)
-            any |= first[x] | second[x];
+        u8 *restrict kept = valid + 6 * part * width, *restrict shown = (u8 *)sums;
         for (i64 x = 0; x < 2 * width; x++) {
-            const u8 shown = first[2 * x] | first[2 * x + 1] | second[2 * x] | second[2 * x + 1] ? 0 : 255;
-            kept[3 * x] = kept[3 * x + 1] = kept[3 * x + 2] = shown;
+            u16 one, other;
+            memcpy(&one, first + 2 * x, 2);
+            memcpy(&other, second + 2 * x, 2);
+            one |= other;
+            any |= one;
+            shown[x] = one ? 0 : 255;
         }
+        triple(shown, 2 * width, kept);
     }
     const u8 *restrict upper = half, *restrict lower = half + 6 * width;
     const u8 *restrict shown = valid, *restrict below = valid + 6 * width;
@@ -698,30 +721,35 @@ INLINE int add_everywhere(const u16 *cells, i64 high, i64 width, i64 length, i64
 }
 
 /* Set the masked px of two lines to the quotients, interpolated between the centres of cells. here, beyond : the
- * quotients of the cells that the lines belong to, and of those across the nearest border. */
-INLINE void fill_lines(const float *here, const float *beyond, i64 width, i64 section, const u8 *mask,
-                              u8 *picture, float *restrict line, u8 *restrict fill)
+ * quotients of the cells that the lines belong to, and of those across the nearest border. fill : scratch, 6 width. */
+INLINE void fill_lines(const float *here, const float *beyond, i64 width, i64 section, const u8 *mask, u8 *picture,
+                       float *restrict line, u8 *fill)
 {
     for (int c = 0; c < 3; c++) {
         const float *restrict near = here + c * section, *restrict other = beyond + c * section;
+        u8 *restrict left = fill + 2 * c * width, *restrict right = left + width;
         for (i64 x = 0; x < width; x++)
             line[x + 1] = 0.75f * near[x] + 0.25f * other[x];
         line[0] = line[1];
         line[width + 1] = line[width];
         for (i64 x = 0; x < width; x++) {
-            fill[6 * x + c] = (u8)rintf(0.25f * line[x] + 0.75f * line[x + 1]);
-            fill[6 * x + 3 + c] = (u8)rintf(0.75f * line[x + 1] + 0.25f * line[x + 2]);
+            left[x] = (u8)(i32)rintf(0.25f * line[x] + 0.75f * line[x + 1]);
+            right[x] = (u8)(i32)rintf(0.75f * line[x + 1] + 0.25f * line[x + 2]);
         }
     }
     for (int row = 0; row < 2; row++) {
         const u8 *hidden = mask + row * 4 * width;
         u8 *values = picture + row * 12 * width;
-        for (i64 x = 0; x < 4 * width; x += 4) {
+        for (i64 x = 0; x < width; x++) {
             u32 four;
-            memcpy(&four, hidden + x, 4);
-            for (i64 k = x; four && k < x + 4; k++)
-                if (hidden[k])
-                    memcpy(values + 3 * k, fill + 3 * (k / 2), 3);
+            memcpy(&four, hidden + 4 * x, 4);
+            for (i64 k = 4 * x; four && k < 4 * x + 4; k++)
+                if (hidden[k]) {
+                    const u8 *from = fill + (k & 2 ? width : 0) + x;
+                    values[3 * k] = from[0];
+                    values[3 * k + 1] = from[2 * width];
+                    values[3 * k + 2] = from[4 * width];
+                }
         }
     }
 }
