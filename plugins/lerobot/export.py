@@ -1,5 +1,5 @@
 """`tactflow export lerobot`: datasets of LeRobot (layout v3.0) with pictures, contact, flow and markers at a
-constant rate; of a calibrated sensor also in mm and N.
+constant rate, and all results between two pictures; of a calibrated sensor also in mm and N.
 
 The layout is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v3. Each recording is an
 episode, in files of its own.
@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,8 +20,17 @@ from numpy.typing import NDArray
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError
-from tactflow.message.episodes import AlignedMarkers, MarkerOrder, Moments, at_rate
+from tactflow.message.episodes import MarkerOrder, Moments, at_rate
 from tactflow.system.extras import missing
+
+from .features import (
+    TACTILE_FEATURE,
+    Window,
+    description,
+    marker_features,
+    numbers,
+    padded_window,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,21 +42,10 @@ log = logging.getLogger("tactflow")
 VERSION = "v3.0"
 """Version of the layout, which LeRobot checks."""
 PICTURE_PREFIX = "observation.images."
-TACTILE_FEATURE = "observation.tactile"
-NAMES = {
-    "contact": ["touching", "x", "y", "area", "angle"],
-    "flow": ["known", "dx", "dy"],
-    "contact_mm": ["touching", "x_mm", "y_mm", "area_mm2"],
-    "flow_mm": ["known", "dx_mm", "dy_mm"],
-    "depth": ["known", "depth_mm", "volume_mm3"],
-    "force": ["known", "z_N", "in_range"],
-    "drag": ["known", "x_N", "y_N"],
-    "pose": ["known", "x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg"],
-}
-"""Feature -> names of its numbers. The first two are in px; the others exist with any calibration. All
-numbers are 0 where the first is 0."""
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
 """Integer columns that every dataset has, besides `timestamp`."""
+WINDOW_ROWS = "window rows"
+"""Key of a row of the table under which its window is kept until the length of all windows is known."""
 FILES_PER_FOLDER = 1000
 """Files per folder, as in LeRobot."""
 ENCODER_OPTIONS = {"crf": "18", "g": "2", "preset": "veryfast"}
@@ -108,6 +105,8 @@ class DatasetWriter:
         self._features: dict[str, dict[str, Any]] = {}
         self._moments: dict[str, Moments] = {}
         self._order = MarkerOrder()
+        self._window = Window()
+        self._window_length = 0
         self._colors = Moments()
         self._sampled = 0
 
@@ -126,7 +125,7 @@ class DatasetWriter:
         rows: list[dict[str, Any]] = []
         encode: Callable[[NDArray[np.uint8] | None], None] | None = None
         with ExitStack() as stack:
-            for index, result in enumerate(at_rate(results, self._fps)):
+            for index, result in enumerate(at_rate(self._window.remember(results), self._fps)):
                 image = self._check(result)
                 if self._is_video and encode is None:
                     path = self._folder / "videos" / self._camera / f"{file}.mp4"
@@ -181,9 +180,10 @@ class DatasetWriter:
 
     def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
         row: dict[str, Any] = {
-            f"{TACTILE_FEATURE}.{name}": values for name, values in _values(result).items()
+            f"{TACTILE_FEATURE}.{name}": values for name, values in numbers(result).items()
         }
         row |= self._marker_rows(result)
+        row[WINDOW_ROWS] = self._window.take(result.t)
         if index % STATISTICS_STEP_FRAMES == 0:
             self._colors.add(image.reshape(-1, 3)[:, ::-1] / 255.0)
             self._sampled += 1
@@ -195,8 +195,8 @@ class DatasetWriter:
     def _marker_rows(self, result: Result) -> dict[str, NDArray[Any]]:
         """The features of the markers; empty before the first frame with markers."""
         if result.markers is not None:
-            return _marker_features(result.sensor, self._order.align(result.markers))
-        return {} if self._order.origin is None else _marker_features(result.sensor, self._order.lost())
+            return marker_features(result.sensor, self._order.align(result.markers), result)
+        return {} if self._order.origin is None else marker_features(result.sensor, self._order.lost())
 
     def _complete(self, rows: list[dict[str, Any]]) -> None:
         """Complete the features of every row of an episode, and add their values to the statistics.
@@ -207,25 +207,39 @@ class DatasetWriter:
         """
         sensor = self._camera.removeprefix(PICTURE_PREFIX)
         if self._order.origin is not None:
-            lost = _marker_features(sensor, self._order.lost())
+            lost = marker_features(sensor, self._order.lost())
             rows[:] = [lost | row for row in rows]
+        self._complete_windows(rows, f"{TACTILE_FEATURE}.{sensor}.window")
         values = [
             {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE_FEATURE)}
             for row in rows
         ]
         if not self._features:
-            self._features = {name: _feature(name, value) for name, value in values[0].items()}
+            calibrated = f"{TACTILE_FEATURE}.contact_mm" in values[0]
+            self._features = {
+                name: description(name, value, calibrated=calibrated) for name, value in values[0].items()
+            }
         if values[0].keys() != self._features.keys():
             raise StageError("it has markers, and the recordings before have none: make two datasets")
         for name in self._features:
             self._moments.setdefault(name, Moments()).add(np.stack([arrays[name] for arrays in values]))
+
+    def _complete_windows(self, rows: list[dict[str, Any]], name: str) -> None:
+        """Give the windows one length, that of the longest in the first episode; one of a row is left out."""
+        windows = [row.pop(WINDOW_ROWS) for row in rows]
+        if not self._features:
+            self._window_length = max(map(len, windows))
+        if self._window_length > 1:
+            columns = len(windows[0][0])
+            for row, window in zip(rows, windows, strict=True):
+                row[name] = padded_window(window, self._window_length, columns)
 
     def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
         import pyarrow as pa
 
         types: dict[str, Any] = {}
         for name, feature in self._features.items():
-            value = getattr(pa, feature["dtype"])()
+            value = pa.bool_() if feature["dtype"] == "bool" else getattr(pa, feature["dtype"])()
             length, *columns = feature["shape"]
             types[name] = pa.list_(pa.list_(value)) if columns else pa.list_(value, length)
         if not self._is_video:
@@ -302,56 +316,6 @@ class DatasetWriter:
         statistics[self._camera] = {key: value.reshape(3, 1, 1).tolist() for key, value in colors.items()}
         statistics[self._camera]["count"] = [self._sampled]
         return statistics
-
-
-def _values(result: Result) -> dict[str, list[float]]:
-    """The numbers of each feature of a frame; all 0 if unknown."""
-    return {
-        name: [1.0, *map(float, numbers)] if numbers else [0.0] * len(NAMES[name])
-        for name, numbers in _numbers(result).items()
-    }
-
-
-def _marker_features(sensor: str, markers: AlignedMarkers) -> dict[str, NDArray[Any]]:
-    """The features of N markers."""
-    prefix = f"{TACTILE_FEATURE}.{sensor}"
-    return {f"{prefix}.marker_offset": markers.offset, f"{prefix}.marker_status": markers.status}
-
-
-def _feature(name: str, value: NDArray[Any]) -> dict[str, Any]:
-    """The description of a feature, from its values in a frame."""
-    dtype = "float32" if value.dtype.kind == "f" else value.dtype.name
-    ending = name.removeprefix(f"{TACTILE_FEATURE}.")
-    if ending in NAMES:
-        return {"dtype": dtype, "shape": [len(value)], "names": NAMES[ending]}
-    is_offset = ending.endswith(".marker_offset")
-    components = ["dx_px", "dy_px"] if is_offset else ["0 tracked, 1 inferred, 2 lost"]
-    return {"dtype": dtype, "shape": list(value.shape), "names": {"components": components}}
-
-
-def _numbers(result: Result) -> dict[str, Sequence[float] | None]:
-    """The numbers of each feature of a frame without the first one; None if unknown."""
-    contact, depth, force, scale = result.contact, result.depth, result.force, result.scale
-    mean = None if result.flow is None else result.flow.mean
-    found: dict[str, Sequence[float] | None] = dict.fromkeys(NAMES if scale else ("contact", "flow"))
-    found["flow"] = mean
-    if contact is not None:
-        found["contact"] = [*contact.center, contact.area, math.radians(contact.angle or 0.0)]
-    if scale is None:
-        return found
-    if contact is not None:
-        found["contact_mm"] = [*scale.point(contact.center), scale.area(contact.area)]
-    if mean is not None:
-        found["flow_mm"] = scale.vector(mean)
-    if depth is not None:
-        found["depth"] = [depth.greatest, depth.volume]
-    if force is not None:
-        x, y, z = force.value
-        found["force"] = [z, force.in_range]
-        found["drag"] = None if x is None or y is None else [x, y]
-    if result.pose is not None and result.pose.status == "tracked":
-        found["pose"] = [*result.pose.translation, *result.pose.rotation]
-    return found
 
 
 def _open_video(

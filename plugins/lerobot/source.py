@@ -1,4 +1,4 @@
-"""The pictures of one camera of a LeRobot dataset (layout v3), as a source."""
+"""The pictures of one camera of a LeRobot dataset (layouts v2 and v3), as a source."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from tactflow.sources.video import decode, refuse_playlist
 
 SCHEME = "lerobot:"
 SETTINGS = {"camera": "key of a camera", "episode": "number of an episode (all if not given)"}
+EPISODES_PER_FOLDER = 1000
+"""Episodes per folder of layout v2, if the dataset does not say: LeRobot's default."""
 
 
 class Episode(NamedTuple):
@@ -38,7 +40,7 @@ class Episode(NamedTuple):
 
 
 class LeRobotEpisodes(FrameReader):
-    """The pictures of one camera; frame i is taken at i / fps.
+    """The pictures of one camera of a dataset of layout v2.0, v2.1 or v3.0; frame i is taken at i / fps.
 
     Each episode is an epoch with a reference of its own.
 
@@ -136,9 +138,36 @@ def _choose(spec: str, info: Any, settings: dict[str, str]) -> tuple[str, int | 
 
 
 def _find(root: Path, info: Any, camera: str, number: int | None) -> list[Episode]:
-    """The requested episode, or all of them in order."""
-    if str(info["codebase_version"]).startswith("v2"):
-        raise SourceError(f"{root}: has layout v2; LeRobot's convert_dataset_v21_to_v30 makes it layout v3")
+    """The requested episode, or all of them in order. Raises SourceError if the metadata lack them."""
+    version = str(info["codebase_version"])
+    if not version.startswith(("v2.", "v3.")):
+        raise SourceError(f"{root}: has layout {version}; required v2.0, v2.1 or v3.0")
+    if version.startswith("v2."):
+        episodes = _find_v2(root, camera, number, int(info.get("chunks_size", EPISODES_PER_FOLDER)))
+    else:
+        episodes = _find_v3(root, camera, number)
+    if not episodes:
+        raise SourceError(f"{root}: meta/episodes does not hold {'an' if number is None else 'this'} episode")
+    return sorted(episodes)
+
+
+def _find_v2(root: Path, camera: str, number: int | None, per_folder: int) -> list[Episode]:
+    """The requested episodes of layout v2, in which each has files of its own, so many in a folder."""
+    episodes = []
+    with (root / "meta" / "episodes.jsonl").open(encoding="utf-8") as lines:
+        for line in filter(str.strip, lines):
+            described = json.loads(line)
+            index = int(described["episode_index"])
+            if number in (None, index):
+                folder, name = f"chunk-{index // per_folder:03d}", f"episode_{index:06d}"
+                table = root / "data" / folder / f"{name}.parquet"
+                video = root / "videos" / folder / camera / f"{name}.mp4"
+                episodes.append(Episode(index, int(described["length"]), table, video, 0.0))
+    return episodes
+
+
+def _find_v3(root: Path, camera: str, number: int | None) -> list[Episode]:
+    """The requested episodes of layout v3, in which several share a file."""
     import pyarrow.dataset as ds
 
     table = ds.dataset(root / "meta" / "episodes", format="parquet")
@@ -146,8 +175,6 @@ def _find(root: Path, info: Any, camera: str, number: int | None) -> list[Episod
     columns = [name for name in table.schema.names if name.startswith((f"{video}/", "data/"))]
     wanted = None if number is None else ds.field("episode_index") == number
     rows = table.to_table(columns=["episode_index", "length", *columns], filter=wanted).to_pylist()
-    if not rows:
-        raise SourceError(f"{root}: meta/episodes does not hold {'an' if number is None else 'this'} episode")
 
     def file(row: Any, key: str, suffix: str) -> Path:
         chunk, part = int(row.get(f"{key}/chunk_index", 0)), int(row.get(f"{key}/file_index", 0))
@@ -161,5 +188,5 @@ def _find(root: Path, info: Any, camera: str, number: int | None) -> list[Episod
             file(row, video, ".mp4"),
             float(row.get(f"{video}/from_timestamp", 0.0)),
         )
-        for row in sorted(rows, key=lambda row: int(row["episode_index"]))
+        for row in rows
     ]

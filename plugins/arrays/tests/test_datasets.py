@@ -322,18 +322,20 @@ def write_film(path: Path, images: NDArray[np.uint8]) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def write_lerobot(root: Path, images: NDArray[np.uint8], dtype: str) -> Path:
+def write_lerobot(root: Path, images: NDArray[np.uint8], dtype: str, version: str = "v3.0") -> Path:
     """Two episodes of two and three frames at 25 Hz, by the documents of the layout."""
     pa = pytest.importorskip("pyarrow", reason="the extra lerobot is not installed")
     import pyarrow.parquet as pq
 
     features = {KEY: {"dtype": dtype, "shape": [48, 64, 3]}, "action": {"dtype": "float32", "shape": [1]}}
-    info = {"codebase_version": "v3.0", "fps": 25, "total_episodes": 2, "features": features}
+    info = {"codebase_version": version, "fps": 25, "total_episodes": 2, "features": features}
     rows: list[dict[str, Any]] = [{"episode_index": int(index >= 2)} for index in range(5)]
     episodes = [{"episode_index": 0, "length": 2}, {"episode_index": 1, "length": 3}]
     if dtype == "image":
         for row, image in zip(rows, images, strict=True):
             row[KEY] = {"bytes": cv2.imencode(".png", image)[1].tobytes()}
+    if version.startswith("v2"):
+        return write_lerobot_v2(root, info, rows, images if dtype == "video" else None)
     for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
         (root / folder).mkdir(parents=True)
     (root / "meta" / "info.json").write_text(json.dumps(info))
@@ -349,11 +351,32 @@ def write_lerobot(root: Path, images: NDArray[np.uint8], dtype: str) -> Path:
     return root
 
 
+def write_lerobot_v2(
+    root: Path, info: dict[str, Any], rows: list[dict[str, Any]], film: NDArray[np.uint8] | None
+) -> Path:
+    """The same in layout v2, with files of its own for each episode, here in folders of one."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps(info | {"chunks_size": 1}))
+    lengths = [{"episode_index": index, "tasks": ["press"], "length": 2 + index} for index in range(2)]
+    (root / "meta" / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lengths))
+    for index, part in enumerate((slice(0, 2), slice(2, 5))):
+        folder, name = f"chunk-{index:03d}", f"episode_{index:06d}"
+        (root / "data" / folder).mkdir(parents=True)
+        pq.write_table(pa.Table.from_pylist(rows[part]), root / "data" / folder / f"{name}.parquet")
+        if film is not None:
+            write_film(root / "videos" / folder / KEY / f"{name}.mp4", film[part])
+    return root
+
+
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
 @pytest.mark.parametrize("dtype", ["video", "image"])
-def test_an_episode_of_a_lerobot_dataset_is_played(dtype: str, tmp_path: Path) -> None:
+def test_an_episode_of_a_lerobot_dataset_is_played(dtype: str, version: str, tmp_path: Path) -> None:
     levels = np.array([20, 60, 100, 140, 180], np.uint8)
     images = np.broadcast_to(levels[:, None, None, None], (5, 48, 64, 3)).copy()
-    root = write_lerobot(tmp_path / "press", images, dtype)
+    root = write_lerobot(tmp_path / "press", images, dtype, version)
     for episode, expected in ((0, [20, 60]), (1, [100, 140, 180])):
         found = played(f"lerobot:{root}?camera={KEY}&episode={episode}")
         # A video comes near the grey levels, which are 40 apart.
@@ -374,3 +397,18 @@ def test_an_episode_of_a_lerobot_dataset_is_played(dtype: str, tmp_path: Path) -
     if dtype == "video":
         with pytest.raises(SourceError, match="a list of other files"):
             open_source(f"lerobot:{root}?camera={KEY}&episode=0")
+
+
+def test_a_lerobot_dataset_of_an_unknown_layout_or_without_the_episode_is_refused(tmp_path: Path) -> None:
+    images = np.zeros((5, 48, 64, 3), np.uint8)
+    root = write_lerobot(tmp_path / "v1", images, "image", "v1.6")
+    with pytest.raises(SourceError, match=r"has layout v1.6; required v2.0, v2.1 or v3.0"):
+        open_source(str(root))
+    root = write_lerobot(tmp_path / "v2", images, "image", "v2.1")
+    episodes = root / "meta" / "episodes.jsonl"
+    episodes.write_text(episodes.read_text().partition("\n")[0])
+    with pytest.raises(SourceError, match="meta/episodes does not hold this episode"):
+        open_source(f"{root}?episode=1")
+    episodes.write_text("{")
+    with pytest.raises(SourceError, match="this LeRobot dataset"):
+        open_source(str(root))

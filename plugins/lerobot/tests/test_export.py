@@ -9,6 +9,7 @@ from contextlib import redirect_stderr
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ import tactflow
 from plugins.lerobot.tests.lerobot_env import needs_datasets, run_with_lerobot
 from tactflow.cli.main import main
 from tactflow.engine.errors import StageError
-from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.frame import Absent, Frame, Tick
 from tactflow.message.episodes import MarkerOrder
 from tactflow.message.result import Result
 from tactflow.plugins.lerobot.export import DatasetWriter
@@ -175,11 +176,14 @@ def test_a_dataset_holds_the_markers_that_were_found(with_markers: Path) -> None
     assert np.array_equal(table[f"{MAIN}.marker_status"], status)
 
 
-def frames_of(*markers: Markers | None) -> list[Result]:
+def frames_of(*markers: Markers | None, scale: Scale | None = None, depth: Any = None) -> list[Result]:
     """A result for each, ten a second, of 64 x 48 pixels."""
     image = np.zeros((48, 64, 3), np.uint8)
     return [
-        result_of(Tick(Frame("main", index, index / 10, image)), Results(image, markers=found))
+        result_of(
+            Tick(Frame("main", index, index / 10, image)),
+            Results(image, markers=found, scale=scale, depth=depth),
+        )
         for index, found in enumerate(markers)
     ]
 
@@ -217,6 +221,70 @@ def test_a_recording_with_markers_after_one_without_is_refused(tmp_path: Path) -
         writer.add(frames_of(moved((0.0, 0.0))))
 
 
+def test_points_are_in_millimetres_and_what_is_unknown_is_masked(tmp_path: Path) -> None:
+    heights = np.zeros((48, 64), np.float32)
+    heights[:, :20] = 0.5
+    scale, depth = Scale(0.1, 0.2, (0.001, 0.001), (31.5, 23.5)), Depth(heights, 0.5, None, 1.0, None)
+    status = np.array([0, 0, 1, 0, 0, 2], np.uint8)
+    markers = replace(moved((2.0, -1.0)), status=status)
+    writer = DatasetWriter(tmp_path, 10, "press")
+    for found in (depth, None, Absent("no_contact")):
+        writer.add(frames_of(markers, scale=scale, depth=found))
+    writer.finish()
+    table = pq.read_table(tmp_path / "data").to_pydict()
+    pressed, without_depth, untouched = points = np.array(table[f"{MAIN}.points"])
+    assert np.allclose(pressed[:5, :3], [[0.2, -0.2, -0.5 * (x < 20)] for x, _ in ORIGIN[:5]])
+    assert np.isnan(without_depth[:, 2]).all()
+    assert np.allclose(untouched[:5, :3], [0.2, -0.2, 0.0])
+    # The forces on single markers, and all of the lost one.
+    assert np.isnan(points[:, :, 3:]).all()
+    assert np.isnan(points[:, 5]).all()
+    assert np.array_equal(np.isfinite(points), table[f"{MAIN}.points_mask"])
+    info = json.loads((tmp_path / "meta" / "info.json").read_text())["features"]
+    components = {"components": ["dx_mm", "dy_mm", "dz_mm", "Fx_N", "Fy_N", "Fz_N"]}
+    assert info[f"{MAIN}.points"] == {"dtype": "float32", "shape": [6, 6], "names": components}
+    assert info[f"{MAIN}.points_mask"]["dtype"] == "bool"
+    mean = json.loads((tmp_path / "meta" / "stats.json").read_text())[f"{MAIN}.points"]["mean"]
+    assert np.allclose(mean[0], [0.2, -0.2, -0.25, 0, 0, 0])
+
+
+def test_points_of_an_uncalibrated_sensor_are_in_pixels(tmp_path: Path) -> None:
+    writer = DatasetWriter(tmp_path, 10, "press")
+    writer.add(frames_of(moved((2.0, -1.0)), depth=Absent("no_contact")))
+    writer.finish()
+    points = np.array(pq.read_table(tmp_path / "data").to_pydict()[f"{MAIN}.points"])[0]
+    assert np.array_equal(points[:, :2], [[2.0, -1.0]] * 6)
+    assert np.isnan(points[:, 2:]).all()
+    info = json.loads((tmp_path / "meta" / "info.json").read_text())["features"]
+    assert info[f"{MAIN}.points"]["names"]["components"][:2] == ["dx_px", "dy_px"]
+
+
+def test_a_window_holds_all_results_since_the_frame_before(tmp_path: Path) -> None:
+    writer = DatasetWriter(tmp_path, 5, "press")
+    results = frames_of(*[moved((0.0, 0.0))] * 6)
+    results[1] = Result(results[1].frame, dict(results[1]) | dict(touched(None)))
+    del results[3]
+    writer.add(results)
+    writer.add(frames_of(moved((0.0, 0.0))))
+    writer.finish()
+    windows = np.array(pq.read_table(tmp_path / "data").to_pydict()[f"{MAIN}.window"])
+    # Frames at 0, 0.2 and 0.4 s, of which that at 0.3 s is missing, and at 0 s of the second episode.
+    assert windows.shape == (4, 2, 10)
+    assert windows[:, :, 0].tolist() == [[0, 1], [1, 1], [0, 1], [0, 1]]
+    assert np.allclose(windows[:, :, 1], [[0, 0], [-0.1, 0], [0, 0], [0, 0]])
+    assert np.allclose(windows[1, 0, 2:], [1, 41.5, 28.5, 400, np.pi / 2, 1, 2, -1])
+    assert not windows[1, 1, 2:].any()
+    info = json.loads((tmp_path / "meta" / "info.json").read_text())["features"]
+    components = info[f"{MAIN}.window"]["names"]["components"]
+    assert components[:4] == ["known", "t_s", "contact.touching", "contact.x"]
+    assert len(components) == 10
+
+
+def test_a_dataset_at_the_rate_of_the_recording_needs_no_window(with_markers: Path) -> None:
+    info = json.loads((with_markers / "meta" / "info.json").read_text())
+    assert not [name for name in info["features"] if name.endswith(".window")]
+
+
 OPENED = """
 import sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -239,6 +307,42 @@ try:
 except OSError as error:
     print(error.strerror)
 """
+
+
+LOADED = """
+import sys
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+dataset = LeRobotDataset("tactflow/press", root=sys.argv[1])
+items = [dataset[index] for index in range(len(dataset))]
+np.savez(sys.argv[2], **{name: np.stack([np.asarray(item[name]) for item in items])
+    for name in items[0] if name.startswith("observation.")})
+"""
+
+
+@needs_datasets
+def test_lerobot_loads_every_number_and_picture_to_the_bit(tmp_path: Path) -> None:
+    out, loaded_path = tmp_path / "press", tmp_path / "loaded.npz"
+    results = list(tactflow.stream(source="sim:press?frames=59", settings={"sinks": {}}, images=True))
+    writer = DatasetWriter(out, 30, "press", video=False)
+    writer.add(results)
+    writer.finish()
+    run_with_lerobot(LOADED, str(out), str(loaded_path))
+    loaded = dict(np.load(loaded_path))
+    table = pq.read_table(out / "data").to_pydict()
+    features = json.loads((out / "meta" / "info.json").read_text())["features"]
+    assert features[f"{MAIN}.window"]["shape"] == [2, 10]
+    for name in features:
+        if name.startswith("observation.tactile."):
+            stored = np.array(table[name], features[name]["dtype"])
+            assert np.array_equal(loaded[name], stored, equal_nan=stored.dtype.kind == "f"), name
+    pictures = np.stack([result.image for result in results[::2] if result.image is not None])[..., ::-1]
+    assert np.array_equal(np.rint(loaded[KEY] * 255).astype(np.uint8), pictures.transpose(0, 3, 1, 2))
+    found = [result.markers.displacement for result in results[::2] if result.markers is not None]
+    offsets = np.stack(found).astype(np.float32)
+    assert np.array_equal(loaded[f"{MAIN}.points"][..., :2], offsets)
+    mask = [True, True, False, False, False, False]
+    assert np.array_equal(loaded[f"{MAIN}.points_mask"], np.broadcast_to(mask, (30, 80, 6)))
 
 
 @needs_datasets

@@ -45,10 +45,12 @@ class AlignedMarkers:
 
     Attributes
     ----------
-    offset : (N, 2) float64, displacements since the reference frame of this recording, px.
+    origin : (N, 2) float64, positions in the reference frame of this recording, px.
+    offset : (N, 2) float64, displacements since then, px.
     status : (N,) uint8, values of `MarkerStatus`. All are finite.
     """
 
+    origin: NDArray[np.float64]
     offset: NDArray[np.float64]
     status: NDArray[np.uint8]
 
@@ -82,7 +84,8 @@ class MarkerOrder:
     def align(self, markers: Markers) -> AlignedMarkers:
         """The markers in the order of the first recording.
 
-        A marker that this recording misses gets the displacement of its nearest neighbour, and is lost.
+        A marker that this recording misses keeps its position in the first one, gets the displacement of its
+        nearest neighbour, and is lost.
 
         Raises
         ------
@@ -93,13 +96,14 @@ class MarkerOrder:
         if self._aligned_origin is None or not np.array_equal(self._aligned_origin, markers.origin):
             self._match(self.origin, markers.origin)
         status = np.where(self._is_missing, MarkerStatus.LOST, markers.status[self._nearest])
-        return AlignedMarkers(markers.displacement[self._nearest], status.astype(np.uint8))
+        origin = np.where(self._is_missing[:, None], self.origin, markers.origin[self._nearest])
+        return AlignedMarkers(origin, markers.displacement[self._nearest], status.astype(np.uint8))
 
     def lost(self) -> AlignedMarkers:
         """All markers, unmoved and lost, for a frame without markers. Only after `align`."""
         assert self.origin is not None
         count = len(self.origin)
-        return AlignedMarkers(np.zeros((count, 2)), np.full(count, MarkerStatus.LOST, np.uint8))
+        return AlignedMarkers(self.origin, np.zeros((count, 2)), np.full(count, MarkerStatus.LOST, np.uint8))
 
     def _match(self, first: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
         distance, nearest = (
