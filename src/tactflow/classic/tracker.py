@@ -133,6 +133,8 @@ class Matcher:
 class GridTracker:
     """The original tracker, on a grid found in the reference frame instead of typed in.
 
+    Parameters
+    ----------
     reference : (H, W, 3) uint8, BGR.
 
     Raises

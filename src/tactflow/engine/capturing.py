@@ -20,11 +20,18 @@ from tactflow.engine.stats import NodeStats
 class Capturing:
     """Takes frames from the source, and starts a tick for each with the sinks that want it.
 
-    node : of the source. slots : of the outputs of all nodes. max_frames : stop after so many; None: never.
+    Parameters
+    ----------
+    node : of the source.
+    slots : of the outputs of all nodes.
+    max_frames : stop after so many; None: never.
 
     Attributes
     ----------
-    slot : of the frames. frames : number so far. stats : of the source. paused : see `pause`.
+    slot : of the frames.
+    frames : number so far.
+    stats : of the source.
+    paused : see `pause`.
     """
 
     def __init__(self, node: Node, slots: Slots, ending: Ending, max_frames: int | None) -> None:

@@ -15,13 +15,17 @@ logger = logging.getLogger("tactflow")
 class Ending:
     """The end of a run. All methods are thread-safe and return immediately.
 
+    Parameters
+    ----------
     on_stop : called after each request to stop, to wake what waits.
 
     Attributes
     ----------
-    stopping : set once the run is to stop, or the source has ended. reason : as `end` in the statistics file;
-    None before. error : the first error, or None. hurried : whether the run was stopped before the end of its
-    source, so that it no longer waits for slow readers.
+    stopping : set once the run is to stop, or the source has ended.
+    reason : as `end` in the statistics file; None before.
+    error : the first error, or None.
+    hurried : whether the run was stopped before the end of its source, so that it no longer waits for slow
+        readers.
     """
 
     def __init__(self, on_stop: Callable[[], None]) -> None:

@@ -57,18 +57,22 @@ class TickState:
 class RunningNode:
     """A stage or sink at run time, used by the thread of its segment.
 
-    skipping : whether gates may close and results be reused. check : whether to check values against their
-    port types.
+    Parameters
+    ----------
+    skipping : whether gates may close and results be reused.
+    check : whether to check values against their port types.
 
     Attributes
     ----------
     instance : of the class; `sink` or `stage` is the same object, the other is None.
-    slots : of its outputs. gates : each with the slot of its signal.
-    signals : boolean output port -> (slot, counts of true values). presences : the same for outputs that may
-    be absent, counting the present values.
+    slots : of its outputs.
+    gates : each with the slot of its signal.
+    signals : boolean output port -> (slot, counts of true values).
+    presences : the same for outputs that may be absent, counting the present values.
     makers, signal_makers : nodes of the same segment that produce its inputs and the signals of its gates.
-    pulled : index of the last tick in which it was evaluated. disabled : whether it failed and is not called
-    any more. last : the outputs of its last run, for repeating gates and repeated inputs.
+    pulled : index of the last tick in which it was evaluated.
+    disabled : whether it failed and is not called any more.
+    last : the outputs of its last run, for repeating gates and repeated inputs.
     """
 
     def __init__(self, node: Node, instance: Part, slots: Slots, *, skipping: bool, check: bool) -> None:

@@ -20,12 +20,17 @@ from tactflow.engine.once import Once
 class Parts:
     """The open parts of a run.
 
-    control : handed to parts that ask for it. offered : further arguments of constructors, by name. check :
-    as in `Runner`.
+    Parameters
+    ----------
+    control : handed to parts that ask for it.
+    offered : further arguments of constructors, by name.
+    check : as in `Runner`.
 
     Attributes
     ----------
-    source : once it is open. nodes : id -> open stage or sink. slots : of the outputs of all nodes.
+    source : once it is open.
+    nodes : id -> open stage or sink.
+    slots : of the outputs of all nodes.
     """
 
     def __init__(

@@ -49,13 +49,18 @@ class Progress:
 class Runner:
     """One run of a pipeline. Its interface for sinks is documented in `tactflow.engine.control.Control`.
 
-    pipeline : validated. max_frames : stop after this number of captured frames. check : check values against
-    their port types, and pass read-only inputs. offered : further arguments that constructors of parts may
-    take by name.
+    Parameters
+    ----------
+    pipeline : validated.
+    max_frames : stop after this number of captured frames.
+    check : check values against their port types, and pass read-only inputs.
+    offered : further arguments that constructors of parts may take by name.
 
     Attributes
     ----------
-    plan : of the segments. nodes : id -> open stage or sink. source : once it is open.
+    plan : of the segments.
+    nodes : id -> open stage or sink.
+    source : once it is open.
 
     Raises
     ------

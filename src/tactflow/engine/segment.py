@@ -76,15 +76,24 @@ class NewReferences:
 class Segment:
     """Evaluates the nodes of one segment for a tick.
 
-    name : in the plan. nodes : all open ones of the run. ending : of the run. latency : of its data sinks.
+    Parameters
+    ----------
+    name : in the plan.
+    nodes : all open ones of the run.
+    ending : of the run.
+    latency : of its data sinks.
     retake : asks the source for a new reference.
 
     Attributes
     ----------
-    inputs, outputs : links; an output with the ids of the sinks that it leads to, or None if it also leads to
-    stages. nodes : in order of evaluation. current : id of the running node. calls : number of calls of nodes
-    so far. epoch : of the last tick; a new one resets all nodes. references : turns frames into references on
-    request of its stages; None if other stages may have processed those frames already.
+    inputs, outputs : links; an output with the ids of the sinks that it leads to, or None if it also leads
+        to stages.
+    nodes : in order of evaluation.
+    current : id of the running node.
+    calls : number of calls of nodes so far.
+    epoch : of the last tick; a new one resets all nodes.
+    references : turns frames into references on request of its stages; None if other stages may have
+        processed those frames already.
     """
 
     def __init__(

@@ -26,7 +26,8 @@ class Threads:
 
     Attributes
     ----------
-    links : of the plan. latency : from capture to the end of each segment with sinks.
+    links : of the plan.
+    latency : from capture to the end of each segment with sinks.
     """
 
     def __init__(self, ending: Ending, retake: Callable[[], None]) -> None:

@@ -42,10 +42,16 @@ class LineStream:
     In a live run, the oldest of more than `MAX_QUEUED_LINES` lines are dropped; otherwise it waits for the
     reader.
 
+    Parameters
+    ----------
     path : a named pipe or device, whose reader the constructor waits for; "-" is standard output.
-    control : the run, which is live or not, and may be stopped; or None. header : the first line of a table.
-    delivered, dropped : number of lines. ended : whether the reader has left or never came; an error only
-    for a pipe that it has left.
+    control : the run, which is live or not, and may be stopped; or None.
+    header : the first line of a table.
+
+    Attributes
+    ----------
+    delivered, dropped : number of lines.
+    ended : whether the reader has left or never came; an error only for a pipe that it has left.
 
     Raises
     ------
@@ -149,9 +155,16 @@ class LineStream:
 class LineFile:
     """Writes complete lines to a regular file, and detects interference by other programs.
 
-    path : the file. replaces, continues : whether it may exist; lines are appended after its last complete
-    line. every : longest time that lines are buffered, s. header : first line of a table, without its line
-    end; None for a file of result messages. delivered : number of lines, without the header.
+    Parameters
+    ----------
+    path : the file.
+    replaces, continues : whether it may exist; lines are appended after its last complete line.
+    every : longest time that lines are buffered, s.
+    header : first line of a table, without its line end; None for a file of result messages.
+
+    Attributes
+    ----------
+    delivered : number of lines, without the header.
 
     Raises
     ------

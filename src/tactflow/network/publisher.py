@@ -48,10 +48,18 @@ _HINT = (
 class BoundSocket:
     """A bound socket and, if keys are required, its authenticator.
 
-    kind : ZeroMQ's type of the socket. hint : advice if the address is in use. options : ZeroMQ's option ->
-    value. keys : the publisher's folder made by `tactflow keys new`: only clients with a key in it are
-    admitted, and everything is encrypted. None admits every client that can reach the address.
-    socket : to be used by one thread at a time. endpoint : the bound address, with the actual port.
+    Parameters
+    ----------
+    kind : ZeroMQ's type of the socket.
+    hint : advice if the address is in use.
+    options : ZeroMQ's option -> value.
+    keys : the publisher's folder made by `tactflow keys new`: only clients with a key in it are admitted,
+        and everything is encrypted. None admits every client that can reach the address.
+    endpoint : the bound address, with the actual port.
+
+    Attributes
+    ----------
+    socket : to be used by one thread at a time.
 
     Raises
     ------

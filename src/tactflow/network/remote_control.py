@@ -28,7 +28,8 @@ class RemoteControl(Connection):
 
     Parameters
     ----------
-    endpoint : address for commands of the run. timeout : longest wait for a reply, s.
+    endpoint : address for commands of the run.
+    timeout : longest wait for a reply, s.
     keys : the subscriber's folder made by `tactflow keys new`, if the run requires keys.
 
     Raises

@@ -47,7 +47,11 @@ MAX_HANG_UPS = 5
 class Connection:
     """A socket connected to a `BoundSocket`, which detects rejection; a context manager.
 
-    kind : ZeroMQ's type of the socket. endpoint : address to connect to. options : ZeroMQ's option -> value.
+    Parameters
+    ----------
+    kind : ZeroMQ's type of the socket.
+    endpoint : address to connect to.
+    options : ZeroMQ's option -> value.
     keys : the subscriber's folder made by `tactflow keys new`; None if the run requires no keys.
 
     Raises

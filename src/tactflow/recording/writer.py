@@ -44,9 +44,18 @@ class Entry:
 class RecordingWriter:
     """Writes a recording. After each `write`, all data has been passed to the operating system.
 
-    path : the file; its folder is created. sensor : names the channels. overwrite : replace an existing file.
-    facts : name -> text, for the metadata. files : name -> content, to be attached.
-    frames, bytes : written so far. begins : log time of the first frame, ns.
+    Parameters
+    ----------
+    path : the file; its folder is created.
+    sensor : names the channels.
+    overwrite : replace an existing file.
+    facts : name -> text, for the metadata.
+    files : name -> content, to be attached.
+
+    Attributes
+    ----------
+    frames, bytes : written so far.
+    begins : log time of the first frame, ns.
 
     Raises
     ------

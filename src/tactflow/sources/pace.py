@@ -24,7 +24,10 @@ logger = logging.getLogger("tactflow")
 class Pace:
     """Waits until frames are due, relative to the first one, so that delays do not accumulate.
 
-    stop : ends waiting immediately. clock : for time and waiting.
+    Parameters
+    ----------
+    stop : ends waiting immediately.
+    clock : for time and waiting.
 
     Examples
     --------

@@ -44,9 +44,12 @@ _MODULE: Final = _compiled()
 class Kernel(Generic[P, R]):
     """A loop. Calls run `compiled`.
 
-    Attributes
+    Parameters
     ----------
     plain : the Python function.
+
+    Attributes
+    ----------
     compiled : its namesake in C; `plain` where there is none.
     """
 

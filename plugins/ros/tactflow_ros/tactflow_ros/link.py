@@ -76,8 +76,12 @@ def send_command(endpoint: str, command: str, keys: str, seconds: float) -> tupl
 class Link:
     """A thread that receives messages until it is closed.
 
-    endpoint, sensor : of tactflow. keys : folder, or "". on_message : called in the thread with the kind of
-    message (`tactflow`, `tactflow_picture`, `tactflow_depth` or `stats`), its JSON, and the bytes after it.
+    Parameters
+    ----------
+    endpoint, sensor : of tactflow.
+    keys : folder, or "".
+    on_message : called in the thread with the kind of message (`tactflow`, `tactflow_picture`,
+        `tactflow_depth` or `stats`), its JSON, and the bytes after it.
 
     Raises
     ------
@@ -85,7 +89,8 @@ class Link:
 
     Attributes
     ----------
-    refused : why tactflow rejected the connection, or None. damaged : number of unreadable messages.
+    refused : why tactflow rejected the connection, or None.
+    damaged : number of unreadable messages.
     """
 
     def __init__(

@@ -77,7 +77,9 @@ class Rendered:
 
     Parameters
     ----------
-    case : which scene. folder : where the file goes. size : (width, height) of the frames, px.
+    case : which scene.
+    folder : where the file goes.
+    size : (width, height) of the frames, px.
     """
 
     def __init__(self, case: Case, folder: Path, size: tuple[int, int] = SIZE) -> None:

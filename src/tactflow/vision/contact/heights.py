@@ -70,6 +70,8 @@ class Heights(NamedTuple):
 class HeightModel:
     """Learns how the light of a sensor responds to slopes, and integrates them.
 
+    Attributes
+    ----------
     alike : whether all channels have changed alike so far, as in a gray camera.
 
     Examples

@@ -103,7 +103,10 @@ class MarkerGraph:
 class Interpolator:
     """Interpolates marks from their neighbours.
 
-    origin : (N, 2) float64, marks in the reference, px. pitch : px.
+    Parameters
+    ----------
+    origin : (N, 2) float64, marks in the reference, px.
+    pitch : px.
 
     Examples
     --------

@@ -30,10 +30,15 @@ class MotionEvidence:
     their scatter; that of one that stays is distributed about zero with the same scatter. Frames are
     correlated, so only the strongest evidence of all frames counts.
 
-    origin : (N, 2) float64, marks in the reference, px. pitch : px.
+    Parameters
+    ----------
+    origin : (N, 2) float64, marks in the reference, px.
+    pitch : px.
     prior : (N,) float64, probability of being a mark by its appearance, 0 to 1.
     against : (N,) float64, log likelihood ratio of staying over moving so far, 0 or more.
 
+    Attributes
+    ----------
     left : (n,) int64, marks that do not move with the gel.
 
     References

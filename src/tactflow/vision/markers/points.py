@@ -38,9 +38,11 @@ class FlowTracker:
 
     Parameters
     ----------
-    reference : (H, W) uint8, grey levels. origin : (N, 2) float64, points in it, px.
+    reference : (H, W) uint8, grey levels.
+    origin : (N, 2) float64, points in it, px.
     radius : of the marks, px, > 0; surroundings are twice as wide.
-    flow : the optical flow. max_error : px, > 0; larger values accept more, and more that is wrong.
+    flow : the optical flow.
+    max_error : px, > 0; larger values accept more, and more that is wrong.
 
     References
     ----------
