@@ -1,6 +1,6 @@
 """What skipping saves on real recordings, and whether it changes a result.
 
-    python lab/skipping.py [--data ../shared/data] [--plot docs/skipping.png] [NAME ...]
+    python lab/skipping.py [--data ../shared/data] [NAME ...]
 
 Every recording runs with skipping and without, a few frames each in turn, on one core. A frame at rest is one
 without a contact in the run that skips nothing; `far` are those more than 8 frames away from any contact.
@@ -143,49 +143,23 @@ class Tally:
         )
 
 
-def plot(pairs: Pairs, path: Path) -> None:
-    """Plot the cost of each frame of a recording, and the events in it."""
-    from matplotlib import pyplot
-
-    pairs = [pair for pair in pairs if not pair[1].frame.reference]
-    seconds = [fresh.t for _, fresh in pairs]
-    drawing, (cost, happens) = pyplot.subplots(2, figsize=(8, 4.5), sharex=True, layout="constrained")
-    for place, label in ((1, "skipping: false"), (0, "skipping: true")):
-        cost.step(seconds, [1e3 * pair[place].cpu_s for pair in pairs], where="mid", label=label)
-    cost.set(ylabel="CPU of a frame, ms", ylim=(0, None))
-    dots = [fresh.markers for _, fresh in pairs]
-    shift = [np.nan if d is None else np.abs(d.position - d.origin).max() for d in dots]
-    if not np.isnan(shift).all():
-        happens.plot(seconds, shift, label="largest shift of a dot, px")
-    area = [fresh.contact.area / 1000 if fresh.contact else 0 for _, fresh in pairs]
-    happens.plot(seconds, area, label="area of the contact, 1000 px²")
-    happens.set(xlabel="s")
-    for axis in (cost, happens):
-        axis.legend()
-    drawing.savefig(path, dpi=100)
-
-
 def main() -> int:
     """Run and print."""
     parser = argparse.ArgumentParser(description="What skipping saves on real recordings.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="only paths that hold one of these")
     root = Path(__file__).resolve().parents[2]
     parser.add_argument("--data", type=Path, default=root / "shared" / "data")
-    parser.add_argument("--plot", type=Path, help="picture of the last recording")
     args = parser.parse_args()
     logging.getLogger("tactflow").setLevel(logging.ERROR)
     rows, bad = [(*HEADS, "decisions differ", "late", "off")], 0
     for name, pipeline, pattern in SENSORS:
-        tally, pairs = Tally(), []
+        tally = Tally()
         for source in sorted(args.data.glob(pattern)):
             if not args.names or any(part in str(source) for part in args.names):
-                pairs = run_both(pipeline, str(source))
-                tally.add(pairs)
+                tally.add(run_both(pipeline, str(source)))
         if tally.counts["rest"] >= MIN_REST_FRAMES:
             rows.append(tally.row(name))
             bad += tally.counts["late"] + tally.counts["off"]
-        if args.plot is not None and pairs:
-            plot(pairs, args.plot)
     show(table(rows))
     return int(bad > 0)
 

@@ -1,8 +1,9 @@
 """Build the site: `make docs`, or `python packaging/lock.py install docs; python docs/site/build.py OUT`.
 
 The pages are README.md, docs/*.md, CONTRIBUTING.md and CHANGELOG.md as they are. Here they are copied into
-one folder, with links to where the site has them, pages for the public names and for the gallery are added,
-and Sphinx makes the site. Its warnings, such as that of a broken link, are errors.
+one folder, with links to where the site has them. Pages for the public names and for the gallery are added,
+and those that quick runs of `tactflow bench` and `tactflow stress` write. Then Sphinx makes the site. Its
+warnings, such as that of a broken link, are errors.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import Final
@@ -27,6 +29,8 @@ BESIDE_THE_GUIDE: Final = {"guide", "index", "changes", "accuracy", "peers"}
 """Pages that have their own place in the navigation, not within the guide."""
 LINKED: Final = ("examples", "pipelines", "plugins")
 """Folders with files that pages link to."""
+MEASURED: Final = {"bench": "accuracy.md", "stress": "stability.md"}
+"""Command that writes a page of plots -> page of the site that links to it."""
 ROOT: Final = """
 ```{toctree}
 :hidden:
@@ -61,6 +65,21 @@ def stage(source: Path) -> None:
     (source / "api.md").write_text(reference(), encoding="utf-8")
     shutil.copyfile(HERE / "conf.py", source / "conf.py")
     shutil.copytree(HERE / "static", source / "static")
+
+
+def measure(source: Path) -> None:
+    """Write the pages of plots, by quick runs, and link to them."""
+    folder = source / "measured"
+    folder.mkdir()
+    for command, page in MEASURED.items():
+        outputs = ["--page", str(folder / f"{command}.html"), "--json", str(source / f"{command}.json")]
+        words = [sys.executable, "-m", "tactflow", command, "--quick", *outputs]
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+        link = (
+            f'<a href="{command}.html">The page of `tactflow {command} --quick`</a>, written with this site.'
+        )
+        with (source / page).open("a", encoding="utf-8") as text:
+            text.write(f"\n{link}\n")
 
 
 def site_name(path: str) -> str:
@@ -117,6 +136,7 @@ def main() -> int:
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     stage(work)
+    measure(work)
     return build_main(["--fail-on-warning", "--quiet", "-d", f"{work}/.doctrees", str(work), str(out)])
 
 

@@ -43,6 +43,7 @@ sphinx_gallery_conf = {
 html_theme = "pydata_sphinx_theme"
 html_title = "tactflow"
 html_static_path = ["static"]
+html_extra_path = ["measured"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False

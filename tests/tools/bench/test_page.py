@@ -11,12 +11,12 @@ import pytest
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline
 from tactflow.sim import open_scene
-from tactflow.tools.bench.costs import ENGINE, measure_costs
+from tactflow.tools.bench.costs import ENGINE, Costs, Step, measure_costs
 from tactflow.tools.bench.growth import Growth
 from tactflow.tools.bench.latency import percentiles
-from tactflow.tools.bench.page import bench_page, front, points
+from tactflow.tools.bench.page import bench_page, front, points, save_pictures
 from tactflow.tools.bench.quantities import QUANTITIES
-from tactflow.tools.bench.results import BenchResult
+from tactflow.tools.bench.results import UNSKIPPED, BenchResult
 
 
 def measured() -> BenchResult:
@@ -65,6 +65,32 @@ def test_the_page_names_every_method_and_marks_the_classic_script() -> None:
         assert words in page
     assert page.count("data:image/jpeg") == 2
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page) == []
+
+
+def test_pictures_are_written_of_what_was_measured(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    result = BenchResult(quick=True)
+    assert save_pictures(result, tmp_path) == []
+    # Names that would cover each other.
+    for name, ms in (("default", 1.0), ("lucas_kanade", 1.1), ("nearest_dots", 1.2), ("classic", 9.0)):
+        for group, errors in (("tracker", {"displacement_rms": 0.1}), ("difference", {"contact_iou": 0.9})):
+            result.add(group, name, "press", errors, times={"contact": [ms / 1e3]}, frames=1)
+    steps = [Step(t, "contact", 1.0 + t, {}, 100.0, 2.0) for t in (0.0, 0.1)]
+    result.grasp = ("press", {"default": Costs(steps), f"default{UNSKIPPED}": Costs(steps)})
+    assert [path.name for path in save_pictures(result, tmp_path)] == ["front.png", "skipping.png"]
+    for name in ("front.png", "skipping.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_pipeline_that_fails_on_a_recording_leaves_the_costs_of_the_others(tmp_path: Path) -> None:
+    scene = open_scene("press?frames=24&markers=none")
+    np.save(tmp_path / "bare.npy", np.stack([scene.frame(n) for n in range(24)]))
+    pipelines = {name: load_pipeline(find_pipeline(name)) for name in ("default", "markerless")}
+    failures: dict[str, str] = {}
+    costs = measure_costs(pipelines, tmp_path / "bare.npy", failures)
+    assert list(costs) == ["markerless"]
+    assert costs["markerless"].steps
+    assert "0 markers found" in failures["default"]
 
 
 @pytest.mark.parametrize("power", [0.0, 1.0, 2.0])

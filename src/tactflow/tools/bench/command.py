@@ -8,8 +8,9 @@ from pathlib import Path
 from tactflow.cli.options import refuse_output, writing
 from tactflow.config.shipped import find_pipeline
 from tactflow.engine.errors import ConfigError
+from tactflow.system.extras import missing
 from tactflow.system.terminal import notes, progress_bar, say, show
-from tactflow.tools.bench.page import bench_page
+from tactflow.tools.bench.page import bench_page, save_pictures
 from tactflow.tools.bench.results import CLASSIC, load_errors, regressions
 from tactflow.tools.bench.run import DEFAULT, MARKERLESS, run_bench
 from tactflow.tools.bench.tables import lines
@@ -49,6 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the page with plots here (default: bench.html)",
     )
     add(
+        "--pictures",
+        type=Path,
+        metavar="FOLDER",
+        help="write the pictures of the documentation there: front.png, skipping.png",
+    )
+    add(
         "--recording",
         type=Path,
         metavar="FILE",
@@ -67,6 +74,8 @@ def run(args: argparse.Namespace) -> int:
     stored = None if args.against is None else load_errors(args.against, quick=args.quick)
     refuse_output("--json", args.json, overwrite=True)
     refuse_output("--page", args.page, overwrite=True)
+    if args.pictures is not None and (remedy := missing("pictures", "plot", ["matplotlib"])):
+        raise ConfigError(f"--pictures: {remedy}")
     if args.recording is not None and not args.recording.exists():
         raise ConfigError(f"--recording {args.recording}: there is no such file")
     scenes = frozenset(args.scene) if args.scene else None
@@ -88,6 +97,11 @@ def run(args: argparse.Namespace) -> int:
         args.page.parent.mkdir(parents=True, exist_ok=True)
         args.page.write_text(bench_page(result, own), encoding="utf-8")
     say(f"tactflow: wrote {args.json} and {args.page}")
+    if args.pictures is not None:
+        with writing(args.pictures):
+            args.pictures.mkdir(parents=True, exist_ok=True)
+            for path in save_pictures(result, args.pictures):
+                say(f"tactflow: wrote {path}")
     if stored is None:
         return 0
     worse = regressions(result, stored, scenes)

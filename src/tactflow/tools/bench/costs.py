@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactflow.engine.errors import TactflowError
 from tactflow.engine.graph import Node, Pipeline
 from tactflow.tools.bench.lockstep import LockstepPipeline, TimedResult, on_recording
 from tactflow.tools.bench.timing import quiet
@@ -104,20 +105,37 @@ def _timed(node: Node, spent: dict[str, float]) -> Node:
     return replace(node, component=replace(component, make=make))
 
 
-def measure_costs(pipelines: Mapping[str, Pipeline], recording: Path | str) -> dict[str, Costs]:
-    """Run pipelines over a recording in turns of a few frames. Returns name -> its frames."""
+def measure_costs(
+    pipelines: Mapping[str, Pipeline], recording: Path | str, failures: dict[str, str] | None = None
+) -> dict[str, Costs]:
+    """Run pipelines over a recording in turns of a few frames. Returns name -> its frames.
+
+    failures : gets name -> why it failed, of those that did; None: what fails raises TactflowError.
+    """
     costs = {name: Costs() for name in pipelines}
-    with quiet():
-        running = {n: _Costed(on_recording(p, Path(recording))) for n, p in pipelines.items()}
-        touched = dict.fromkeys(pipelines, False)
-        for name, pipeline in running.items():
-            with closing(pipeline):
-                while results := pipeline.block():
-                    for result, stage_ms in zip(results, pipeline.stage_ms, strict=True):
-                        if not result.frame.reference:
-                            costs[name].steps.append(_step(result, stage_ms, touched[name]))
-                        touched[name] = result.contact is not None
-                    pipeline.stage_ms.clear()
+    touched = dict.fromkeys(pipelines, False)
+    with quiet(), ExitStack() as stack:
+        running = {
+            name: stack.enter_context(closing(_Costed(on_recording(pipeline, Path(recording)))))
+            for name, pipeline in pipelines.items()
+        }
+        while running:
+            for name, pipeline in list(running.items()):
+                try:
+                    results = pipeline.block()
+                except TactflowError as error:
+                    if failures is None:
+                        raise
+                    failures[name], results = str(error), []
+                    del costs[name]
+                # A pipeline that failed may have timed a frame without a result.
+                for result, stage_ms in zip(results, pipeline.stage_ms, strict=False):
+                    if not result.frame.reference:
+                        costs[name].steps.append(_step(result, stage_ms, touched[name]))
+                    touched[name] = result.contact is not None
+                pipeline.stage_ms.clear()
+                if not results:
+                    del running[name]
     return costs
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
 from itertools import accumulate
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from tactflow.tools.bench.depth import DEPTH
 from tactflow.tools.bench.growth import Growth
 from tactflow.tools.bench.latency import percentiles
 from tactflow.tools.bench.quantities import QUANTITIES, Quantity
-from tactflow.tools.bench.results import CLASSIC, PIPELINE, TRUTH, BenchResult, Measurement
+from tactflow.tools.bench.results import CLASSIC, PIPELINE, TRUTH, UNSKIPPED, BenchResult, Measurement
 from tactflow.tools.bench.tables import TITLES, number
 from tactflow.tools.page import (
     HEIGHT,
@@ -30,6 +31,7 @@ from tactflow.tools.page import (
     multiples,
     page,
     plot,
+    save_plot,
     series,
     table,
 )
@@ -60,6 +62,17 @@ FRONTS: Final = (
     ("flow_in_mask", "flow_error"),
 )
 """Group and quantity of each plot of time against error."""
+PICTURE: Final = (
+    ("tracker", "displacement_rms", "Dots: displacement error, RMS, px"),
+    ("difference", "contact_iou", "Contact: 1 - overlap with the true one"),
+)
+"""Group, quantity and title of the panels of `front.png`."""
+OURS: Final = "tactflow"
+"""Name in `front.png` of what the default pipeline does."""
+_DECADES: Final = 30
+"""Range of an axis, highest over lowest value, from which powers of ten are marks enough."""
+_NAME_OFFSETS: Final = ((5, 3), (5, -3), (-5, 3), (-5, -3), (0, 14), (0, -14))
+"""Where a name may stand beside its point, points to the right and up; the first for want of a free one."""
 _MIN_PLOTTED_ERROR: Final = 1e-3
 """Smallest error on a logarithmic axis: an error of 0 is drawn here."""
 _LEAD: Final = (
@@ -99,7 +112,9 @@ def points(measured: Sequence[Measurement], quantity: Quantity) -> list[Point]:
         own = [m for m in measured if m.method == method and m.time_ms and quantity.key in m.values]
         if own:
             times = np.quantile([m.time_ms or 0.0 for m in own], [0.25, 0.5, 0.75])
-            errors = np.quantile([quantity.distance(m.values[quantity.key]) for m in own], [0.25, 0.5, 0.75])
+            errors = np.quantile(
+                [quantity.distance(m.values[quantity.key]) for m in own], [0.25, 0.5, 0.75]
+            ).round(9)
             found.append(Point(method, tuple(times.tolist()), tuple(errors.tolist())))
     return found
 
@@ -140,20 +155,62 @@ def draw_front(axes: Axes, found: Sequence[Point], quantity: Quantity, own: Sequ
 
 def draw_points(axes: Axes, found: Sequence[Point], own: Sequence[str] = ()) -> None:
     """Draw the methods, their front, and their names; the classic script and `own` ones are marked."""
+    from matplotlib.ticker import LogLocator
+
+    times = [ms for point in found for ms in point.ms]
+    errors = [max(error, _MIN_PLOTTED_ERROR) for point in found for error in point.error]
+    axes.set(xscale="log", yscale="log", xlabel="CPU time of a frame, ms")
+    axes.set(xlim=_around(times), ylim=_around(errors))
     for point in found:
-        marked = point.name in (CLASSIC, *own)
-        tint = colour("bad") if point.name == CLASSIC else series(0) if not marked else colour("good")
         low, middle, high = (max(error, _MIN_PLOTTED_ERROR) for error in point.error)
         across = [[point.ms[1] - point.ms[0]], [point.ms[2] - point.ms[1]]]
         along = [[middle - low], [high - middle]]
-        shape, place = "s" if marked else "o", (point.ms[1], middle)
+        shape, tint = "s" if point.name in (CLASSIC, *own) else "o", _tint(point.name, own)
+        place = point.ms[1], middle
         axes.errorbar(*place, yerr=along, xerr=across, fmt=shape, color=tint, elinewidth=0.8, markersize=5)
-        axes.annotate(point.name, place, (4, 3), textcoords="offset points", fontsize=7.5, color=tint)
     best = front(found)
     steps = [max(point.error[1], _MIN_PLOTTED_ERROR) for point in best]
     axes.plot([p.ms[1] for p in best], steps, color=colour("quiet"), linewidth=0.8, zorder=0)
-    axes.set(xscale="log", yscale="log", xlabel="CPU time of a frame, ms")
-    axes.margins(x=0.25, y=0.15)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0,) if high > _DECADES * low else (1.0, 2.0, 5.0)))
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+        axis.set_minor_formatter("")
+    _write_names(axes, found, own)
+
+
+def _around(values: Sequence[float]) -> tuple[float, float]:
+    """Limits of a logarithmic axis with room for names."""
+    low, high = min(values), max(values)
+    factor = max(1.5, (high / low) ** 0.2)
+    return low / factor, high * factor
+
+
+def _tint(name: str, own: Sequence[str]) -> str:
+    return colour("bad") if name == CLASSIC else colour("good") if name in own else series(0)
+
+
+def _write_names(axes: Axes, found: Sequence[Point], own: Sequence[str]) -> None:
+    """Write the names beside their points, where they cover neither a point nor each other."""
+    from matplotlib.transforms import Bbox
+
+    axes.figure.draw_without_rendering()  # type: ignore[union-attr]
+    places = [(point.ms[1], max(point.error[1], _MIN_PLOTTED_ERROR)) for point in found]
+    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in axes.transData.transform(places)]
+    for point, place in zip(found, places, strict=True):
+        style = {"textcoords": "offset points", "fontsize": 8, "color": _tint(point.name, own)}
+        for x, y in _NAME_OFFSETS:
+            sideways = "left" if x > 0 else "right" if x < 0 else "center"
+            upright = "bottom" if y > 0 else "top"
+            name = axes.annotate(point.name, place, (x, y), ha=sideways, va=upright, **style)
+            name.set_in_layout(False)
+            box = name.get_window_extent()
+            if axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 and not box.count_overlaps(taken):
+                break
+            name.remove()
+        else:
+            axes.annotate(point.name, place, _NAME_OFFSETS[0], **style)
+        taken.append(box)
 
 
 def _costs(result: BenchResult) -> list[Html]:
@@ -199,17 +256,58 @@ def _grasp(result: BenchResult) -> Iterator[Section]:
 def draw_grasp(figure: Figure, costs: dict[str, Costs]) -> None:
     """Draw the cost of each frame of a recording, and the events in it."""
     cost, happens = figure.subplots(2, sharex=True)
-    for index, run in enumerate(costs.values()):
+    for index, (name, run) in enumerate(costs.items()):
         steps = run.steps
         times = [step.t for step in steps]
-        cost.step(times, [step.cpu_ms for step in steps], where="mid", color=series(index), linewidth=1)
+        spent = [step.cpu_ms for step in steps]
+        cost.step(times, spent, where="mid", color=series(index), linewidth=1, label=name)
     steps = next(iter(costs.values())).steps
     times = [step.t for step in steps]
     happens.plot(times, [step.area / 1000 for step in steps], label="area, 1000 px²", color=series(2))
     happens.plot(times, [step.shift for step in steps], label="largest shift of a dot, px", color=series(3))
     cost.set(ylabel="CPU of a frame, ms", yscale="log")
+    cost.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     happens.set(xlabel="time, s")
     happens.legend(loc="upper right")
+
+
+def _as_ours(point: Point) -> Point:
+    """The way of the default pipeline under the name that readers of the front page know."""
+    return point._replace(name=OURS) if point.name == "default" else point
+
+
+def save_pictures(result: BenchResult, folder: Path) -> list[Path]:
+    """Write the pictures of the documentation that a run has the numbers for; returns their paths.
+
+    front.png : time against error of dots and contacts. skipping.png : cost of each frame with and without
+    skipping.
+    """
+    written = []
+    stages = [
+        (group, [_as_ours(point) for point in points(result.measurements(group), QUANTITIES[name])])
+        for group, name, _ in PICTURE
+    ]
+    if all(len(found) > 1 for _, found in stages):
+
+        def draw(figure: Figure) -> None:
+            for axes, (_, found), (_, _, title) in zip(figure.subplots(1, 2), stages, PICTURE, strict=True):
+                draw_points(axes, found, [OURS])
+                axes.set_title(title)
+
+        written.append(folder / "front.png")
+        save_plot(written[-1], draw, width=800, height=320)
+    if result.grasp is not None:
+        costs = result.grasp[1]
+        pair = [name for name in costs if name.endswith(UNSKIPPED)]
+        pair += [name.removesuffix(UNSKIPPED) for name in pair]
+
+        def draw_pair(figure: Figure) -> None:
+            draw_grasp(figure, {name: costs[name] for name in pair if name in costs})
+            figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+
+        written.append(folder / "skipping.png")
+        save_plot(written[-1], draw_pair, width=800, height=440)
+    return written
 
 
 def _growth(result: BenchResult) -> Iterator[Section]:

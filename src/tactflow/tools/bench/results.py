@@ -23,6 +23,8 @@ TRUTH = "truth"
 """What the pictures of a scene show beside the pipelines."""
 CLASSIC = "classic"
 """Name of the pipeline that is the yardstick: the original script."""
+UNSKIPPED = ", nothing skipped"
+"""What stands behind the name of a pipeline that works on every frame in full."""
 TIMES = {"contact": "contact_ms", "idle": "idle_ms"}
 """Kind of frame -> quantity that is its median CPU time, ms."""
 LEFT_OUT = "frames_left_out"

@@ -27,7 +27,7 @@ from tactflow.tools.bench.lockstep import TimedResult, on_recording, take_turns
 from tactflow.tools.bench.methods import measure_methods
 from tactflow.tools.bench.pictures import deepest_frame, found_picture, true_picture
 from tactflow.tools.bench.quantities import Tally
-from tactflow.tools.bench.results import CLASSIC, PIPELINE, TRUTH, BenchResult
+from tactflow.tools.bench.results import CLASSIC, PIPELINE, TRUTH, UNSKIPPED, BenchResult
 from tactflow.tools.bench.scenes import (
     FULL,
     FULL_STAGES,
@@ -185,8 +185,12 @@ def _further_steps(
             with rendered(case, folder) as scene:
                 scene.path.rename(source)
         suited = {name: p for name, p in loaded.items() if not _is_for_one_camera(p)}
-        measured = measure_costs(suited, source)
-        result.costs = {name: cost.by_stage() for name, cost in measured.items()}
+        own = next((name for name in reversed(suited) if name not in (CLASSIC, MARKERLESS)), DEFAULT)
+        suited[f"{own}{UNSKIPPED}"] = replace(loaded[own], skipping=False)
+        failures: dict[str, str] = {}
+        measured = measure_costs(suited, source, failures)
+        result.failures |= {f"{PIPELINE}/{name}/{source.name}": why for name, why in failures.items()}
+        result.costs = {name: cost.by_stage() for name, cost in measured.items() if name in loaded}
         result.grasp = (recording.name if recording else "a simulated press", measured)
 
     def growth() -> None:
