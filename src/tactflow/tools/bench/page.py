@@ -8,7 +8,7 @@ from functools import partial
 from html import escape
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -198,7 +198,11 @@ def _write_names(axes: Axes, found: Sequence[Point], own: Sequence[str]) -> None
     places = [(point.ms[1], max(point.error[1], _MIN_PLOTTED_ERROR)) for point in found]
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in axes.transData.transform(places)]
     for point, place in zip(found, places, strict=True):
-        style = {"textcoords": "offset points", "fontsize": 8, "color": _tint(point.name, own)}
+        style: dict[str, Any] = {
+            "textcoords": "offset points",
+            "fontsize": 8,
+            "color": _tint(point.name, own),
+        }
         for x, y in _NAME_OFFSETS:
             sideways = "left" if x > 0 else "right" if x < 0 else "center"
             upright = "bottom" if y > 0 else "top"

@@ -40,6 +40,11 @@ def lines(tuned: Tuned) -> Iterator[str]:
     yield from markdown("Time and error", "\n\n".join(facts), columns, rows)
 
 
+def _reaching(limits: tuple[float, float], budget: float) -> tuple[float, float]:
+    """Limits of a logarithmic axis that show a budget, too."""
+    return min(limits[0], budget / 1.2), max(limits[1], budget * 1.2)
+
+
 def front_page(tuned: Tuned, goal: Goal) -> str:
     """A page: each candidate's time against its largest error, their front, the budgets, and the choice."""
     usable = [trial for trial in tuned.trials if trial.usable and math.isfinite(trial.ms)]
@@ -51,8 +56,10 @@ def front_page(tuned: Tuned, goal: Goal) -> str:
         axes.set_title("largest error, px of the camera image")
         if goal.max_ms is not None:
             axes.axvline(goal.max_ms, color=colour("warn"), linewidth=1)
+            axes.set_xlim(_reaching(axes.get_xlim(), goal.max_ms))
         if goal.max_error is not None:
             axes.axhline(goal.max_error, color=colour("warn"), linewidth=1)
+            axes.set_ylim(_reaching(axes.get_ylim(), goal.max_error))
 
     rows = []
     for trial in tuned.trials:
