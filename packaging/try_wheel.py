@@ -48,7 +48,6 @@ def run(command: list[str] | str, folder: Path, programs: Path | None = None) ->
     """
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
     # Nothing that an earlier run has compiled.
-    environment["NUMBA_CACHE_DIR"] = str(folder / "compiled")
     if programs is not None:
         environment["PATH"] = f"{programs}{os.pathsep}{environment['PATH']}"
     subprocess.run(

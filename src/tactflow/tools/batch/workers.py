@@ -25,9 +25,7 @@ CONNECT_SECONDS = 10.0
 TASKS_PER_THREAD = 2
 """Tasks per thread of a Dask worker: the current one and the next, so that it never idles."""
 SCHEDULER_GONE = "lost the Dask scheduler; run again when it is back: finished recordings are kept"
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment of a worker: with a worker per processor, each library gets one thread."""
 
 
