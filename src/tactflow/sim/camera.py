@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Points
 from tactflow.vision.geometry.mapping import find_homography, project
-
-Points = NDArray[np.float64]
 
 SIZE = (800, 600)
 """Width and height of every scene's frames, px."""

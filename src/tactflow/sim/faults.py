@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.sim.settings import Settings
+from tactflow.vision.arrays import ColorImage
 
-Picture = NDArray[np.uint8]
 _EMPTY_COLOURS = {"black": (0, 0, 0), "green": (0, 135, 0)}
 """Blue, green and red of an empty RGB buffer and of an empty YUV buffer."""
 _OVEREXPOSURE_GAIN = 2.0
@@ -19,7 +18,7 @@ _DISPLACEMENT_PX = 8
 """Distance by which rows are displaced, px: four pixel pairs of YUYV."""
 
 
-def delivered(index: int, settings: Settings, render: Callable[[int], Picture]) -> Picture:
+def delivered(index: int, settings: Settings, render: Callable[[int], ColorImage]) -> ColorImage:
     """Frame `index` as the camera delivers it. render : draws a frame, (H, W, 3) uint8, which is new."""
     if index < settings.late and settings.first != "gel":
         return _first(index, settings, render)
@@ -29,7 +28,7 @@ def delivered(index: int, settings: Settings, render: Callable[[int], Picture]) 
     return picture
 
 
-def _first(index: int, settings: Settings, render: Callable[[int], Picture]) -> Picture:
+def _first(index: int, settings: Settings, render: Callable[[int], ColorImage]) -> ColorImage:
     if settings.first in _EMPTY_COLOURS:
         picture = render(0)
         picture[:] = _EMPTY_COLOURS[settings.first]
@@ -45,7 +44,7 @@ def _first(index: int, settings: Settings, render: Callable[[int], Picture]) -> 
     return picture
 
 
-def _damage(picture: Picture, number: int, seed: int) -> None:
+def _damage(picture: ColorImage, number: int, seed: int) -> None:
     """Damage the lower half of a picture, in place: gray, noise and displaced rows in turns."""
     lower = picture[len(picture) // 2 :]
     if number % 3 == 0:

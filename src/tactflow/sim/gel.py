@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.sim.shapes import Array, Shape
+from tactflow.sim.shapes import Shape
+from tactflow.vision.arrays import Floats32
 
 SINK_IN_RATIO = 0.3
 """Depth of the surface where it leaves the indenter, relative to full depth. Chosen by hand, between a thin
@@ -103,7 +104,7 @@ class Press:
         return self.depth > TOUCH_DEPTH_PX
 
 
-def reached(press: Press, x: Array, y: Array) -> Array:
+def reached(press: Press, x: Floats32, y: Floats32) -> Floats32:
     """Depth of the indenter below the untouched surface at (x, y), px; negative above it."""
     cos, sin = np.float32(np.cos(press.angle)), np.float32(np.sin(press.angle))
     dx, dy = x - np.float32(press.x), y - np.float32(press.y)
@@ -111,7 +112,7 @@ def reached(press: Press, x: Array, y: Array) -> Array:
     return np.asarray(np.float32(press.depth) - gap, dtype=np.float32)
 
 
-def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_]:
+def in_contact(presses: Sequence[Press], x: Floats32, y: Floats32) -> NDArray[np.bool_]:
     """Whether an indenter lies below the untouched surface at gel coordinates x, y (float32, px)."""
     mask = np.zeros(x.shape, dtype=np.bool_)
     for press in presses:
@@ -120,7 +121,7 @@ def in_contact(presses: Sequence[Press], x: Array, y: Array) -> NDArray[np.bool_
     return mask
 
 
-def surface(press: Press, depth: Array) -> Array:
+def surface(press: Press, depth: Floats32) -> Floats32:
     """Depth of the gel's surface, px >= 0, from the result of `reached`."""
     sink = np.float32(press.sink * press.depth)
     outside = sink * np.exp(np.float32(press.rim) * (np.minimum(depth, sink) / sink - np.float32(1.0)))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tactflow.sim.camera import CENTER, HALF_DIAGONAL
 from tactflow.sim.gel import Press
-from tactflow.sim.shapes import Array
+from tactflow.vision.arrays import Floats32
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ LIGHTS = {
 }  # fmt: skip
 
 
-def untouched_gel(light: Light, x: Array, y: Array, dim: float = 1.0) -> NDArray[np.float32]:
+def untouched_gel(light: Light, x: Floats32, y: Floats32, dim: float = 1.0) -> NDArray[np.float32]:
     """Grey levels (H, W, 3) float32, BGR, of the gel at rest, at gel coordinates x, y (H, W), px."""
     angle = np.radians(np.asarray(light.azimuth))
     image = np.empty((*x.shape, 3), np.float32)
@@ -97,7 +97,7 @@ def _grain(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
     return grain[..., None]
 
 
-def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
+def shading(light: Light, depth: Floats32, step: float) -> NDArray[np.float32]:
     """(h, w, 3) float32: shading of a deformed surface relative to rest, >= 0.
 
     depth : (h, w) float32, depth of the surface, px, sampled every `step` px.
@@ -120,7 +120,7 @@ def shading(light: Light, depth: Array, step: float) -> NDArray[np.float32]:
     return np.asarray(cv2.merge(channels), dtype=np.float32)
 
 
-def brightness(light: Light, press: Press, depth: Array) -> Array:
+def brightness(light: Light, press: Press, depth: Floats32) -> Floats32:
     """Grey levels (h, w) that a contact adds to all channels. depth : (h, w), px, from `reached`."""
     share = press.depth / press.shape.depth
     grown, set_in = 0.45 + 0.55 * share, min(1.0, share / 0.1)
@@ -145,7 +145,7 @@ def lamp(size: tuple[int, int], strength: float) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.broadcast_to(row, (size[1], size[0], 3)), dtype=np.float32)
 
 
-def spot(size: tuple[int, int], center: tuple[float, float], spread: tuple[float, float]) -> Array:
+def spot(size: tuple[int, int], center: tuple[float, float], spread: tuple[float, float]) -> Floats32:
     """(H, W) float32: a Gaussian, 1 at `center` (x, y), with standard deviations `spread` (x, y), px."""
     across, down = (
         np.exp(-0.5 * ((np.arange(length) - middle) / deviation) ** 2).astype(np.float32)

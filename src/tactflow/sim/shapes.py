@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+from tactflow.vision.arrays import Floats32
 
 _FIXED_POINT_ITERATIONS = 4
 """Fixed-point steps to the surface of a rotated shape: to 0.01 px."""
@@ -37,7 +37,7 @@ class Shape:
     tilted : makes the shape after a rotation (3, 3) about that point; None: see `tilt_surface`.
     """
 
-    gap: Callable[[Array, Array], Array]
+    gap: Callable[[Floats32, Floats32], Floats32]
     reach: float
     depth: float
     sources: NDArray[np.float64]
@@ -78,13 +78,13 @@ def _segment(half_length: float, count: int) -> NDArray[np.float64]:
 def sphere(radius: float = 95.0, depth: float = 26.0) -> Shape:
     """A ball of `radius` px, approximated by a paraboloid as in Hertz's theory."""
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         return np.asarray((x * x + y * y) * np.float32(0.5 / radius), dtype=np.float32)
 
     return _rotation_invariant(gap, radius, depth)
 
 
-def _rotation_invariant(gap: Callable[[Array, Array], Array], radius: float, depth: float) -> Shape:
+def _rotation_invariant(gap: Callable[[Floats32, Floats32], Floats32], radius: float, depth: float) -> Shape:
     contact = float(np.sqrt(radius * depth))
     plain = Shape(gap, 3.8 * contact, depth, np.zeros((1, 2)), 1.2 * contact, radius)
     return replace(plain, tilted=lambda _: plain)
@@ -93,7 +93,7 @@ def _rotation_invariant(gap: Callable[[Array, Array], Array], radius: float, dep
 def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
     """A ball of `radius` px with its exact shape, for calibration."""
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         squared = np.minimum(x * x + y * y, np.float32((0.99 * radius) ** 2))
         round_part = np.float32(radius) - np.sqrt(np.float32(radius**2) - squared)
         return np.asarray(round_part + np.hypot(x, y) - np.sqrt(squared), dtype=np.float32)
@@ -108,7 +108,7 @@ def bumpy_ball(radius: float = 95.0, depth: float = 26.0, relief: float = 2.5) -
     def rolled(rotation: NDArray[np.float64]) -> Shape:
         axes = rotation.astype(np.float32)
 
-        def gap(x: Array, y: Array) -> Array:
+        def gap(x: Floats32, y: Floats32) -> Floats32:
             squared = x * x + y * y
             below = np.float32(radius) - smooth.gap(x, y)
             inside = squared < np.float32((0.9 * radius) ** 2)
@@ -129,7 +129,7 @@ def tilt_surface(shape: Shape, rotation: NDArray[np.float64]) -> Shape:
     turn = rotation.astype(np.float32)
     center = np.float32(shape.center)
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         # Where the point of the untilted surface lies that is now above (x, y); z points out of the gel.
         from_x, from_y = x, y
         for _ in range(_FIXED_POINT_ITERATIONS):
@@ -147,7 +147,7 @@ def tilt_surface(shape: Shape, rotation: NDArray[np.float64]) -> Shape:
 def cable(radius: float = 62.0, half_length: float = 520.0, depth: float = 17.0) -> Shape:
     """A cylinder of `radius` px along x with rounded ends."""
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         beyond = np.maximum(np.abs(x) - np.float32(half_length), 0)
         return np.asarray((beyond * beyond + y * y) * np.float32(0.5 / radius), dtype=np.float32)
 
@@ -163,7 +163,7 @@ def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, l
     # Lowest point of a leaning edge, where the gap is 0.
     lowest, rise = -3.0 * lean / np.sqrt(1.0 - lean**2), 3.0 * np.sqrt(1.0 - lean**2)
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         beyond = np.maximum(np.abs(x) - np.float32(half_length), 0)
         across = y + np.float32(lowest)
         away = np.sqrt(beyond * beyond + across * across + np.float32(9.0)) - np.float32(rise)
@@ -172,7 +172,7 @@ def edge(half_length: float = 170.0, slope: float = 0.55, depth: float = 14.0, l
     return Shape(gap, half_length + 150, depth, _segment(half_length, 12), 45.0)
 
 
-def _flank(outside: Array) -> Array:
+def _flank(outside: Floats32) -> Floats32:
     # A chamfer with a rounded foot avoids a crease in the shading.
     return np.asarray(np.sqrt(outside * outside + np.float32(4.0)) - np.float32(2.0), dtype=np.float32)
 
@@ -182,7 +182,7 @@ def box(
 ) -> Shape:
     """A flat punch with rounded corners."""
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         dx = np.abs(x) - np.float32(half_width - corner)
         dy = np.abs(y) - np.float32(half_height - corner)
         outside = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0)) - np.float32(corner)
@@ -195,7 +195,7 @@ def box(
 def ring(radius: float = 70.0, tube: float = 45.0, depth: float = 12.0) -> Shape:
     """A torus with centre line `radius` and tube radius `tube`, px."""
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         across = np.hypot(x, y) - np.float32(radius)
         return np.asarray(across * across * np.float32(0.5 / tube), dtype=np.float32)
 
@@ -212,7 +212,7 @@ def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Sha
     relief_map = smooth / np.float32(255.0)
     middle_x, middle_y = (np.float32((side - 1) / 2) for side in relief_map.shape[::-1])
 
-    def raised(x: Array, y: Array) -> Array:
+    def raised(x: Floats32, y: Floats32) -> Floats32:
         if not x.size:  # `remap` takes no empty maps: a gel without markers
             return np.empty(x.shape, np.float32)
         map_x = np.ascontiguousarray(x + middle_x).reshape(len(x), -1)
@@ -220,7 +220,7 @@ def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Sha
         values = cv2.remap(relief_map, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(values, dtype=np.float32).reshape(x.shape)
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         from_center = np.hypot(x, y)
         rim = np.exp(-((from_center - np.float32(radius - 10.0)) ** 2) / np.float32(2 * 6.0**2))
         lower = np.float32(relief) * (1 - np.maximum(rim, raised(x, y)))
@@ -234,7 +234,7 @@ def block(half_width: float = 215.0, half_height: float = 135.0, depth: float = 
     """A large flat punch with grooves across it, 5 px deep, that also make contact."""
     plain = box(half_width, half_height, 14.0, depth)
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         groove = np.float32(0.5) - np.float32(0.5) * np.cos(x * np.float32(2 * np.pi / 43.0))
         return np.asarray(plain.gap(x, y) + np.float32(5.0) * groove**4, dtype=np.float32)
 
@@ -251,7 +251,7 @@ def screw(
     """A threaded rod along x, with inclined ridges of amplitude `ridges` px every `thread` px."""
     smooth = cable(radius, half_length, depth)
 
-    def gap(x: Array, y: Array) -> Array:
+    def gap(x: Floats32, y: Floats32) -> Floats32:
         ridge = np.cos((x + np.float32(0.16) * y) * np.float32(2 * np.pi / thread))
         return np.asarray(smooth.gap(x, y) + np.float32(ridges) * (1 - ridge), dtype=np.float32)
 

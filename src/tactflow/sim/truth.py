@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.sim.camera import Camera, Points
+from tactflow.sim.camera import Camera
 from tactflow.sim.gel import MM_PER_PX, Press, displacement, force, in_contact, reached, surface
+from tactflow.vision.arrays import Points
 from tactflow.vision.geometry import PixelMapping
 
 FLOW_POINTS: Final = 1500

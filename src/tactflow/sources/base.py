@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MAX_PIXELS
 from tactflow.system.extras import missing
+from tactflow.vision.arrays import ColorImage
 
 log = logging.getLogger("tactflow")
 
@@ -31,8 +32,6 @@ TWELVE_BIT_LEVELS = 4096
 MIN_SIDE_PX = 2
 """Minimum number of rows and columns, px, because stages halve the picture."""
 
-BgrImage = NDArray[np.uint8]
-
 
 class Arrival(NamedTuple):
     """A frame of a source.
@@ -46,7 +45,7 @@ class Arrival(NamedTuple):
     damaged : as in `Frame`.
     """
 
-    image: BgrImage
+    image: ColorImage
     t: float
     seq: int
     reference: bool = False
@@ -106,7 +105,7 @@ class FrameReader:
         """Yield all pictures, as accepted by `to_bgr`, and their times, s."""
         raise NotImplementedError
 
-    def read(self) -> tuple[BgrImage, float] | None:
+    def read(self) -> tuple[ColorImage, float] | None:
         """The next frame and its time, or None at the end.
 
         Returns
@@ -126,7 +125,7 @@ class FrameReader:
         """Like `read`, with the metadata for `capture`."""
         return next(self._arrivals, None)
 
-    def peek(self) -> tuple[BgrImage, float] | None:
+    def peek(self) -> tuple[ColorImage, float] | None:
         """The next frame, without consuming it; None at the end. Raises as `read`."""
         arrival = self.read_arrival()
         if arrival is None:
@@ -221,7 +220,7 @@ class CaptureReader(FrameReader):
             self._capture = None
 
 
-def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> BgrImage:
+def to_bgr(image: NDArray[Any], name: str, *, note: bool = True) -> ColorImage:
     """Convert a gray, BGR, BGRA or 16-bit picture to (H, W, 3) uint8 BGR.
 
     >>> bgr = to_bgr(np.full((2, 2), 65535, np.uint16), "example")

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import SourceError
 from tactflow.engine.frame import MAX_PIXELS
-from tactflow.sources.base import DEFAULT_FPS, BgrImage, FrameReader, check_array, damaged, to_bgr
+from tactflow.sources.base import DEFAULT_FPS, FrameReader, check_array, damaged, to_bgr
 from tactflow.sources.paths import find_path, locate
 from tactflow.sources.video import open_video
 from tactflow.system.files import expanded
+from tactflow.vision.arrays import ColorImage
 
 IMAGE_SUFFIXES = frozenset(
     [".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"]
@@ -80,7 +81,7 @@ def decode_image(data: bytes, name: str) -> NDArray[Any]:
     return image
 
 
-def load_image(spec: str, directory: Path | None = None) -> BgrImage:
+def load_image(spec: str, directory: Path | None = None) -> ColorImage:
     """Find and decode one image file: (H, W, 3) uint8 BGR. Raises as `find_path` and `read_image` do."""
     path = find_path(spec, directory)
     return to_bgr(read_image(path), str(path))

@@ -10,8 +10,9 @@ from tactflow.engine.errors import SourceError
 from tactflow.recording.frames import RawFrame, decode_pixels, nanoseconds, parse_frame
 from tactflow.recording.reader import look_into, messages
 from tactflow.recording.records import DAMAGE_ERRORS, NotARecordingError
-from tactflow.sources.base import BgrImage, FrameReader, damaged, log
+from tactflow.sources.base import FrameReader, damaged, log
 from tactflow.sources.paths import describe_settings, find_path, split_query
+from tactflow.vision.arrays import ColorImage
 
 SETTINGS = {"start": "SECONDS (from the beginning)"}
 MIN_UNIX_TIME_S = 1e9
@@ -65,7 +66,7 @@ class Recording(FrameReader):
                 self._path,
             )
 
-    def _frames(self) -> Iterator[tuple[BgrImage, float, int, bool, int, bool]]:
+    def _frames(self) -> Iterator[tuple[ColorImage, float, int, bool, int, bool]]:
         """All frames with their metadata."""
         self._picture = str(self._path)
         try:

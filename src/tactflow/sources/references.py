@@ -10,8 +10,9 @@ from typing import Final
 import numpy as np
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import Arrival, BgrImage, FrameReader, log
+from tactflow.sources.base import Arrival, FrameReader, log
 from tactflow.sources.files import ImageFiles
+from tactflow.vision.arrays import ColorImage
 from tactflow.vision.change import DamageTest, Settling, shows_gel
 
 MAX_HELD_BYTES: Final = 128_000_000
@@ -159,7 +160,7 @@ class References:
         self._test: DamageTest | None = None
         self._test_epoch = -1
         self._blank = False
-        self._first: BgrImage | None = None
+        self._first: ColorImage | None = None
         self.left_out = 0
         self.repeated = 0
 
@@ -168,7 +169,7 @@ class References:
         self._requested.set()
 
     def arranged(
-        self, arrivals: Iterator[Arrival], source: FrameReader, image: BgrImage | None
+        self, arrivals: Iterator[Arrival], source: FrameReader, image: ColorImage | None
     ) -> Iterator[Arrival]:
         """Mark the references among the frames of a source, and the damaged ones; for each episode anew.
 
@@ -183,7 +184,7 @@ class References:
             yield from self._arranged(episode, source, image)
 
     def _arranged(
-        self, arrivals: Iterator[Arrival], source: FrameReader, image: BgrImage | None
+        self, arrivals: Iterator[Arrival], source: FrameReader, image: ColorImage | None
     ) -> Iterator[Arrival]:
         """`arranged` for the frames of one episode: of one epoch of the source."""
         if image is not None:
@@ -261,12 +262,12 @@ class References:
             self._learn(image, arrival.epoch)
         return arrival
 
-    def _learn(self, image: BgrImage, epoch: int) -> None:
+    def _learn(self, image: ColorImage, epoch: int) -> None:
         """Look for damage by comparison with this reference."""
         self._test = DamageTest(image) if self._skip_damaged else None
         self._test_epoch = epoch
 
-    def _count_repeated(self, image: BgrImage) -> None:
+    def _count_repeated(self, image: ColorImage) -> None:
         if self._first is None:
             self._first, self.repeated = image, 1
         elif self.repeated and np.array_equal(image, self._first):
@@ -330,7 +331,7 @@ class References:
             return
         log.info("%s: the reference is frame %d%s", self._name, number, why)
 
-    def _shown_before(self, image: BgrImage, first: Arrival) -> Arrival:
+    def _shown_before(self, image: ColorImage, first: Arrival) -> Arrival:
         """A reference delivered before the first frame, whose size it must have."""
         (height, width), (high, wide) = image.shape[:2], first.image.shape[:2]
         if (height, width) != (high, wide):
@@ -344,7 +345,7 @@ class References:
         return Arrival(image, first.t, -1, reference=True, epoch=epoch, paced=False)
 
 
-def _changed_blocks(before: BgrImage, after: BgrImage) -> float:
+def _changed_blocks(before: ColorImage, after: ColorImage) -> float:
     """Share of blocks in which two pictures differ."""
     differs = (before != after).any(axis=2)
     high, wide = (max(1, side // BLOCK_SIDE_PX) for side in differs.shape)

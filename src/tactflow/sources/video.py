@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tactflow.engine.errors import SourceError
 from tactflow.sources.base import (
     DEFAULT_FPS,
-    BgrImage,
     CaptureReader,
     FrameReader,
     check_pixel_count,
@@ -22,6 +21,7 @@ from tactflow.sources.base import (
     log,
 )
 from tactflow.system.extras import missing
+from tactflow.vision.arrays import ColorImage
 
 MAX_FPS = 1e4
 """Maximum rate of a video file, frames per second; larger ones are ignored. Chosen by hand."""
@@ -120,7 +120,7 @@ class PyAvVideo(FrameReader):
         return _timed(((image, stamp, stamp) for image, stamp in pictures), self)
 
 
-def decode(path: Path, name: str, begin: float = 0.0) -> Iterator[tuple[BgrImage, float]]:
+def decode(path: Path, name: str, begin: float = 0.0) -> Iterator[tuple[ColorImage, float]]:
     """Decode a video with PyAV: (H, W, 3) uint8 BGR, and their times in the file, s; 0 if unknown.
 
     begin : time from which on pictures are yielded, s. name : for messages. Raises SourceError for too large

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactflow.engine.errors import SourceError
-from tactflow.sources.base import Arrival, BgrImage, FrameReader, log
+from tactflow.sources.base import Arrival, FrameReader, log
 from tactflow.system.clock import SYSTEM, Clock
+from tactflow.vision.arrays import ColorImage
 
 MAX_BLACK_MEAN_GREY = 4.0
 """Maximum mean gray level of a black picture; a lit gel has 30 and more."""
@@ -121,7 +122,7 @@ class Watched(FrameReader):
         self._fault: _Fault | None = None
         self._arrived_at = self._good_at = self._lit_at = self._changed_at = clock.now()
         self._lit = False
-        self._previous: BgrImage | None = None
+        self._previous: ColorImage | None = None
         self._reader = threading.Thread(
             target=self._work, args=(source,), name=f"tactflow-read-{name}", daemon=True
         )
@@ -201,7 +202,7 @@ class Watched(FrameReader):
         tries = f", at attempt {fault.attempts}" if fault.attempts else ""
         log.warning("%s: is back after %.1f s%s (%s)", self.name, now - fault.since, tries, fault.kind)
 
-    def _picture_problem(self, image: BgrImage, now: float) -> tuple[str, float, bool] | None:
+    def _picture_problem(self, image: ColorImage, now: float) -> tuple[str, float, bool] | None:
         """The fault of a picture, its start (s), and whether it has lasted long enough to be reported.
 
         Black pictures at the start are a fault immediately, because they must not become the reference.
@@ -258,7 +259,7 @@ class Watched(FrameReader):
                 self._fault.detail = "it was opened, but gave no good frame"
         return source
 
-    def _take(self, image: BgrImage, t: float) -> bool:
+    def _take(self, image: ColorImage, t: float) -> bool:
         """Handle a new frame; returns whether to reopen the source."""
         now = self._clock.now()
         with self._changed:

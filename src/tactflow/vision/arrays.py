@@ -13,6 +13,8 @@ Mask = NDArray[np.uint8]
 """(H, W), not 0 inside."""
 Points = NDArray[np.float64]
 """(N, 2), px, x right, y down."""
+Bytes = NDArray[np.uint8]
+"""Of any shape."""
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Indices = NDArray[np.int64]

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
+from tactflow.vision.arrays import Flags
+
 FloatArray = NDArray[np.floating[Any]]
-BoolArray = NDArray[np.bool_]
 
 
 def pixel_area(hull: FloatArray) -> float:
@@ -118,7 +119,7 @@ def detection(points: FloatArray, truth: FloatArray, radius: float) -> tuple[flo
     return count / len(truth) if len(truth) else 1.0, count / len(points) if len(points) else 1.0, errors
 
 
-def identity_errors(position: FloatArray, truth: FloatArray, pitch: float) -> BoolArray:
+def identity_errors(position: FloatArray, truth: FloatArray, pitch: float) -> Flags:
     """Which markers have the wrong identity: nearer to another's true position, or off by half a pitch.
 
     position, truth : (N, 2), claimed and true positions of the same markers, px. pitch : distance of

@@ -10,13 +10,10 @@ import math
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import Bytes, Floats32
 from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.illumination import SATURATION_GREY
-
-Byte = NDArray[np.uint8]
 
 BLUR_SIGMA_PX: Final = 0.8
 """Standard deviation of the smoothing of changes, pixels of the window. Chosen by hand."""
@@ -27,7 +24,7 @@ NEIGHBOUR_WEIGHT: Final = _AT_ONE / (1 + 2 * _AT_ONE)
 
 
 @kernel
-def smooth_cells(half: Byte, smooth: Floats32) -> None:
+def smooth_cells(half: Bytes, smooth: Floats32) -> None:
     """Fill the planes `smooth`, (3, h, w), with means over 3 x 3 cells.
 
     half : (2 h, 6 w), a picture with cells of 2 x 2 pixels; their mean is rounded, as in `halved`.
@@ -51,7 +48,7 @@ def weigh_change(
     weight: Floats32,
     brightness: Floats32,
     colour_factor: Floats32,
-    before: Byte,
+    before: Bytes,
     evidence_before: Floats32,
     squared: Floats32,
     colour: Floats32,
@@ -83,7 +80,7 @@ def weigh_change(
 
 @kernel
 def scaled_change(
-    picture: Byte,
+    picture: Bytes,
     top: int,
     left: int,
     coefficients: Floats32,

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tactflow.vision.arrays import Bytes
 from tactflow.vision.compiled import kernel
-
-Bytes = NDArray[np.uint8]
 
 
 def halved(picture: Bytes, block: tuple[slice, slice] | None = None) -> Bytes:

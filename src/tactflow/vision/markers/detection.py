@@ -14,10 +14,10 @@ from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, Lattice, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.selection import Candidate, Sign, candidates, evidence, marks_of, probability
+from tactflow.vision.markers.selection import Candidate, Polarity, candidates, evidence, marks_of, probability
 from tactflow.vision.markers.spots import SAME_SIZE_RATIO, Spots, find_spots, sigmas
 
-Polarity = Literal["auto", "dark", "bright"]
+PolarityOption = Literal["auto", "dark", "bright"]
 
 MIN_SCORE: Final = 2.5
 """Minimum score of a candidate to be accepted as marks (see `selection.candidates`). Real gels with marks
@@ -132,7 +132,7 @@ def detect_markers(
     image: NDArray[np.uint8],
     *,
     dot_radius: float | None = None,
-    polarity: Polarity = "auto",
+    polarity: PolarityOption = "auto",
     valid: NDArray[np.uint8] | None = None,
     least_probability: float = 0.5,
 ) -> Detection:
@@ -178,7 +178,7 @@ def detect_markers(
     gray = to_gray(image).astype(np.float32)
     _require_options(dot_radius, polarity, valid, gray.shape)
     shortest = min(gray.shape)
-    signs: tuple[Sign, ...] = ("dark", "bright") if polarity == "auto" else (polarity,)
+    signs: tuple[Polarity, ...] = ("dark", "bright") if polarity == "auto" else (polarity,)
     scales = {
         sign: {s: find_spots(gray, s, sign, valid) for s in sigmas(dot_radius, shortest)} for sign in signs
     }

@@ -8,13 +8,11 @@ from typing import Final, Literal, get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Indices, check_color_image
+from tactflow.vision.arrays import Bytes, Indices, check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 
-Bytes = NDArray[np.uint8]
 InpaintMethod = Literal["telea", "ns", "normalized", "none"]
 _METHODS: Final = get_args(InpaintMethod)
 

@@ -10,16 +10,13 @@ from typing import Final, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tactflow.vision.arrays import check_color_image
+from tactflow.vision.arrays import Bytes, check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.markers.detection import Detection, NoMarkersError, detect_markers
+from tactflow.vision.markers.selection import Polarity
 from tactflow.vision.markers.spots import SAME_SIZE_RATIO
-
-Bytes = NDArray[np.uint8]
-Polarity = Literal["dark", "bright"]
 
 CIRCLE_POINTS: Final = 12
 """Number of points on the circle that a spot is compared with. Chosen by hand."""

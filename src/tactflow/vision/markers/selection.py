@@ -18,7 +18,7 @@ from tactflow.vision.arrays import Floats
 from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, NEIGHBOUR_COUNT, Lattice, nearest, support
 from tactflow.vision.markers.spots import RADIUS_PER_SIGMA, Spots, joined
 
-Sign = Literal["dark", "bright"]
+Polarity = Literal["dark", "bright"]
 
 MIN_STRENGTH_RATIO: Final = 0.35
 """Minimum response of a mark, relative to the typical one of its scale: dirt and grain are a tail. With 0.25,
@@ -89,7 +89,7 @@ class Candidate(NamedTuple):
 
     spots: Spots
     radius: float
-    polarity: Sign
+    polarity: Polarity
     score: float
     lattice: Lattice
 
@@ -102,7 +102,7 @@ class Candidate(NamedTuple):
         return f"{len(self.centers)} {self.polarity} ones of radius {self.radius:.1f} px"
 
 
-def candidates(scales: Mapping[Sign, Mapping[float, Spots]]) -> list[Candidate]:
+def candidates(scales: Mapping[Polarity, Mapping[float, Spots]]) -> list[Candidate]:
     """The candidates of all polarities and scales, the best first.
 
     scales : the spots for each polarity and scale, px.

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
-from tactflow.vision.arrays import Flags, Floats, Floats32, Indices
+from tactflow.vision.arrays import Bytes, Flags, Floats, Floats32, Indices
 from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.spots import SAME_SIZE_RATIO
 
-Bytes = NDArray[np.uint8]
 Levels = NDArray[np.int16]
 
 PHASES: Final = 4
