@@ -47,7 +47,6 @@ def run(command: list[str] | str, folder: Path, programs: Path | None = None) ->
     command : a list, or a line for the shell. programs : folder that is searched first for commands.
     """
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
-    # Nothing that an earlier run has compiled.
     if programs is not None:
         environment["PATH"] = f"{programs}{os.pathsep}{environment['PATH']}"
     subprocess.run(
