@@ -69,6 +69,13 @@ class Difference(Stage):
         creep: float = Field(
             0.1, ge=0, le=1, description="largest fraction of its change that a released gel loses per frame"
         )
+        border: float = Field(
+            0.55,
+            gt=0,
+            lt=1,
+            description="slope of the gel at the outline, as a fraction of the steepest nearby: 0.55 is the "
+            "outer edge of the imprint, 0.85 about where the gel clings to the object",
+        )
         patience: int = Field(
             30,
             ge=0,
@@ -87,6 +94,7 @@ class Difference(Stage):
             shift=params.shift,
             relaxation=params.relaxation,
             creep=params.creep,
+            border=params.border,
         )
 
     def reset(self) -> None:

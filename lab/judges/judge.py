@@ -3,6 +3,7 @@
     python -m lab.judges.judge --data RECORDINGS
     python -m lab.judges.judge --data RECORDINGS --labels mine.json default mine.yaml
     python -m lab.judges.judge --data RECORDINGS --set stages.difference.use=otsu --set stages.fusion=null
+    python -m lab.judges.judge --data RECORDINGS --fit stages.difference.border=0.55,0.7,0.85
 
 A person outlined the contacts (`python -m lab.judges.label`); `outlines.json` beside this file has
 outlines of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of
@@ -332,6 +333,31 @@ def _by_lab(judged: Sequence[Judged]) -> Iterator[tuple[str, list[Judged]]]:
         yield lab, list(group)
 
 
+def fitted(runs: Mapping[str, Sequence[Judged]]) -> Iterator[str]:
+    """Lines of a table: for each lab the setting that is best on every second outlined frame, and the overlap
+    of hulls on the others with it and with the first setting.
+
+    runs : setting -> results of the same frames in the same order, as from `judge`.
+    """
+    usual = next(iter(runs))
+    rows, kept, chosen = [], {name: [] for name in ("usual", "fit")}, {}
+    overlaps: dict[str, dict[str, list[float]]] = {}
+    for name, judged in runs.items():
+        for lab, group in _by_lab([one for one in judged if not np.isnan(one.hull)]):
+            overlaps.setdefault(lab, {})[name] = [one.hull for one in group]
+    for lab, by_setting in overlaps.items():
+        if len(by_setting[usual]) < 2:
+            continue
+        chosen[lab] = max(by_setting, key=lambda name: _median(by_setting[name][::2]))
+        for into, name in (("usual", usual), ("fit", chosen[lab])):
+            kept[into] += by_setting[name][1::2]
+        halves = [by_setting[name][1::2] for name in (usual, chosen[lab])]
+        rows.append((lab, str(len(halves[0])), chosen[lab], *(f"{_median(half):.2f}" for half in halves)))
+    rows.append(("all", str(len(kept["fit"])), "", *(f"{_median(kept[n]):.2f}" for n in ("usual", "fit"))))
+    worst = [f"{np.quantile(kept[name], 0.1):.2f}" for name in ("usual", "fit")]
+    yield from table([("lab", "frames", "best", usual, "fit"), *rows, ("10 %", "", "", *worst)])
+
+
 def scatter(labels: Iterable[FrameLabel]) -> list[float]:
     """Overlap, 0..1, of the outlines of rounds 1 and 2 of each frame that has both."""
     rounds = {(label.recording, label.frame, label.round): label for label in labels if label.outlines}
@@ -392,6 +418,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--blank", action="store_true", help="leave the frames out of --picture, as their licence may ask for"
     )
+    parser.add_argument(
+        "--fit",
+        metavar="A.B=V,W,...",
+        help="take the best value for each lab by every second outline, and judge it on the others",
+    )
     add_set(parser)
     options = parser.parse_args(arguments)
     try:
@@ -400,6 +431,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         first = [label for label in labels if label.round == 1]
         if options.picture is not None:
             draw_worst(options.pipelines[0], first, options.data, options.picture, options.blank)
+            return 0
+        if options.fit is not None:
+            key, _, values = options.fit.partition("=")
+            choices = {f"{key.rpartition('.')[2]}={v}": {key: parse_value(v)} for v in values.split(",")}
+            runs = {
+                name: list(judge(options.pipelines[0], first, options.data, settings=settings | choice))
+                for name, choice in choices.items()
+            }
+            print(*fitted(runs), sep="\n")
             return 0
         results = {
             name: list(judge(name, first, options.data, settings=settings)) for name in options.pipelines

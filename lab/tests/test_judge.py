@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.judges.judge import OUTLINES, Judged, interval, judge, main, scatter
+from lab.judges.judge import OUTLINES, Judged, fitted, interval, judge, main, scatter
 from lab.judges.label_file import FrameLabel, load_labels, save_labels
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
@@ -166,3 +166,12 @@ def test_the_worst_frames_are_drawn(labelled: tuple[Path, list[FrameLabel]], tmp
     assert blank is not None
     assert ((blank == (0, 255, 0)).all(axis=2) == (picture == (0, 255, 0)).all(axis=2)).all()
     assert main([*words, str(tmp_path / "no" / "worst.png")]) == 2
+
+
+def test_the_setting_that_is_best_on_every_second_outline_is_judged_on_the_others() -> None:
+    def judged(*overlaps: float) -> list[Judged]:
+        return [Judged("one", "press", True, True, hull=overlap) for overlap in overlaps]
+
+    lines = list(fitted({"a": judged(0.5, 0.6, 0.5, 0.6), "b": judged(0.9, 0.7, 0.9, 0.7)}))
+    assert lines[1].split() == ["one", "2", "b", "0.60", "0.70"]
+    assert lines[2].split() == ["all", "2", "0.60", "0.70"]

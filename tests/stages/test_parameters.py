@@ -32,7 +32,14 @@ WRONG: dict[str, list[dict[str, Any]]] = {
     "marker_mask": [{"dot": 0}, {"dot": "big"}, {"contrast": 300}, {"polarity": "green"}],
     "inpaint": [{"method": "magic"}, {"radius": 0}],
     "difference": [
-        *({"false_alarms": 0}, {"repeatability": 2}, {"relaxation": 1}, {"tint": 2}, {"creep": -1}),
+        *(
+            {"false_alarms": 0},
+            {"repeatability": 2},
+            {"relaxation": 1},
+            {"tint": 2},
+            {"creep": -1},
+            {"border": 1},
+        ),
         *({"method": "magic"}, {"edge": 1}),
     ],
     "hull": [

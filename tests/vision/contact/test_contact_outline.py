@@ -80,6 +80,13 @@ def test_a_disc_is_found_to_within_a_pixel(mixtures: Float) -> None:
     assert math.sqrt(mask.sum() / math.pi) == pytest.approx(30, abs=1.0)
 
 
+def test_a_higher_border_draws_the_outline_further_in() -> None:
+    change, core = tilted(disc()), (disc() < -4).astype(np.uint8)
+    areas = [int((contact_level(change, core, SLOPES, border) > 0).sum()) for border in (0.3, 0.55, 0.85)]
+    assert areas == sorted(areas, reverse=True)
+    assert areas[0] > areas[2]
+
+
 @pytest.mark.parametrize("size", [(1, 1), (2, 7), (31, 44)])
 def test_the_largest_change_nearby_is_found_up_to_the_border(size: tuple[int, int]) -> None:
     change = np.random.default_rng(0).random(size).astype(np.float32)

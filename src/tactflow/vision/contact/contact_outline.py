@@ -30,7 +30,9 @@ half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 
 real outlines within 0.02."""
 
 
-def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
+def contact_level(
+    change: Floats32, core: Mask, mixtures: Floats32, border: float = BORDER_SLOPE_FRACTION
+) -> Floats32:
     """Level set of one contact's outline.
 
     Parameters
@@ -38,6 +40,8 @@ def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
     change : (h, w, 3) float32, in the window of the contact, standard deviations; 0 outside its region.
     core : (h, w) uint8, 1 where the contact certainly is, else 0.
     mixtures : (k, 3) float32, weights of the channels; one mixture gives depth, several give slopes.
+    border : slope at the outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
+        fraction of the local depth is in proportion.
 
     Returns
     -------
@@ -54,8 +58,9 @@ def contact_level(change: Floats32, core: Mask, mixtures: Floats32) -> Floats32:
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
-    shows, border = _what_shows(change, mixtures)
-    level = np.asarray(shows / largest_nearby(shows) - np.float32(border), np.float32)
+    shows, usual = _what_shows(change, mixtures)
+    fraction = min(usual * border / BORDER_SLOPE_FRACTION, 1.0)
+    level = np.asarray(shows / largest_nearby(shows) - np.float32(fraction), np.float32)
     inside = _around(np.asarray((level > 0) | (core > 0)), core)
     # Pixels that are filled in or removed get the extreme values of the level.
     np.clip(level, -0.5, 0.5, out=level)

@@ -35,7 +35,7 @@ from scipy import special
 from tactflow.vision.arrays import Flags, Floats32, check_color_image
 from tactflow.vision.contact.background import CELL_PX, BackgroundModel, Change
 from tactflow.vision.contact.components import contact_cells, wide_change
-from tactflow.vision.contact.contact_outline import contact_level, draw_level
+from tactflow.vision.contact.contact_outline import BORDER_SLOPE_FRACTION, contact_level, draw_level
 from tactflow.vision.contact.heights import HeightModel
 from tactflow.vision.contact.level_lines import ContactFinder
 
@@ -110,6 +110,7 @@ class ContactDetector:
     creep : largest fraction of its change that a released gel loses from one frame to the next, 0..1. A
         change that fades faster, but not to `relaxation` at once, is a contact being lifted. Higher ends a
         contact earlier.
+    border : slope at the outline as a fraction of its largest nearby, in (0, 1). Higher draws it further in.
 
     Raises
     ------
@@ -136,6 +137,7 @@ class ContactDetector:
         shift: float = 1.0,
         relaxation: float = 0.2,
         creep: float = 0.1,
+        border: float = BORDER_SLOPE_FRACTION,
     ) -> None:
         if not 0 < false_alarms < 1:
             raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
@@ -149,12 +151,15 @@ class ContactDetector:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
         if not 0 <= creep <= 1:
             raise ValueError(f"creep: required in [0, 1], got {creep}")
+        if not 0 < border < 1:
+            raise ValueError(f"border: required in (0, 1), got {border}")
         self._false_alarms = false_alarms
         self._repeatability = repeatability
         self._tint = min(tint, repeatability)
         self._shift = shift
         self._relaxation = relaxation
         self._creep = creep
+        self._border = border
         self.reset()
 
     def reset(self) -> None:
@@ -243,7 +248,7 @@ class ContactDetector:
         for rows, columns, inside, core in regions:
             window = self._background.window_change(change, rows, columns, inside)
             surely = core.repeat(2, axis=0).repeat(2, axis=1)
-            level = contact_level(window, surely, heights.mixtures)
+            level = contact_level(window, surely, heights.mixtures, self._border)
             draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, mask)
         if not regions:
             draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL_PX)
