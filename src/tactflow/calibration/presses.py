@@ -124,7 +124,7 @@ class PressFinder:
             self.presses.clear()
 
     def _add(self, press: Press) -> None:
-        """A press of its own, or another moment of the last one."""
+        """Start a new press, or extend the last one."""
         if self.lasts:
             last = self.presses[-1]
             moved = float(np.hypot(*np.subtract(press.center, last.center))) / last.radius

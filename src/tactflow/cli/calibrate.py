@@ -137,7 +137,7 @@ def _add_options(parser: argparse.ArgumentParser, shown: Sequence[str] = tuple(O
 
 
 class _Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
-    """Verbs of which the first is meant where none is named."""
+    """Subcommands, of which the first is the default."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

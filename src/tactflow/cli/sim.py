@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=".jsonl (one line a frame), in raw pixels; .csv for force",
     )
-    add_overwrite(parser, "these files")
+    add_overwrite(parser, "either file")
     parser.add_argument("--list", action="store_true", help="print the scenes and their settings")
     add_quiet(parser)
 

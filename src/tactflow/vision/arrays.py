@@ -38,4 +38,6 @@ def check_mask(mask: NDArray[Any], shape: tuple[int, ...] | None = None) -> None
     """Raise ValueError if an array is not an (H, W) uint8 mask, or not of a shape."""
     wanted = "(H, W)" if shape is None else shape
     if mask.ndim != 2 or mask.dtype != np.uint8 or (shape is not None and mask.shape != shape):
-        raise ValueError(f"required a mask of shape {wanted} and dtype uint8, got {mask.shape} {mask.dtype}")
+        raise ValueError(
+            f"required a uint8 mask of shape {wanted}, got shape {mask.shape}, dtype {mask.dtype}"
+        )

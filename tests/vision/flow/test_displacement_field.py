@@ -228,7 +228,7 @@ def test_markers_of_another_reference_and_other_masks_are_refused() -> None:
     model = FieldModel(GRID, SIZE)
     with pytest.raises(ValueError, match="required 70 markers, got 2"):
         model(Markers(GRID[:2], GRID[:2], np.zeros(2, np.uint8), np.zeros(2)))
-    with pytest.raises(ValueError, match="required a mask"):
+    with pytest.raises(ValueError, match="required a uint8 mask"):
         field_of(markers(waves(GRID))).motion(np.zeros((400, 300)))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="required a size"):
         FieldModel(GRID, (0, 10))

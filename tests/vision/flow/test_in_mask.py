@@ -159,5 +159,5 @@ def test_a_marker_is_inside_if_its_nearest_pixel_is() -> None:
 
 @pytest.mark.parametrize("mask", [np.zeros((3, 3), bool), np.zeros((3, 3, 1), np.uint8)])
 def test_other_masks_are_refused(mask: Any) -> None:
-    with pytest.raises(ValueError, match=r"required a mask of shape \(H, W\)"):
+    with pytest.raises(ValueError, match=r"required a uint8 mask of shape \(H, W\)"):
         flow_in_mask(moved(), mask)

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from tactflow.vision.arrays import Flags, Floats32, check_color_image
+from tactflow.vision.arrays import Flags, Floats32, check_color_image, check_mask
 from tactflow.vision.contact.background import CELL_PX, BackgroundModel, Change
 from tactflow.vision.contact.components import contact_cells, wide_change
 from tactflow.vision.contact.contact_outline import BORDER_SLOPE_FRACTION, contact_level, draw_level
@@ -188,7 +188,8 @@ class ContactDetector:
         Raises ValueError if an array has another type or shape, or another size than earlier frames.
         """
         self._check(image)
-        _check_mask(valid, image)
+        if valid is not None:
+            check_mask(valid, image.shape[:2])
         if self._background is not None:
             self._background.add(image)
             return
@@ -302,10 +303,3 @@ class ContactDetector:
     def _limit(self, cells: int) -> float:
         """Detection threshold on squared deviations, corrected for the number of cells."""
         return chi_square_threshold(self._false_alarms / cells)
-
-
-def _check_mask(mask: NDArray[np.uint8] | None, image: NDArray[np.uint8]) -> None:
-    if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != np.uint8):
-        raise ValueError(
-            f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
-        )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
-from tactflow.vision.arrays import Floats
+from tactflow.vision.arrays import Floats, check_mask
 from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, Lattice, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.selection import Candidate, Polarity, candidates, evidence, marks_of, probability
 from tactflow.vision.markers.spots import SAME_SIZE_RATIO, Spots, find_spots, sigmas
@@ -333,8 +333,8 @@ def _require_options(
         raise ValueError(f"required dot_radius 1 to {largest:g} px, got {dot_radius:g}")
     if polarity not in ("auto", "dark", "bright"):
         raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
-    if valid is not None and (valid.shape != shape or valid.dtype != np.uint8):
-        raise ValueError(f"required valid to be {shape} uint8, got shape {valid.shape}, dtype {valid.dtype}")
+    if valid is not None:
+        check_mask(valid, shape)
 
 
 def _reading_order(centers: Floats, radius: float) -> NDArray[np.int64]:

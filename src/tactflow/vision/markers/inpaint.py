@@ -9,7 +9,7 @@ from typing import Final, Literal, get_args
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Bytes, Indices, check_color_image
+from tactflow.vision.arrays import Bytes, Indices, check_color_image, check_mask
 from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.downsample import halved
 
@@ -95,10 +95,7 @@ def remove_markers(
 def _check(image: Bytes, mask: Bytes, method: str, radius: float) -> None:
     """Validate the arguments of `remove_markers`."""
     check_color_image(image)
-    if mask.shape != image.shape[:2] or mask.dtype != np.uint8:
-        raise ValueError(
-            f"required a uint8 mask of shape {image.shape[:2]}, got shape {mask.shape}, dtype {mask.dtype}"
-        )
+    check_mask(mask, image.shape[:2])
     if method not in _METHODS:
         raise ValueError(f"method: required one of {_METHODS}, got {method!r}")
     if not (radius > 0 and math.isfinite(radius)):
