@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Frame
+from tactflow.parameters import GelParams
 from tactflow.ports import ContactMask, Deviations, Touching, Unmarked, Valid
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.reference import ReferenceCheck
@@ -45,20 +46,11 @@ class Difference(Stage):
 
     memory = "stateful"
 
-    class Params(StageParams):
+    class Params(GelParams):
         """Sensitivity of the test against the sensor's own noise."""
 
         false_alarms: float = Field(
             1e-6, gt=0, lt=1, description="false contacts on the untouched gel, per frame"
-        )
-        repeatability: float = Field(
-            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
-        )
-        tint: float = Field(
-            0.01,
-            ge=0,
-            le=1,
-            description="variation of the colour of that light, relative to its brightness; see gel",
         )
         shift: float = Field(
             1.0, ge=0, le=100, description="movement of the untouched gel against the camera, px"

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Frame
+from tactflow.parameters import GelParams
 from tactflow.ports import Changed, Suspect
 from tactflow.vision.change import RestTest
 from tactflow.vision.geometry.valid_area import bounding_box, valid_area
@@ -42,18 +43,9 @@ class Probe(Stage):
     memory = "stateful"
     watches = "touching"
 
-    class Params(StageParams):
+    class Params(GelParams):
         """Sensitivity, and the minimum rate of full frames."""
 
-        repeatability: float = Field(
-            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
-        )
-        tint: float = Field(
-            0.01,
-            ge=0,
-            le=1,
-            description="variation of the colour of that light, relative to its brightness; see gel",
-        )
         false_alarms: float = Field(
             0.01, gt=0, le=0.5, description="share of still frames in which the dots are measured anyway"
         )

@@ -9,6 +9,24 @@ from pydantic import Field
 from tactflow.engine.contract import StageParams
 
 
+class GelParams(StageParams):
+    """How much the light on the untouched gel varies; `gel` of a pipeline file sets it for all stages.
+
+    >>> GelParams(tint=0.02)
+    GelParams(repeatability=0.025, tint=0.02)
+    """
+
+    repeatability: float = Field(
+        0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
+    )
+    tint: float = Field(
+        0.01,
+        ge=0,
+        le=1,
+        description="variation of the colour of that light, relative to its brightness; see gel",
+    )
+
+
 class MarkParams(StageParams):
     """What the printed marks look like.
 

@@ -4,7 +4,6 @@ pipeline as a Mermaid flowchart."""
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,9 @@ from typing import Any
 from tactflow.cli.options import add_pipeline, load_plan
 from tactflow.cli.progress import END_WORDS
 from tactflow.engine.contract import Sink
-from tactflow.engine.errors import ConfigError
 from tactflow.engine.graph import Gate, Node, Pipeline
 from tactflow.engine.plan import Plan, dependencies
+from tactflow.engine.stats import read_statistics
 from tactflow.system.terminal import show
 
 FAILURE_REASONS = ("error", "disabled")
@@ -34,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph for each stage and sink."""
-    statistics = None if args.stats is None else _read_statistics(args.stats)
+    statistics = None if args.stats is None else read_statistics(args.stats)
     pipeline, plan = load_plan(args)
     skipping = "" if pipeline.skipping else ", skipping is off"
     show([f"{pipeline.file}: sensor {pipeline.sensor}, segments {', '.join(plan.segments)}{skipping}"])
@@ -46,19 +45,6 @@ def run(args: argparse.Namespace) -> int:
             ["", f"{id_} ({texts.pop('at')})", *(f"  {k.ljust(width)}  {text}" for k, text in texts.items())]
         )
     return 0
-
-
-def _read_statistics(path: Path) -> dict[str, Any]:
-    """Read a statistics file; raises ConfigError if it cannot be read, or is not one."""
-    try:
-        statistics = json.loads(path.read_bytes())
-    except OSError as error:
-        raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
-    except ValueError:
-        statistics = None
-    if not isinstance(statistics, dict) or not {"stages", "sinks", "latency_ms"} <= statistics.keys():
-        raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")
-    return statistics
 
 
 def _whole_run(run: Mapping[str, Any]) -> str:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass, field
 from itertools import accumulate
 from math import ceil, exp, log
+from pathlib import Path
 from typing import Any
 
+from tactflow.engine.errors import ConfigError
+
+STATISTICS_KEYS = {"frames", "stages", "sinks", "latency_ms"}
+"""Keys by which a statistics file is recognised."""
 _BINS_PER_E = 50
 """Bins per factor e: a quantile is exact to +-1 %."""
 _MIN_DURATION_S = 1e-7
@@ -112,3 +118,16 @@ class SignalStats:
     def entry(self) -> dict[str, int]:
         """The entry in the statistics file."""
         return {"true": self.true, "rises": self.rises}
+
+
+def read_statistics(path: Path) -> dict[str, Any]:
+    """Read the statistics file of a run. Raises ConfigError if it cannot be read, or is not one."""
+    try:
+        statistics = json.loads(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"--stats {path}: cannot be read: {error.strerror}") from None
+    except ValueError:
+        statistics = None
+    if not isinstance(statistics, dict) or not statistics.keys() >= STATISTICS_KEYS:
+        raise ConfigError(f"--stats {path}: not a statistics file; tactflow run --stats writes one")
+    return statistics

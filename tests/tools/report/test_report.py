@@ -108,10 +108,10 @@ def test_what_holds_no_results_is_refused(
 
 
 @pytest.mark.parametrize("text", ["{}", "[1]", "no JSON"])
-def test_statistics_that_are_none_are_refused(run: Path, text: str, terminal: Terminal) -> None:
+def test_a_file_without_statistics_is_refused(run: Path, text: str, terminal: Terminal) -> None:
     Path("stats.json").write_text(text)
     assert terminal("report", str(run / "run.jsonl"), "--stats", "stats.json") == 2
-    assert "--stats stats.json: required statistics" in terminal.err
+    assert "--stats stats.json: not a statistics file" in terminal.err
 
 
 def test_results_are_plotted_in_a_notebook(run: Path) -> None:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -137,6 +138,19 @@ class BenchResult:
         path.write_text(f'{head[:-1]}, "values": {{\n{lines}\n}}}}\n', encoding="utf-8")
 
 
+def load_stored(path: Path, command: str, schema: str, content: str) -> dict[str, Any]:
+    """The result of a command. Raises ConfigError unless the file has its schema and content."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not JSON: {error}") from error
+    if not isinstance(stored, dict) or stored.get("schema") != schema or content not in stored:
+        raise ConfigError(f'{path}: not a result of `tactflow {command}` (required "schema": "{schema}")')
+    return stored
+
+
 def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
     """Errors of a stored run: group/method/scene -> quantity -> error.
 
@@ -144,14 +158,7 @@ def load_errors(path: Path, *, quick: bool) -> dict[str, dict[str, float]]:
     Raises ConfigError if the file is not a result of the bench, or of a quick run while this one is full, or
     the other way round, because their scenes differ.
     """
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise ConfigError(f"{path}: not JSON: {error}") from error
-    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or "values" not in stored:
-        raise ConfigError(f'{path}: not a result of `tactflow bench` (required "schema": "{SCHEMA}")')
+    stored = load_stored(path, "bench", SCHEMA, "values")
     if stored["quick"] != quick:
         kind = "quick" if stored["quick"] else "full"
         raise ConfigError(f"{path}: is the result of a {kind} run; compare it with a {kind} run")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from typing import Any
 
 from tactflow.cli.options import add_overwrite, refuse_output, writing
-from tactflow.engine.errors import ConfigError
+from tactflow.engine.stats import read_statistics
 from tactflow.system.files import completed
 from tactflow.system.terminal import say
 from tactflow.tools.report.page import collect, report_page
@@ -39,23 +37,10 @@ def run(args: argparse.Namespace) -> int:
     """
     out = args.results.with_suffix(".html") if args.out is None else args.out
     refuse_output("--out", out, overwrite=args.overwrite, suffixes=(".html",))
-    statistics = None if args.stats is None else _statistics(args.stats)
+    statistics = None if args.stats is None else read_statistics(args.stats)
     reports = collect(read_results(args.results))
     written = report_page(args.results.name, reports, statistics)
     with writing(out), completed(out) as partial:
         partial.write_text(written, encoding="utf-8")
     say(f"tactflow: wrote {out}")
     return 0
-
-
-def _statistics(path: Path) -> dict[str, Any]:
-    """The statistics of a run. Raises ConfigError if the file holds none."""
-    try:
-        statistics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if not all(key in statistics for key in ("frames", "stages", "latency_ms")):
-            raise ValueError("it has no frames, stages and latency_ms")
-    except OSError as error:
-        raise ConfigError(f"--stats {path}: {error.strerror or error}") from None
-    except (ValueError, TypeError) as error:
-        raise ConfigError(f"--stats {path}: required statistics of tactflow run --stats: {error}") from None
-    return statistics

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result, encode_message
+from tactflow.tools.bench.results import load_stored
 from tactflow.tools.stress.clips import cases_for, clip
 from tactflow.tools.stress.compare import add_differences, cells, difference, heads, numbers
 from tactflow.tools.stress.parts import Listing, Part, Worst
@@ -154,13 +153,5 @@ def rounded(answers: Answers) -> Answers:
 
 def load_answers(path: Path, schema: str) -> Answers:
     """The answers of a stored run. ConfigError if the file is not a result of `tactflow stress`."""
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise ConfigError(f"{path}: not JSON: {error}") from error
-    if not isinstance(stored, dict) or stored.get("schema") != schema or "answers" not in stored:
-        raise ConfigError(f'{path}: not a result of `tactflow stress` (required "schema": "{schema}")')
-    answers: Answers = stored["answers"]
+    answers: Answers = load_stored(path, "stress", schema, "answers")["answers"]
     return answers
