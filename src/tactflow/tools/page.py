@@ -36,6 +36,7 @@ from tactflow.drawing.plots import series as series
 from tactflow.system.extras import missing
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -47,6 +48,8 @@ class Html(str):
 
 WIDTH, HEIGHT = 360, 240
 """Size of a small plot, CSS pixels."""
+DECADES_FROM = 30
+"""Range of an axis, highest over lowest value, from which powers of ten are marks enough."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +89,8 @@ def paragraphs(text: str) -> Html:
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, sortable: bool = False) -> Html:
-    """A table. A cell that is `Html` is put in as it is; a number is aligned to the right.
+    """A table. A cell that is `Html` is put in as it is; a number, or a dash for none, is
+    aligned to the right.
 
     >>> "<td>a &lt; b</td>" in table(["what"], [["a < b"]])
     True
@@ -103,7 +107,7 @@ def _cell(value: Any) -> str:
     if isinstance(value, Html):
         return f"<td>{value}</td>"
     text = str(value)
-    kind = ' class="number"' if re.fullmatch(r"[-+−]?[\d.,]+(e[-+]?\d+)?( %)?", text) else ""
+    kind = ' class="number"' if re.fullmatch(r"-|([<>] )?[-+−]?[\d.,]+(e[-+]?\d+)?( %)?", text) else ""
     return f"<td{kind}>{escape(text)}</td>"
 
 
@@ -118,9 +122,11 @@ def details(summary: str, *body: Html) -> Html:
 
 
 def key(names: Sequence[str]) -> Html:
-    """Which colour is which name, in the order of `series`, for all plots below."""
+    """Which colour is which name, in the order of `series`, for all plots below; striped once the colours
+    repeat."""
     items = (
-        f'<span><i style="background: var(--{SERIES[i % len(SERIES)]})"></i>{escape(name)}</span>'
+        f'<span><i{" class=striped" if i >= len(SERIES) else ""} '
+        f'style="--ink: var(--{SERIES[i % len(SERIES)]})"></i>{escape(name)}</span>'
         for i, name in enumerate(names)
     )
     return Html(f'<div class="key">{"".join(items)}</div>')
@@ -162,6 +168,18 @@ def plot(
     wide = ' class="wide"' if width > WIDTH else ""
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     return Html(f"<figure{wide}>{svg}{below}</figure>")
+
+
+def plain_numbers(axes: Axes) -> None:
+    """Write 0.2 instead of a power of ten on the logarithmic axes of a plot, whose limits are known."""
+    from matplotlib.ticker import LogLocator
+
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() == "log":
+            low, high = sorted(axis.get_view_interval())
+            axis.set_major_locator(LogLocator(subs=(1.0,) if high > DECADES_FROM * low else (1.0, 2.0, 5.0)))
+            axis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+            axis.set_minor_formatter("")
 
 
 def save_plot(path: Path, draw: Callable[[Figure], object], *, width: int, height: int) -> None:

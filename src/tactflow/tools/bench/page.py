@@ -8,6 +8,7 @@ from functools import partial
 from html import escape
 from itertools import accumulate
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ from tactflow.tools.page import (
     key,
     multiples,
     page,
+    plain_numbers,
     plot,
     save_plot,
     series,
@@ -69,10 +71,10 @@ PICTURE: Final = (
 """Group, quantity and title of the panels of `front.png`."""
 OURS: Final = "tactflow"
 """Name in `front.png` of what the default pipeline does."""
-_DECADES: Final = 30
-"""Range of an axis, highest over lowest value, from which powers of ten are marks enough."""
 _NAME_OFFSETS: Final = ((5, 3), (5, -3), (-5, 3), (-5, -3), (0, 14), (0, -14))
 """Where a name may stand beside its point, points to the right and up; the first for want of a free one."""
+LINE_CHARACTERS: Final = 44
+"""Length of a line that fits above a small plot."""
 _MIN_PLOTTED_ERROR: Final = 1e-3
 """Smallest error on a logarithmic axis: an error of 0 is drawn here."""
 _LEAD: Final = (
@@ -150,13 +152,12 @@ def _fronts(result: BenchResult, own: Sequence[str]) -> Iterator[Html]:
 def draw_front(axes: Axes, found: Sequence[Point], quantity: Quantity, own: Sequence[str] = ()) -> None:
     """Draw the methods against one error."""
     draw_points(axes, found, own)
-    axes.set_title(f"1 - {quantity.title}" if quantity.best == 1 else quantity.heading)
+    title = f"1 - {quantity.title}" if quantity.best == 1 else quantity.heading
+    axes.set_title(fill(title, LINE_CHARACTERS))
 
 
 def draw_points(axes: Axes, found: Sequence[Point], own: Sequence[str] = ()) -> None:
     """Draw the methods, their front, and their names; the classic script and `own` ones are marked."""
-    from matplotlib.ticker import LogLocator
-
     times = [ms for point in found for ms in point.ms]
     errors = [max(error, _MIN_PLOTTED_ERROR) for point in found for error in point.error]
     axes.set(xscale="log", yscale="log", xlabel="CPU time of a frame, ms")
@@ -171,11 +172,7 @@ def draw_points(axes: Axes, found: Sequence[Point], own: Sequence[str] = ()) -> 
     best = front(found)
     steps = [max(point.error[1], _MIN_PLOTTED_ERROR) for point in best]
     axes.plot([p.ms[1] for p in best], steps, color=colour("quiet"), linewidth=0.8, zorder=0)
-    for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(subs=(1.0,) if high > _DECADES * low else (1.0, 2.0, 5.0)))
-        axis.set_major_formatter(lambda value, _: f"{value:g}")
-        axis.set_minor_formatter("")
+    plain_numbers(axes)
     _write_names(axes, found, own)
 
 
@@ -270,7 +267,7 @@ def draw_grasp(figure: Figure, costs: dict[str, Costs]) -> None:
     happens.plot(times, [step.area / 1000 for step in steps], label="area, 1000 px²", color=series(2))
     happens.plot(times, [step.shift for step in steps], label="largest shift of a dot, px", color=series(3))
     cost.set(ylabel="CPU of a frame, ms", yscale="log")
-    cost.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    plain_numbers(cost)
     happens.set(xlabel="time, s")
     happens.legend(loc="upper right")
 
@@ -327,6 +324,7 @@ def _growth(result: BenchResult) -> Iterator[Section]:
             linear = 0 in grown.x
             axes.set(xscale="linear" if linear else "log", yscale="linear" if linear else "log")
             axes.set(xlabel=grown.unit or grown.title.lower(), ylabel="CPU of a frame, ms")
+            plain_numbers(axes)
             power = grown.exponent
             axes.set_title(grown.title + ("" if power is None else f": grows with the power {power:.2f}"))
 

@@ -82,13 +82,18 @@ def memory_mb() -> float:
 
 @dataclass(slots=True)
 class Window:
-    """Sums over a part of the recording."""
+    """Means over a part of the recording; lists of single frames would grow, and count as memory.
+
+    frames, contacts, seen : their numbers, and that of the frames at rest with dots. dots : mean displacement
+    of the dots at rest, px. center, area : means of the contacts, px, px^2. memory : MB.
+    """
 
     frames: int = 0
     contacts: int = 0
-    dots: list[float] = field(default_factory=list[float])
-    centers: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
-    areas: list[float] = field(default_factory=list[float])
+    seen: int = 0
+    dots: float = 0.0
+    center: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    area: float = 0.0
     memory: float = 0.0
 
     def add(self, result: Result) -> None:
@@ -96,12 +101,14 @@ class Window:
         self.frames += 1
         if result.contact is not None:
             self.contacts += 1
-            self.centers.append(result.contact.center)
-            self.areas.append(result.contact.area)
+            self.center += (np.array(result.contact.center) - self.center) / self.contacts
+            self.area += (result.contact.area - self.area) / self.contacts
         elif result.markers is not None:
             seen = result.markers.status == 0
             if seen.any():
-                self.dots.append(float(np.abs(result.markers.displacement[seen].mean(axis=0)).max()))
+                self.seen += 1
+                moved = float(np.abs(result.markers.displacement[seen].mean(axis=0)).max())
+                self.dots += (moved - self.dots) / self.seen
 
 
 def run_endurance(subjects: Sequence[Subject], *, quick: bool, length: int | None = None) -> Part:
@@ -123,7 +130,7 @@ def run_endurance(subjects: Sequence[Subject], *, quick: bool, length: int | Non
         levels = [(number + 1) / WINDOWS for number in range(WINDOWS)]
         for name, values in (
             ("memory_mb", [window.memory for window in windows]),
-            ("dots_drift", [float(np.mean(w.dots)) if w.dots else None for w in windows]),
+            ("dots_drift", [w.dots if w.seen else None for w in windows]),
         ):
             if any(value is not None for value in values):
                 part.curves.append(Curve("long run", "share of the run", name, subject.name, levels, values))
@@ -153,13 +160,13 @@ def _judge(worst: Worst, windows: Sequence[Window]) -> list[str]:
     missed = 1 - sum(window.contacts for window in held) / max(1, sum(window.frames for window in held))
     worst.add("false_at_rest", false, "at rest")
     worst.add("held", missed, "in contact")
-    dots = [float(np.mean(window.dots)) for window in rest if window.dots]
+    dots = [window.dots for window in rest if window.seen]
     drift = abs(dots[-1] - dots[0]) if dots else None
     cells = [f"{count:,}", f"{false:.2g}", f"{missed:.2g}", "-" if drift is None else f"{drift:.2g}"]
     if drift is not None:
         worst.add("dots_drift", drift, "at rest")
-    centers = [np.mean(window.centers, axis=0) for window in held if window.centers]
-    areas = [float(np.mean(window.areas)) for window in held if window.areas]
+    centers = [window.center for window in held if window.contacts]
+    areas = [window.area for window in held if window.contacts]
     if centers:
         shift = max(float(np.hypot(*(center - centers[0]))) for center in centers)
         growth = max(100 * abs(area / areas[0] - 1) for area in areas)

@@ -21,6 +21,7 @@ from tactflow.tools.page import (
     marked,
     multiples,
     page,
+    plain_numbers,
     plot,
     save_plot,
     series,
@@ -181,6 +182,7 @@ def _panel(curves: Sequence[Curve], names: Sequence[str]) -> Html:
         if max(known) < DOUBLE * min(known):
             axes.set_ylim(min(known) / DOUBLE, max(known) * DOUBLE)
         _ticks(axes, curves[0])
+        plain_numbers(axes)
         axes.set_title(curves[0].panel)
 
     bound = "dotted: Cramér-Rao bound" if any(curve.bound is not None for curve in curves) else ""
@@ -229,6 +231,7 @@ def save_picture(report: Report, path: Path, subject: str) -> None:
                     _ticks(axes, curve)
             axes.axhline(DOUBLE, color=colour("quiet"), linewidth=1, linestyle=":")
             axes.set(yscale="log", title=panel)
+        plain_numbers(grid[0])
         for axes in grid[len(panels) :]:
             axes.set_visible(False)
         grid[0].set_ylabel("error, relative to the undisturbed scene")
