@@ -125,7 +125,7 @@ def key(names: Sequence[str]) -> Html:
     """Which colour is which name, in the order of `series`, for all plots below; striped once the colours
     repeat."""
     items = (
-        f'<span><i{" class=striped" if i >= len(SERIES) else ""} '
+        f"<span><i{' class=striped' if i >= len(SERIES) else ''} "
         f'style="--ink: var(--{SERIES[i % len(SERIES)]})"></i>{escape(name)}</span>'
         for i, name in enumerate(names)
     )
