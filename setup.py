@@ -52,7 +52,10 @@ setup(
         "tactflow.sinks",
         "tactflow.pipelines",
         "tactflow.plugins",
-        *(f"tactflow.plugins.{name}" for name in ("arrays", "lerobot", "onnx", "parquet", "rosbags")),
+        *(
+            f"tactflow.plugins.{name}"
+            for name in ("arrays", "lerobot", "onnx", "parquet", "replay_buffer", "rosbags")
+        ),
     ],
     long_description=re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", absolute, readme) if REPOSITORY else readme,
     long_description_content_type="text/markdown",

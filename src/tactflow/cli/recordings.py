@@ -40,7 +40,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "format",
         help="hdf5 (all frames and numbers as plain arrays), lerobot (a dataset of layout v3.0), "
-        "or that of a plug-in",
+        "replay-buffer (Zarr, for Diffusion Policy), or that of a plug-in",
     )
     add_sources(
         parser,

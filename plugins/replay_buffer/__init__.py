@@ -1,0 +1,1 @@
+"""Replay buffers of Diffusion Policy: an export. As sources, `plugins/arrays` reads them."""
