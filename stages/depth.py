@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from typing import Final
+
 from pydantic import Field
 
 from tactflow.calibration.file import Calibration
@@ -9,9 +12,16 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask, Gradients, Unmarked, Untouched
 from tactflow.vision.depth.darkness import DarkSurface
+from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Depth as HeightMap
 from tactflow.vision.types import Scale
+
+logger = logging.getLogger("tactflow")
+
+CONTRADICTION_ERROR: Final = 0.5
+"""Relative standard error of a depth above which its picture may be mirrored. Slopes of presses on five Minis
+give at most 0.41, those of their mirror images 0.55 or more."""
 
 
 class Depth(Stage):
@@ -20,7 +30,8 @@ class Depth(Stage):
 
     No depth exceeds the thickness of the gel, or half the width of the contact: what would is reported as
     this bound, and its standard error contains the difference. Absent without a calibration, or with one that
-    knows the scale alone and no network.
+    knows the scale alone and no network; nor, with the default of a kind
+    of sensor, where the slopes contradict each other as those of a mirrored picture do.
 
     >>> import numpy as np
     >>> import tactflow
@@ -51,6 +62,7 @@ class Depth(Stage):
         photometric = None if known is None else known.photometric
         self._errors = None if photometric is None else photometric.errors()
         self._darkness = None if known is None or known.darkness is None else known.darkness.model()
+        self._is_warned = False
 
     def process(
         self,
@@ -70,5 +82,34 @@ class Depth(Stage):
         if known.darkness is not None and self._darkness is not None and gradients is None:
             dark = DarkSurface(self._darkness, scale, known.darkness.stderr, self._thickness)
             return dark.depth(unmarked, rest, contact_mask)
-        surface = Surface(known.slopes, scale, self._errors, self._thickness)
-        return surface.depth(unmarked, rest, contact_mask, gradients)
+        if known.kind is None or gradients is not None:
+            surface = Surface(known.slopes, scale, self._errors, self._thickness)
+            return surface.depth(unmarked, rest, contact_mask, gradients)
+        height, width = contact_mask.shape
+        surface = Surface(self.once(_placed, known, scale, (width, height)), scale, self._errors, self._thickness)
+        depth = surface.depth(unmarked, rest, contact_mask)
+        if (depth.greatest_stderr or 0) <= CONTRADICTION_ERROR * depth.greatest:
+            return depth
+        if not surface.is_mirrored(unmarked, rest, contact_mask):
+            return depth
+        self._warn(known.kind)
+        return Absent("mirrored")
+
+    def _warn(self, kind: str) -> None:
+        """Say once what to do with a mirrored picture."""
+        if not self._is_warned:
+            logger.warning(
+                "depth: the slopes of a contact contradict each other, and not if left and right are "
+                "exchanged: the picture is mirrored, and the calibration of a %s is not used for such "
+                "frames. Take pictures as the sensor gives them, or calibrate these: `tactflow calibrate "
+                "--area WIDTH HEIGHT --ball-radius MM`",
+                kind,
+            )
+        self._is_warned = True
+
+
+def _placed(known: Calibration, scale: Scale, size: tuple[int, int]) -> SlopeModel | None:
+    """The slopes of the default of a kind, for the part of the gel that pictures of this size show."""
+    usual = known.scale_at(size)
+    zoom = scale.x / usual.x, scale.y / usual.y
+    return known.slopes if known.slopes is None or zoom == (1, 1) else known.slopes.zoomed(*zoom)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import logging
 
-from tactflow.calibration.file import UNLIKE, UNLIKE_KIND, Calibration
+import numpy as np
+from numpy.typing import NDArray
+
+from tactflow.calibration.file import UNLIKE, Calibration
+from tactflow.calibration.likeness import place
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Absent
 from tactflow.ports import Untouched
 from tactflow.system.spelling import distinct
 from tactflow.vision.geometry import PixelMapping
+from tactflow.vision.types import Markers
 from tactflow.vision.types import Scale as MillimetresPerPixel
 
 logger = logging.getLogger("tactflow")
@@ -20,8 +25,10 @@ class Scale(Stage):
     """Millimetres per pixel, from the file `calibration` of the pipeline; absent without it.
 
     A calibration made with frames of another size or another preprocess ends the run; a gel that looks
-    different from the calibrated one is a warning. The default of a kind of sensor, or the calibration in a
-    recording, is not used, with a warning, where it does not fit.
+    different from the calibrated one is a warning. The default of a kind of sensor is compared with the
+    pictures first: their light at rest, and the pitch of the dots, which gives the scale. It is not used,
+    with a warning that says what to do, where they are turned, cropped, uncropped or of another sensor; nor
+    is the calibration in a recording where it does not fit.
 
     >>> import numpy as np
     >>> import tactflow
@@ -38,54 +45,68 @@ class Scale(Stage):
         self._is_described = False
 
     def process(
-        self, untouched: Untouched, mapping: PixelMapping | None = None
+        self, untouched: Untouched, mapping: PixelMapping | None = None, markers: Markers | None = None
     ) -> MillimetresPerPixel | Absent:
         """The scale, or Absent("no_calibration")."""
-        if self._calibration is None:
+        known = self._calibration
+        if known is None:
             return Absent("no_calibration")
-        scale = self.once(self._fitting, self._calibration, untouched, mapping)
+        if known.kind is None:
+            scale = self.once(self._own, known, untouched, mapping)
+        else:
+            dots = None if markers is None or known.dot_pitch is None else markers.origin
+            scale = self.once(self._of_kind, known, untouched, mapping, dots)
         return Absent("no_calibration") if scale is None else scale
 
-    def _fitting(
+    def _own(
         self, calibration: Calibration, untouched: Untouched, mapping: PixelMapping | None
     ) -> MillimetresPerPixel | None:
         """The scale for a new reference; None where a calibration that nobody chose does not fit."""
-        kind, first, self._is_described = calibration.kind, not self._is_described, True
+        first, self._is_described = not self._is_described, True
         size = untouched.shape[1], untouched.shape[0]
-        unlike = 100 * calibration.unlikeness(untouched)
         misfit = calibration.misfit(mapping or PixelMapping.identity(size))
-        if misfit is None and kind is not None and unlike > 100 * UNLIKE_KIND:
-            measured, limit = distinct(unlike, 100 * UNLIKE_KIND)
-            misfit = (
-                f"the untouched gel differs from one by {measured} % of its brightness "
-                f"({limit} % at most): another sensor, a turned picture, or "
-                "something touches it"
-            )
         if misfit is not None:
-            if not (calibration.recorded or kind):
+            if not calibration.recorded:
                 raise StageError(f"{misfit}; use the pipeline that it was made with, or calibrate anew")
             if first:
-                which = "in the recording" if kind is None else f"of a {kind}"
-                logger.warning("scale: the calibration %s is not used: %s", which, misfit)
+                logger.warning("scale: the calibration in the recording is not used: %s", misfit)
             return None
-        if kind is None and unlike > 100 * UNLIKE:
+        unlike = 100 * calibration.unlikeness(untouched)
+        if unlike > 100 * UNLIKE:
             logger.warning(
                 "scale: the untouched gel differs by %s %% of its brightness from the calibrated one "
                 "(%s %% is usual at most): another sensor, another light, or something touches it",
                 *distinct(unlike, 100 * UNLIKE),
             )
-        elif kind is not None and first:
-            _describe_default(calibration)
         return calibration.scale_at(size)
 
+    def _of_kind(
+        self,
+        calibration: Calibration,
+        untouched: Untouched,
+        mapping: PixelMapping | None,
+        dots: NDArray[np.float64] | None,
+    ) -> MillimetresPerPixel | None:
+        """The scale by the default of a kind for a new reference; None where it does not fit."""
+        first, self._is_described = not self._is_described, True
+        size = untouched.shape[1], untouched.shape[0]
+        scale, words = place(calibration, untouched, mapping or PixelMapping.identity(size), dots)
+        if first and scale is None:
+            logger.warning("scale: the calibration of a %s is not used: %s", calibration.kind, words)
+        elif first and scale is not None:
+            _describe_default(calibration, scale, words)
+        return scale
 
-def _describe_default(calibration: Calibration) -> None:
-    photometric, scale = calibration.photometric, calibration.scale
+
+def _describe_default(calibration: Calibration, scale: MillimetresPerPixel, words: str) -> None:
+    """Report the default with the errors that it has on other sensors of the kind."""
+    photometric = calibration.photometric
     depth = "" if photometric is None else f"depth +- {100 * photometric.depth_stderr:.0f} %, "
     logger.info(
-        "default calibration of a %s: %slengths +- %.0f %%; `tactflow calibrate --refine` with one press of "
-        "a ball or more makes it that of this sensor",
+        "default calibration of a %s: %slengths +- %.0f %%%s; `tactflow calibrate --refine` with one press "
+        "of a ball or more makes it that of this sensor",
         calibration.kind,
         depth,
         100 * scale.stderr[0] / scale.x,
+        f" ({words})" if words else "",
     )

@@ -39,9 +39,6 @@ pipeline file shifts it less."""
 UNLIKE: Final = 0.1
 """Largest difference of the untouched gel, see `Calibration.unlikeness`. Chosen by hand: presses of one
 session differ by 0.01."""
-UNLIKE_KIND: Final = 0.22
-"""The same for sensors of one kind. Minis of three labs differ by 0.06 to 0.07, with dots by up to 0.21, and
-seven other kinds of gel from them by 0.24 to 1.1."""
 ASPECT: Final = 0.02
 """Largest relative difference of the aspect ratios of frames of the same shape. Chosen by hand."""
 ALIGNED: Final = 0.9
@@ -165,6 +162,7 @@ class Calibration(_Entry):
     darkness : depth from darkening, for gels in white light. force : from contacts. None if not known.
     kind : of sensor that it is the default of, for frames of the same shape and any size; else None.
     gel_thickness : mm, which no depth exceeds; None where it is not known.
+    dot_pitch : spacing of the dots of the gels with dots of that kind, mm; None where not known.
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
     recorded : whether it comes from a recording, which was made with it.
     information : (114, 114) float64, `Photometry.information`, to refine it for another sensor; None without
@@ -176,6 +174,7 @@ class Calibration(_Entry):
     format: Literal["tactflow.calibration/1"] = "tactflow.calibration/1"
     sensor: str
     kind: str | None = None
+    dot_pitch: PositiveFloat | None = None
     made: str = Field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     made_from: str
     tactflow: str = __version__

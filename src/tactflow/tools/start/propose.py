@@ -17,7 +17,8 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from tactflow.calibration.file import UNLIKE_KIND, Calibration
+from tactflow.calibration.file import Calibration
+from tactflow.calibration.likeness import match_light
 from tactflow.config.load import load_pipeline
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import StageError
@@ -201,7 +202,7 @@ def _recognised(untouched: ColorImage) -> list[str]:
         path = load_pipeline(find_pipeline(name)).calibration
         if path is not None:
             calibration = Calibration.load(path)
-            if calibration.misfit(mapping) is None and calibration.unlikeness(plain) <= UNLIKE_KIND:
+            if calibration.misfit(mapping) is None and match_light(calibration.look, plain).fits:
                 names.append(name)
     return names
 

@@ -72,6 +72,18 @@ class SlopeModel:
         self.coefficients: Floats32 = np.asarray(coefficients, np.float32)
         self._by_place = np.ascontiguousarray(self.coefficients.transpose(2, 1, 0))
 
+    def zoomed(self, across: float, down: float) -> SlopeModel:
+        """The same for pictures that show another part of the gel, with the same centre.
+
+        across, down : width and height of that part, over those of the pictures that the model is for.
+
+        >>> terms = np.ones((PLACE_TERMS, COLOUR_TERMS, 2))
+        >>> SlopeModel(terms).zoomed(0.5, 1.0).coefficients[:, 0, 0].tolist()
+        [1.0, 0.5, 1.0, 0.25, 0.5, 1.0]
+        """
+        factors = np.array([1, across, down, across**2, across * down, down**2], np.float32)
+        return SlopeModel(self.coefficients * factors[:, None, None])
+
     def slopes(
         self, change: Floats32, x: Floats32, y: Floats32, near: Bytes, steepest: float = STEEPEST
     ) -> Floats32:

@@ -142,6 +142,21 @@ class Surface:
         whole[window.part] = self._integrated(slope, window, rest.window)
         return whole
 
+    def is_mirrored(self, image: Bytes, rest: Rest, mask: Bytes) -> bool:
+        """Whether the slopes contradict each other less if left and right are exchanged; see `depth`.
+
+        Of slopes from a mirrored picture only those along y have the right sign. No surface has such slopes:
+        it explains about half of them, and nearly all once the others are turned around. Of 122 presses of
+        four balls and an edge on five Minis none is said to be mirrored, and of their mirror images 121.
+        """
+        slope, _, window = self._slopes(image, rest, mask)
+        misfits = []
+        for sign in (1, -1):
+            turned = slope * np.array([sign, 1], np.float32)[:, None, None]
+            low = self._integrated(turned, window, rest.window)
+            misfits.append(self._unexplained(turned, low, mask[window.whole]))
+        return misfits[1] < misfits[0]
+
     def _slopes(
         self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None
     ) -> tuple[Floats32, float, Window]:
