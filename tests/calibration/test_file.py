@@ -221,7 +221,7 @@ def test_a_default_of_a_kind_says_once_that_it_is_one_and_is_left_out_for_anothe
     with caplog.at_level(logging.WARNING, "tactflow"):
         results = list(tactflow.stream(pipeline, source="sim:round_gel", max_frames=3))
     assert {result.scale for result in results} == {None}
-    assert "the untouched gel differs from one by" in caplog.text
+    assert "the light of the untouched gel differs from that of one by" in caplog.text
 
 
 @pytest.mark.parametrize("kind", kinds())
