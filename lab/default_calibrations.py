@@ -1,102 +1,326 @@
-"""Make the calibrations of kinds of sensors that the package ships.
+"""Make the calibrations of kinds of sensors that the package ships, and judge them on other sensors.
 
     python -m lab.default_calibrations [--data ../shared/data] [--keep FOLDER]
+    python -m lab.default_calibrations --judge [--presses N]
 
-Each is learned from all presses of one sensor whose licence allows it: `gelslam` (GelSight Mini,
-rpl-cmu/gelslam, MIT) and FOTS (DIGIT, Rancho-zhao/FOTS, MIT). Recordings of other Minis, which nothing is
-learned from, show how much larger its errors are there: `KIND_ERRORS`, which also widen those of the DIGIT.
+The Mini's is learned from all presses of `gelslam` (rpl-cmu/gelslam, MIT), whose licence allows it; three
+other Minis, which nothing is learned from, show its errors on other sensors of the kind, and these are what
+it states. There is none for depth of a DIGIT: one learned from FOTS (Rancho-zhao/FOTS, MIT) is worse on
+another DIGIT than a fit to a single press of its own. Of FOTS the package has the untouched gel and its
+scale.
+
+With `--judge` nothing is written, and three tables are printed, each with one sensor left out: the default of
+a Mini on the three others, with the error that the two others than the judged one would have it state, also
+after one press of its own; two DIGITs by 0, 1, 3 and 20 presses of their own, by refining the other one's
+calibration and from scratch; and what becomes of pictures that a default is not for.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from lab.depth import SETS, radii_of, scale_of, sessions_of
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import tactflow
+from lab.depth import SETS, chosen, radii_of, scale_of, sessions_of
 from tactflow.calibration import KINDS
-from tactflow.calibration.file import Calibration, ScaleEntry, raw_corners, small_picture
-from tactflow.calibration.photometric import fit_photometry
-from tactflow.calibration.samples import press_errors, summary
+from tactflow.calibration.file import Calibration, PhotometricEntry, ScaleEntry, raw_corners, small_picture
+from tactflow.calibration.photometric import Photometry, fit_photometry
+from tactflow.calibration.presses import Session
+from tactflow.calibration.refine import refine_photometry
+from tactflow.calibration.samples import press_errors
+from tactflow.engine.errors import ConfigError
+from tactflow.vision.depth.surface import Rest, Surface
+from tactflow.vision.types import Scale
 
-TRAINING_SETS = {
+Sessions = Mapping[str, tuple[Session, list[str]]]
+Presses = tuple[Session, Scale, list[float]]
+
+LEARNED = {
     "mini": (
         "gelslam",
         "GelSight Mini",
         "github.com/rpl-cmu/gelslam (MIT): presses of balls of 6.3 and 9.5 mm",
     ),
-    "digit": ("digit_fots", "DIGIT", "github.com/Rancho-zhao/FOTS (MIT): presses of a ball of 4.7 mm"),
+    "digit": ("digit_fots", "DIGIT", "github.com/Rancho-zhao/FOTS (MIT): the untouched gel, and its scale"),
 }
 """File -> set, kind of sensor, source and licence."""
-KIND_SCALE = 0.05
-"""Relative standard error of the scale on another sensor of the kind: the authors of FOTS measured 19.6 and
-21.1 pixels per mm on two DIGITs."""
-KIND_ERRORS = {"normal_error": 2.6, "depth_stderr": 0.102}
-"""Additional errors on another sensor of the kind, measured on two other Minis by this program."""
-OTHER_SETS = {"mini": ("mini_ball", "mini_ball_9mm")}
+WITH_DEPTH = ("mini",)
+"""Files that have slopes."""
+DOT_PITCH = {"mini": 2.03}
+"""Spacing of the dots of a gel with dots, mm: of `mini_ball`, at the scale of `lab.depth`, 2.07 and 2.00
+along x and y."""
+OTHERS = {"mini": ("mini_ball", "mini_ball_9mm", "mini_ball_4mm")}
 """File -> sets of other sensors of the kind."""
+DIGITS = ("digit_fots", "digit_ball")
+"""Sets of the DIGITs that are judged by each other."""
+KIND_SCALE = 0.05
+"""Relative standard error of the scale on another sensor of the kind: on three DIGITs their owners measured
+18.7, 19.6 and 21.1 pixels per mm."""
+COUNTS = (1, 3, 20)
+"""Own presses that a DIGIT is calibrated by."""
 
 
 def main() -> None:
-    """Write the files, and print their errors."""
-    parser = argparse.ArgumentParser(description="make the default calibrations")
+    """Write the files and print their errors, or judge them."""
+    parser = argparse.ArgumentParser(description="make or judge the default calibrations")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--keep", type=Path, help="folder with the presses of an earlier run")
+    parser.add_argument("--judge", action="store_true", help="write nothing; judge on sensors left out")
+    parser.add_argument("--presses", type=int, default=15, help="presses of a set that are judged")
     args = parser.parse_args()
-    names = [learned for learned, _, _ in TRAINING_SETS.values()] + [
-        name for sets in OTHER_SETS.values() for name in sets
-    ]
+    if args.judge:
+        names = ("gelslam", *OTHERS["mini"], *DIGITS)
+        sessions = sessions_of(names, args.data, args.keep)
+        judge_minis(sessions, args.presses)
+        judge_digits(sessions, args.presses)
+        judge_misuse(args.data)
+        return
+    names = (*(learned for learned, _, _ in LEARNED.values()), *OTHERS["mini"])
     sessions = sessions_of(names, args.data, args.keep)
-    for file, (learned, kind, origin) in TRAINING_SETS.items():
-        session, pictures = sessions[learned]
-        scale = scale_of(SETS[learned], session)
-        fitted = fit_photometry(session, scale, radii_of(SETS[learned], pictures))
-        made = Calibration(
-            sensor=file,
-            made_from=origin,
-            raw_size=session.mapping.raw_size,
-            size=session.mapping.size,
-            corners=raw_corners(session.mapping),
-            scale=ScaleEntry.of(scale, "the authors of the recordings"),
-            photometric=fitted.found,
-            look=small_picture(session.untouched),
-            slopes=fitted.model,
-            information=fitted.information,
+    for file in LEARNED:
+        made = make(file, sessions)
+        made.save(KINDS / f"{file}.yaml")
+        if made.photometric is not None:
+            print(f"{file}: {words(made.photometric.model_dump())} on other sensors of the kind")
+
+
+def make(file: str, sessions: Sessions) -> Calibration:
+    """The default of a kind, with the errors that it has on other sensors of the kind."""
+    learned, kind, origin = LEARNED[file]
+    session, scale, radii = presses_of(learned, sessions)
+    stderr = (KIND_SCALE * scale.x, KIND_SCALE * scale.y)
+    made = Calibration(
+        sensor=file,
+        kind=kind,
+        dot_pitch=DOT_PITCH.get(file),
+        made_from=origin,
+        raw_size=session.mapping.raw_size,
+        size=session.mapping.size,
+        corners=raw_corners(session.mapping),
+        scale=ScaleEntry.of(replace(scale, stderr=stderr), "the authors of the recordings"),
+        look=small_picture(session.untouched),
+    )
+    if file not in WITH_DEPTH:
+        return made
+    fitted = fit_photometry(session, scale, radii)
+    others = [presses_of(name, sessions) for name in OTHERS[file]]
+    return made.model_copy(
+        update={
+            "photometric": stated(fitted, others),
+            "slopes": fitted.model,
+            "information": fitted.information,
+        }
+    )
+
+
+def stated(fitted: Photometry, others: Sequence[Presses]) -> PhotometricEntry:
+    """The entry of a default: its errors on other sensors of the kind, each with the same weight.
+
+    `between`, the part of the relative error of a depth that all frames share, is the most likely one. The
+    error of the depth that is stated at the start of a run is the one that a usual frame states.
+    """
+    alone = fitted.found.model_copy(update={"between": 0.0})
+    errors = [np.array(press_errors(*other[:1], fitted.model, *other[1:])) for other in others]
+    frames = [frame_errors(fitted, alone, other) for other in others]
+
+    def surprise(between: float) -> float:
+        """Negative log-likelihood of the errors of the depth."""
+        return sum(
+            float(np.nanmean(np.log(variance) + relative(found) ** 2 / variance))
+            for found, variance in zip(errors, (own**2 + between**2 for own in frames), strict=True)
         )
-        for_kind(made, kind).save(KINDS / f"{file}.yaml")
-        own = fitted.found.model_dump()
-        print(f"{file}: {words(own)} on its own sensor")
-        if others := OTHER_SETS.get(file, ()):
-            errors = []
-            for other in others:
-                presses, pictures = sessions[other]
-                scale, radii = scale_of(SETS[other], presses), radii_of(SETS[other], pictures)
-                errors += press_errors(presses, fitted.model, scale, radii)
-            there = summary(errors)
-            more = {name: max(there[name] ** 2 - own[name] ** 2, 0) ** 0.5 for name in KIND_ERRORS}
-            print(f"{file}: {words(there)} on {', '.join(others)}: {words(more)} more")
+
+    between = min(np.arange(0, 0.5, 0.002).tolist(), key=surprise)
+    usual = math.sqrt(np.mean([np.median(own) ** 2 for own in frames]) + between**2)
+    normal = math.sqrt(np.mean([found[:, 0].mean() ** 2 for found in errors]))
+    return alone.model_copy(update={"normal_error": normal, "depth_stderr": usual, "between": between})
 
 
-def for_kind(own: Calibration, kind: str) -> Calibration:
-    """The same as the default of a kind of sensor, with the errors that it has on others of the kind."""
-    photometric, entry = own.photometric, own.scale_entry
-    assert photometric is not None
-    wider = {name: math.hypot(getattr(photometric, name), more) for name, more in KIND_ERRORS.items()}
-    wider["between"] = math.hypot(photometric.between, KIND_ERRORS["depth_stderr"])
-    pairs = zip(entry.mm_per_pixel, entry.stderr, strict=True)
-    stderr = tuple(math.hypot(error, KIND_SCALE * value) for value, error in pairs)
-    update = {
-        "kind": kind,
-        "scale_entry": entry.model_copy(update={"stderr": stderr}),
-        "photometric": photometric.model_copy(update=wider),
-    }
-    return own.model_copy(update=update)
+def relative(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,): errors of the depth, of `press_errors`, over the depth that was found."""
+    return np.asarray(errors[:, 1] / (1 + errors[:, 1]))
+
+
+def frame_errors(fitted: Photometry, found: PhotometricEntry, presses: Presses) -> NDArray[np.float64]:
+    """(n,): the relative standard error of the depth that each frame states."""
+    session, scale, _ = presses
+    surface, rest = Surface(fitted.model, scale, found.errors()), Rest(session.untouched)
+    depths = [surface.depth(press.image, rest, press.mask) for press in session.presses]
+    return np.array([(depth.greatest_stderr or np.nan) / depth.greatest for depth in depths])
+
+
+def presses_of(name: str, sessions: Sessions) -> Presses:
+    """The presses of a set, their scale, and the radius of the ball of each, mm."""
+    session, pictures = sessions[name]
+    return session, scale_of(SETS[name], session), radii_of(SETS[name], pictures)
+
+
+def some(presses: Presses, count: int, start: int = 0) -> Presses:
+    """So many presses, from all over the set, beginning with one of them."""
+    session, scale, radii = presses
+    step = max(1, (len(radii) - start) // count)
+    few, balls = chosen(session, radii, slice(start, start + step * count, step))
+    return few, scale, balls
+
+
+def judge_minis(sessions: Sessions, count: int) -> None:
+    """Print the errors of the default of a Mini on others, and how they compare with the stated ones."""
+    base = Calibration.load(KINDS / "mini.yaml")
+    assert base.slopes is not None
+    assert base.information is not None
+    assert base.photometric is not None
+    nothing = np.zeros(0)
+    known = Photometry(base.slopes, base.information, base.photometric, nothing, nothing > 0, nothing)
+    print("Mini            own presses  normals   cap, %   at start, %   in frames, %   within 1, 2, %")
+    for name in OTHERS["mini"]:
+        judged = some(presses_of(name, sessions), count, 1)
+        others = [some(presses_of(other, sessions), count) for other in OTHERS["mini"] if other != name]
+        found = stated(known, others)
+        print(row(name, 0, known, found, judged), flush=True)
+        own = some(presses_of(name, sessions), 3)
+        left_out = base.model_copy(update={"photometric": found})
+        for number in range(len(own[2])):
+            one, radii = chosen(own[0], own[2], slice(number, number + 1))
+            refined = refine_photometry(one, own[1], radii[0], left_out)
+            print(row(name, 1, refined, refined.found, judged), flush=True)
+
+
+def row(name: str, own: int, fitted: Photometry, found: PhotometricEntry, judged: Presses) -> str:
+    """Errors of a fit on the presses of another sensor, and how many of them are within the stated ones."""
+    session, scale, radii = judged
+    errors = np.array(press_errors(session, fitted.model, scale, radii))
+    stated_errors = frame_errors(fitted, found, judged)
+    off = np.abs(relative(errors)) / stated_errors
+    one, two = (100 * np.nanmean(off < k) for k in (1, 2))
+    cap = 100 * math.sqrt(np.nanmean(errors[:, 1] ** 2))
+    return (
+        f"{name:15} {own:11d} {np.mean(errors[:, 0]):8.1f} {cap:8.1f} {100 * found.depth_stderr:13.0f} "
+        f"{100 * np.median(stated_errors):14.0f} {one:9.0f}, {two:3.0f}"
+    )
+
+
+def judge_digits(sessions: Sessions, count: int) -> None:
+    """Print the errors on each DIGIT by the other one's calibration, refined and not, and from scratch."""
+    print("DIGIT           own presses  way          normals   cap, %   stated, %")
+    for name, other in (DIGITS, DIGITS[::-1]):
+        presses = presses_of(name, sessions)
+        judged = some(presses, count, 1)
+        session, scale, radii = presses_of(other, sessions)
+        fitted = fit_photometry(session, scale, radii)
+        base = replace_fit(make("digit", {**sessions, "digit_fots": sessions[other]}), fitted)
+        print(digit_row(name, 0, "other DIGIT", fitted, judged), flush=True)
+        for own in COUNTS:
+            few, few_scale, balls = some(presses, own)
+            for way in ("refined", "from scratch"):
+                try:
+                    if way == "refined":
+                        found = refine_photometry(few, few_scale, balls[0], base)
+                    else:
+                        found = fit_photometry(few, few_scale, balls)
+                except ConfigError as problem:
+                    print(f"{name:15} {own:11d}  {way:12} refused: {problem}")
+                else:
+                    print(digit_row(name, own, way, found, judged), flush=True)
+
+
+def replace_fit(known: Calibration, fitted: Photometry) -> Calibration:
+    """The calibration with other slopes."""
+    return known.model_copy(
+        update={
+            "photometric": fitted.found,
+            "slopes": fitted.model,
+            "information": fitted.information,
+        }
+    )
+
+
+def digit_row(name: str, own: int, way: str, fitted: Photometry, judged: Presses) -> str:
+    """Errors of a fit on presses of a DIGIT."""
+    session, scale, radii = judged
+    errors = np.array(press_errors(session, fitted.model, scale, radii))
+    cap = 100 * math.sqrt(np.nanmean(errors[:, 1] ** 2))
+    return (
+        f"{name:15} {own:11d}  {way:12} {np.median(errors[:, 0]):7.1f} {cap:8.1f} "
+        f"{100 * fitted.found.depth_stderr:11.0f}"
+    )
+
+
+def judge_misuse(data: Path) -> None:
+    """Print what the default of a Mini does with pictures that it is not for."""
+    print("picture                   frames with contact, with depth; first warning")
+    for name, pictures, settings in misuses(data):
+        warnings: list[str] = []
+        catch = _Catch(warnings)
+        with catch:
+            results = list(tactflow.stream("mini_plain", source=pictures, settings=settings))
+        touched = [result for result in results if result.contact is not None]
+        deep = sum(result.depth is not None for result in touched)
+        first = next((text for text in warnings if "not used" in text), "none")
+        print(f"{name:25} {len(touched):3d}, {deep:3d}; {first[:150]}", flush=True)
+
+
+def misuses(data: Path) -> Iterator[tuple[str, list[NDArray[np.uint8]], dict[str, Any]]]:
+    """Name, pictures and settings of each case; the first is as it should be."""
+    uncropped = read(data / "mini_ball_4mm")
+    cropped = {"stages.preprocess.crop": [32, 24, 256, 192]}
+    yield "as it should be", uncropped, cropped
+    yield "mirrored", [flipped(picture, 1) for picture in uncropped], cropped
+    yield "upside down", [flipped(picture, 0) for picture in uncropped], cropped
+    yield "turned by 90 degrees", uncropped, {**cropped, "stages.preprocess.rotate": 90}
+    yield "turned by 180 degrees", uncropped, {**cropped, "stages.preprocess.rotate": 180}
+    yield "cropped twofold", read(data / "mini_ball_9mm"), {"stages.preprocess.crop": [80, 60, 160, 120]}
+    yield "uncropped", uncropped, {}
+    wedge = [np.ascontiguousarray(picture[40:220]) for picture in read(data / "wedge_ball")]
+    yield "another kind", wedge, {}
+
+
+def flipped(picture: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:
+    """The mirror image."""
+    return np.asarray(cv2.flip(picture, axis), np.uint8)
+
+
+def read(folder: Path, count: int = 8) -> list[NDArray[np.uint8]]:
+    """The untouched gel of a folder, and some of its presses."""
+    rests = ("background", "000", "reference")
+    paths = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".jpg"))
+    paths.sort(key=lambda path: path.stem not in rests)
+    chosen_paths = [paths[0], *paths[1 :: max(1, len(paths) // count)]]
+    return [np.asarray(cv2.imread(str(path)), np.uint8) for path in chosen_paths]
+
+
+class _Catch:
+    """Collects the warnings of the package.
+
+    texts : list that they are added to.
+    """
+
+    def __init__(self, texts: list[str]) -> None:
+        import logging
+
+        class Handler(logging.Handler):
+            def emit(self, record: logging.LogRecord) -> None:
+                texts.append(record.getMessage())
+
+        self._logger, self._handler = logging.getLogger("tactflow"), Handler(logging.WARNING)
+
+    def __enter__(self) -> None:
+        self._logger.addHandler(self._handler)
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.removeHandler(self._handler)
 
 
 def words(errors: Mapping[str, float]) -> str:
     """Errors, for people."""
-    return ", ".join(f"{name} {errors[name]:.3f}" for name in KIND_ERRORS)
+    return ", ".join(f"{name} {errors[name]:.3f}" for name in ("normal_error", "depth_stderr", "between"))
 
 
 if __name__ == "__main__":

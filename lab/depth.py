@@ -45,7 +45,7 @@ class Balls:
     """A set.
 
     radii : start of a file's name -> radius of the ball, mm. kind : the default calibration of its kind,
-    made from another sensor.
+    made from another sensor. crop : [x, y, width, height], px, of a picture that shows more than the gel.
     """
 
     folder: str
@@ -54,13 +54,18 @@ class Balls:
     mm: float
     radii: dict[str, float]
     kind: str | None = None
+    crop: tuple[int, int, int, int] | None = None
 
 
 SETS = {
     "gelslam": Balls("mini_ball_gelslam", "background.png", "mini_plain", MINI, {"6": 3.155, "9": 4.75}),
     "mini_ball": Balls("gels/mini_ball", "000.png", "mini", MINI, {"": 2.5}, "mini"),
     "mini_ball_9mm": Balls("mini_ball_9mm", "background.png", "mini_plain", MINI, {"": 4.735}, "mini"),
+    "mini_ball_4mm": Balls(
+        "mini_ball_4mm", "000.png", "mini_plain", 0.08, {"": 2.0}, "mini", (32, 24, 256, 192)
+    ),
     "digit_fots": Balls("gels/digit_fots", "000.png", "digit", 1 / 19.58, {"": 2.35}),
+    "digit_ball": Balls("digit_ball", "000.png", "digit", 1 / 18.68, {"": 4.4}),
     "wedge_ball": Balls("wedge_ball", "reference.jpg", "wedge", 0.1, {"": 1.98}),
 }
 EDGE = Balls("gels/mini_box", "000.png", "mini_plain", MINI, {}, "mini")
@@ -74,7 +79,7 @@ def read(balls: Balls, data: Path) -> tuple[Session, list[str]]:
     with TemporaryDirectory() as links:
         for number, path in enumerate(pictures):
             (Path(links) / f"{number:04d}{path.suffix}").symlink_to(path.resolve())
-        pictures_only = {"calibration": None}
+        pictures_only = {"calibration": None, "stages.preprocess.crop": balls.crop and [*balls.crop]}
         results = tactflow.stream(balls.pipeline, source=links, settings=pictures_only, images=True)
         first, *others = [r for r in results if r.image is not None]
     untouched = first.get("unmarked", first.image)

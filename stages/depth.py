@@ -12,7 +12,6 @@ from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask, Gradients, Unmarked, Untouched
 from tactflow.vision.depth.darkness import DarkSurface
-from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.depth.surface import Rest, Surface
 from tactflow.vision.types import Depth as HeightMap
 from tactflow.vision.types import Scale
@@ -30,8 +29,8 @@ class Depth(Stage):
 
     No depth exceeds the thickness of the gel, or half the width of the contact: what would is reported as
     this bound, and its standard error contains the difference. Absent without a calibration, or with one that
-    knows the scale alone and no network; nor, with the default of a kind
-    of sensor, where the slopes contradict each other as those of a mirrored picture do.
+    knows the scale alone and no network; and, with the default of a kind of sensor, where the slopes
+    contradict each other as those of a mirrored picture do.
 
     >>> import numpy as np
     >>> import tactflow
@@ -86,7 +85,8 @@ class Depth(Stage):
             surface = Surface(known.slopes, scale, self._errors, self._thickness)
             return surface.depth(unmarked, rest, contact_mask, gradients)
         height, width = contact_mask.shape
-        surface = Surface(self.once(_placed, known, scale, (width, height)), scale, self._errors, self._thickness)
+        placed = self.once(known.at, scale, (width, height))
+        surface = Surface(placed.slopes, scale, self._errors, self._thickness)
         depth = surface.depth(unmarked, rest, contact_mask)
         if (depth.greatest_stderr or 0) <= CONTRADICTION_ERROR * depth.greatest:
             return depth
@@ -106,10 +106,3 @@ class Depth(Stage):
                 kind,
             )
         self._is_warned = True
-
-
-def _placed(known: Calibration, scale: Scale, size: tuple[int, int]) -> SlopeModel | None:
-    """The slopes of the default of a kind, for the part of the gel that pictures of this size show."""
-    usual = known.scale_at(size)
-    zoom = scale.x / usual.x, scale.y / usual.y
-    return known.slopes if known.slopes is None or zoom == (1, 1) else known.slopes.zoomed(*zoom)

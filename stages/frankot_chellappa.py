@@ -37,20 +37,24 @@ class FrankotChellappa(Stage):
     def __init__(self, params: StageParams, calibration: Calibration | None = None) -> None:
         """Prepare. calibration : of the sensor."""
         super().__init__(params)
-        self._model = None if calibration is None else calibration.slopes
+        self._known = calibration
 
     def process(
         self, unmarked: Unmarked, untouched: Untouched, contact_mask: ContactMask, scale: Scale
     ) -> Depth | Absent:
         """The height map of the contact."""
-        if self._model is None:
+        known = self._known
+        if known is None or known.slopes is None:
             return Absent("no_calibration")
         if not contact_mask.any():
             return Absent("no_contact")
         rest = self.once(Rest, untouched)
         everywhere = np.ones((rest.window.height, rest.window.width), np.uint8)
         change = colour_change(unmarked, rest, rest.window, np.zeros(3, np.float32))
-        slope = self._model.slopes(change, rest.x, rest.y, everywhere)
+        height, width = contact_mask.shape
+        model = self.once(known.at, scale, (width, height)).slopes if known.kind else known.slopes
+        assert model is not None
+        slope = model.slopes(change, rest.x, rest.y, everywhere)
         # A step is two pixels; slopes rise towards the camera, into which the gel is pushed.
         spectrum = scipy.fft.fft2(slope * np.float32(-2 * scale.x))
         y, x = (2j * np.pi * scipy.fft.fftfreq(side) for side in slope.shape[1:])

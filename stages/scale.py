@@ -100,13 +100,18 @@ class Scale(Stage):
 
 def _describe_default(calibration: Calibration, scale: MillimetresPerPixel, words: str) -> None:
     """Report the default with the errors that it has on other sensors of the kind."""
-    photometric = calibration.photometric
-    depth = "" if photometric is None else f"depth +- {100 * photometric.depth_stderr:.0f} %, "
+    photometric, depth = calibration.photometric, ""
+    ball = "`tactflow calibrate --refine` with one press of a ball or more"
+    if photometric is None:
+        advice = f"for depth, {ball}"
+    else:
+        depth = f"depth +- {100 * photometric.depth_stderr:.0f} %, "
+        advice = f"{ball} makes it that of this sensor"
     logger.info(
-        "default calibration of a %s: %slengths +- %.0f %%%s; `tactflow calibrate --refine` with one press "
-        "of a ball or more makes it that of this sensor",
+        "default calibration of a %s: %slengths +- %.0f %%%s; %s",
         calibration.kind,
         depth,
         100 * scale.stderr[0] / scale.x,
         f" ({words})" if words else "",
+        advice,
     )

@@ -229,13 +229,29 @@ def test_the_shipped_defaults_say_what_they_are_made_from_and_how_far_off_they_a
     known = Calibration.load(KINDS / f"{kind}.yaml")
     assert known.kind is not None
     assert "MIT" in known.made_from
+    assert known.scale.stderr[0] == pytest.approx(0.05 * known.scale.x)
+    if known.photometric is None:
+        assert known.slopes is None
+        return
     assert known.slopes is not None
     assert known.information is not None
     assert np.linalg.eigvalsh(known.information).min() > -1e-3
-    assert known.photometric is not None
-    assert 0.102 < known.photometric.depth_stderr < 0.25
-    assert known.photometric.errors().between == pytest.approx(0.102)
-    assert known.scale.stderr[0] == pytest.approx(0.05 * known.scale.x)
+    errors = known.photometric.errors()
+    assert 0.5 * known.photometric.depth_stderr < errors.between < known.photometric.depth_stderr < 0.25
+
+
+def test_a_default_for_other_frames_knows_their_scale_and_their_part_of_the_gel() -> None:
+    known = Calibration.load(KINDS / "mini.yaml")
+    usual = known.scale_at((640, 480))
+    half = known.at(Scale(usual.x / 2, usual.y / 2, (0.001, 0.001), usual.origin), (640, 480))
+    assert half.scale_at((640, 480)).x == pytest.approx(usual.x / 2)
+    assert half.scale.stderr[0] == pytest.approx(0.002)
+    assert known.slopes is not None
+    assert half.slopes is not None
+    # Terms of the place: 1, x, y, x^2, x y, y^2.
+    ratio = half.slopes.coefficients[:, 0, 0] / known.slopes.coefficients[:, 0, 0]
+    assert ratio.tolist() == pytest.approx([1, 0.5, 0.5, 0.25, 0.25, 0.25])
+    assert known.at(usual, (640, 480)) is known
 
 
 def test_a_file_without_its_arrays_or_with_broken_ones_is_refused(tmp_path: Path) -> None:

@@ -103,6 +103,22 @@ def test_presses_that_are_no_ball_are_refused(base: Calibration, other: Session)
         fit_photometry(replace(other, presses=idle), SCALE, BALL)
 
 
+def test_a_fit_from_scratch_is_kept_where_it_is_the_better_one(base: Calibration, other: Session) -> None:
+    presses = some(other, slice(0, None, 2))
+    # A base whose slopes are right only in the mean.
+    assert base.slopes is not None
+    rng = np.random.default_rng(0)
+    odd = base.slopes.coefficients.copy()
+    odd[1:] += rng.normal(0, 0.5 * np.abs(odd[:1]).max(), odd[1:].shape).astype(np.float32)
+    worse = base.model_copy(update={"slopes": SlopeModel(odd)})
+    fresh = fit_photometry(presses, SCALE, BALL)
+    refined = refine_photometry(presses, SCALE, BALL, worse)
+    assert np.array_equal(refined.model.coefficients, fresh.model.coefficients)
+    few = some(presses, slice(2))
+    kept = refine_photometry(few, SCALE, BALL, base)
+    assert kept.found.normal_error < fit_photometry(few, SCALE, BALL).found.normal_error
+
+
 def test_a_press_that_is_no_ball_is_left_out_among_others(base: Calibration, other: Session) -> None:
     odd = replace(other.presses[1], image=np.roll(other.presses[1].image, 1, axis=2))
     presses = [other.presses[0], odd, *other.presses[2:4]]

@@ -184,7 +184,7 @@ def test_the_default_of_a_kind_of_sensor_is_refined_by_two_pictures_of_one_press
     assert "does not fit: the frames are turned" in terminal.err
     Path("left.yaml").write_text(REFINED.replace("calibration: kind.yaml", ""))
     assert terminal("calibrate", *refine, *ball, "--overwrite") == 2
-    assert "required a pipeline with a calibration" in terminal.err
+    assert "since the pipeline has no calibration" in terminal.err
 
 
 def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(terminal: Terminal) -> None:

@@ -60,7 +60,7 @@ def fit_darkness(session: Session, scale: Scale, ball_radius: float) -> Darkness
     Raises ConfigError without presses, for contacts larger than the ball or too small, and for a gel that
     does not become darker with the depth.
     """
-    check_presses(session, scale, np.full(len(session.presses), ball_radius), fewest=1)
+    check_presses(session, scale, np.full(len(session.presses), ball_radius))
     rest = Rest(session.untouched)
     presses = [_rings(press, rest, scale, ball_radius) for press in session.presses]
     kept = np.array([len(rings) >= FEWEST_RINGS for rings in presses])

@@ -206,6 +206,23 @@ class Calibration(_Entry):
         center = (size[0] - 1) / 2, (size[1] - 1) / 2
         return Scale(x * across, y * down, (x_error * across, y_error * down), center)
 
+    def at(self, scale: Scale, size: tuple[int, int]) -> Self:
+        """The same for processed frames (width, height), px, that show another part of the gel around the
+        same middle. scale : mm per px of these frames."""
+        usual = self.scale_at(size)
+        zoom = scale.x / usual.x, scale.y / usual.y
+        if zoom == (1, 1):
+            return self
+        known = self.scale_entry
+        (x, y), (across, down) = known.mm_per_pixel, zoom
+        error = scale.stderr[0] / scale.x * x * across, scale.stderr[1] / scale.y * y * down
+        entry = known.model_copy(update={"mm_per_pixel": (x * across, y * down), "stderr": error})
+        slopes = None if self.slopes is None else self.slopes.zoomed(*zoom)
+        # `cached_property` keeps the scale in the instance.
+        copy = self.model_copy(update={"scale_entry": entry, "slopes": slopes})
+        copy.__dict__.pop("scale", None)
+        return copy
+
     def save(self, path: Path) -> None:
         """Write the YAML file, and beside it the arrays in a `.npz` of the same name.
 

@@ -14,7 +14,8 @@ from tactflow.vision.arrays import Floats
 from tactflow.vision.types import Scale
 
 FEWEST_PRESSES: Final = 8
-"""Presses that a fit needs at least; 20 or more are advised. Chosen by hand."""
+"""Presses from which on they must be all over the gel, and each half of them can judge the other; 20 or more
+are advised. Chosen by hand."""
 SPREAD: Final = 0.15
 """Least part of the picture's width and height that the presses span. Chosen by hand."""
 TOO_LARGE: Final = 2.0
@@ -34,11 +35,10 @@ OTHER_RADIUS: Final = 2**0.5
 is asked: half way to a diameter. Single presses on two Minis and a DIGIT have 0.9 to 1.3."""
 
 
-def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) -> None:
+def check_presses(session: Session, scale: Scale, radii: Floats) -> None:
     """Raise ConfigError if the presses cannot give a calibration, with what was found and what to do.
 
-    radii : (n,) float64, of the ball of each press, mm. fewest : presses; with at least `FEWEST_PRESSES` they
-    must be all over the gel.
+    radii : (n,) float64, of the ball of each press, mm. `FEWEST_PRESSES` or more must be all over the gel.
     """
     presses = session.presses
     if not (np.isfinite(radii) & (radii > 0)).all():
@@ -48,13 +48,8 @@ def check_presses(session: Session, scale: Scale, radii: Floats, fewest: int) ->
             f"calibrate: nothing touched the gel in {session.frames} frames; the first frame must show it "
             "untouched, the others presses of the ball"
         )
-    if len(presses) < fewest:
-        raise ConfigError(
-            f"calibrate: required {fewest} presses of the ball or more (20 are better), found "
-            f"{len(presses)} in {session.frames} frames; lift the ball between two presses"
-        )
     span = np.ptp([press.center for press in presses], axis=0) / session.mapping.size
-    if span.min() < SPREAD and fewest >= FEWEST_PRESSES:
+    if span.min() < SPREAD and len(presses) >= FEWEST_PRESSES:
         # Rounded down, so that the message cannot show the required value.
         wide, high = np.floor(1000 * span) / 10
         raise ConfigError(
@@ -82,8 +77,9 @@ def check_explained(explained: float) -> None:
 
 
 def check_error(found: PhotometricEntry) -> None:
-    """Raise ConfigError if the error of the depth is too large, with possible causes."""
-    if found.depth_stderr > LARGEST_ERROR:
+    """Raise ConfigError if the error of the depth is too large although there are enough presses, with
+    possible causes."""
+    if found.depth_stderr > LARGEST_ERROR and found.presses >= FEWEST_PRESSES:
         error, limit = distinct(100 * found.depth_stderr, 100 * LARGEST_ERROR)
         raise ConfigError(
             f"calibrate: the error of the depth would be {error} % ({limit} % at most); press all over the "

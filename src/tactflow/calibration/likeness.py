@@ -27,6 +27,9 @@ LIGHT_FLOOR: Final = 20.0
 LARGEST_MISFIT: Final = 0.09
 """RMS difference of the logarithms above which the light is that of another kind of sensor. Minis of five
 labs have 0.04 to 0.07, one that shows its housing 0.11, nine other kinds of sensor 0.18 to 0.6."""
+LEAST_ZOOM: Final = 0.45
+"""Zoom below which nothing is recognised: the light of a small part of the gel is as even as that of many
+sensors."""
 LARGEST_ZOOM: Final = 1.25
 """Factor, or its inverse, between the zoom of a picture and that of the calibration, above which it is not
 used: by the light, five Minis have 0.9 to 1.0, and pictures cropped to one half 0.55 to 0.67."""
@@ -53,7 +56,7 @@ class Match(NamedTuple):
     @property
     def fits(self) -> bool:
         """Whether the light is that of the kind, at any zoom."""
-        return self.misfit <= LARGEST_MISFIT
+        return self.misfit <= LARGEST_MISFIT and self.zoom >= LEAST_ZOOM
 
 
 class Placement(NamedTuple):
@@ -83,6 +86,10 @@ def match_light(look: NDArray[np.float32], untouched: NDArray[np.uint8]) -> Matc
     zooms = ZOOMS[:, None, None]
     misfits = np.sqrt(np.mean((light - zooms * linear - zooms**2 * quadratic) ** 2, axis=(1, 2)))
     best = int(np.argmin(misfits))
+    # The light of some kinds is no quadratic polynomial.
+    as_it_is = float(np.sqrt(np.mean((light - _log_light(look)) ** 2)))
+    if as_it_is <= misfits[best]:
+        return Match(as_it_is, 1.0)
     return Match(float(misfits[best]), float(ZOOMS[best]))
 
 

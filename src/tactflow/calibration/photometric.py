@@ -16,7 +16,7 @@ All of this is linear in the coefficients: a ridge regression with a few hundred
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -40,6 +40,19 @@ PLACE_RIDGE: Final = 1e-3
 """The same for coefficients that depend on the position, so that a colour means much the same where nothing
 was pressed. Chosen on the simulator: after 8 presses normals under `mixed` are 55 degrees off with 1e-6, 13
 with 1e-4, 7 with 1e-3; with 1e-2 heights of a box are off by 9 % after 26 presses, instead of 7."""
+CHANNELS: Final = 3
+"""Terms of the colour that are a channel itself, not a product."""
+FEW_PRESSES: Final = 2
+"""Presses up to which the ridge below is that of a single press. With more it falls with the square of their
+number, so that it is 1e-3 for the place with 63."""
+FEW_PLACE_RIDGE: Final = 1.0
+"""Ridge penalty of coefficients that depend on the position, for a single press: it shows one place only. On
+a DIGIT, normals elsewhere are then 7 degrees off, instead of 17 with 1e-2; on a Mini 6 instead of 12."""
+FEW_COLOUR_RIDGE: Final = 0.1
+"""The same of coefficients of products of channels, which a small part of all slopes determines badly."""
+SINGLE_PRESS_ERRORS: Final[Mapping[str, float]] = {"normal_error": 7.0, "depth_stderr": 0.25}
+"""Errors of a calibration by a single press: of the normals, degrees, and of the depth, relative. Measured on
+presses elsewhere on two DIGITs and four Minis (`python -m lab.default_calibrations --judge`)."""
 OUTLIER: Final = 4.0
 """Robust standard deviations above the median misfit at which a press is rejected. Chosen by hand."""
 LEAST_SCATTER: Final = 0.1
@@ -67,16 +80,18 @@ class Photometry:
 
 
 def fit_photometry(session: Session, scale: Scale, ball_radius: float | Sequence[float]) -> Photometry:
-    """Learn slopes from presses of one ball or several.
+    """Learn slopes from presses of one ball or several; a single press is enough for a first calibration.
 
-    Outliers are rejected. The errors are those of fits to one half of the presses on the other half.
+    From `FEWEST_PRESSES` on, outliers are rejected. The errors are those of presses that a fit has not seen:
+    of one half by the other, of fewer presses of each by the others, and of a single press those that single
+    presses had on other sensors.
 
     session : what `PressFinder` found. scale : mm per px. ball_radius : mm, of all presses or of each.
 
-    Raises ConfigError if there are too few presses, all in one place, larger than the ball, or not of a ball.
+    Raises ConfigError without presses, with many in one place, larger than the ball, or not of a ball.
     """
     radii = np.broadcast_to(np.asarray(ball_radius, np.float64), len(session.presses))
-    check_presses(session, scale, radii, FEWEST_PRESSES)
+    check_presses(session, scale, radii)
     samples = prepared(session, scale, radii)
     kept = np.ones(len(samples), np.bool_)
     for _ in range(ROUNDS):
@@ -84,19 +99,27 @@ def fit_photometry(session: Session, scale: Scale, ball_radius: float | Sequence
         fitted = [sample.center(start, weights) for sample, start in zip(samples, starts, strict=True)]
         centers = np.array(fitted)
         misfit = np.array([s.misfit(c, weights).angle for s, c in zip(samples, centers, strict=True)])
-        before, kept = kept, _fitting(misfit)
+        before, kept = kept, _fitting(misfit) if len(samples) >= FEWEST_PRESSES else kept
         if (kept == before).all():
             break
     else:
         weights, _ = _fit(samples, np.flatnonzero(kept))
     good = np.flatnonzero(kept)
-    errors = _held_out(session, samples, good, scale)
+    errors: dict[str, float] = dict(SINGLE_PRESS_ERRORS)
+    if len(good) > 1:
+        errors = left_out(session, samples, good, scale, lambda chosen: _fit(samples, chosen)[0])
+    if len(good) < FEWEST_PRESSES:
+        # Where the light differs from place to place, few presses of a ball do not explain each other.
+        pairs = zip(samples, centers, strict=True)
+        errors["explained"] = float(np.median([s.misfit(c, weights).explained for s, c in pairs]))
     check_explained(errors["explained"])
     found = PhotometricEntry(
         ball_radius=float(np.median(radii)),
         presses=len(good),
         rejected=len(samples) - len(good),
         steepest=max(samples[i].reach / samples[i].ball_radius for i in good),
+        # What few presses leave open is nearly the same in all frames.
+        between=errors["depth_stderr"] if len(good) < FEWEST_PRESSES else 0.0,
         **errors,
     )
     check_error(found)
@@ -146,10 +169,19 @@ def _solve(presses: Sequence[tuple[Sample, Floats]]) -> tuple[Floats, Floats]:
     matrix = np.kron(np.eye(2), inside)
     free = np.flatnonzero(np.arange(2 * count + 2) % (count + 1) < count)
     matrix[np.ix_(free, free)] += ROUND * around
-    ridge = np.append(np.repeat([RIDGE, *[PLACE_RIDGE] * (PLACE_TERMS - 1)], COLOUR_TERMS), RIDGE)
+    ridge = np.append(_ridge(len(presses)), RIDGE)
     matrix += np.diag(np.tile(ridge, 2) * np.diag(matrix) + 1e-9 * np.trace(matrix) / len(matrix))
     solved = np.linalg.solve(matrix, aim.ravel()).reshape(2, count + 1)
     return solved[:, :count], solved[:, count]
+
+
+def _ridge(presses: int) -> Floats:
+    """(114,): ridge penalty of each coefficient, as a part of its own weight, for a number of presses."""
+    few = min(1.0, (FEW_PRESSES / presses) ** 2)
+    place = np.array([0.0] + [max(PLACE_RIDGE, FEW_PLACE_RIDGE * few)] * (PLACE_TERMS - 1))
+    colour = np.full(COLOUR_TERMS, max(RIDGE, FEW_COLOUR_RIDGE * few))
+    colour[:CHANNELS] = RIDGE
+    return np.asarray(np.maximum(place[:, None], colour).ravel())
 
 
 def _roundness(terms: NDArray[np.float32], dx: Floats, dy: Floats) -> Floats:
@@ -171,12 +203,21 @@ def _roundness(terms: NDArray[np.float32], dx: Floats, dy: Floats) -> Floats:
     return np.asarray(across.T @ across + along.T @ along, np.float64)
 
 
-def _held_out(
-    session: Session, samples: Sequence[Sample], good: NDArray[np.intp], scale: Scale
+def left_out(
+    session: Session,
+    samples: Sequence[Sample],
+    good: NDArray[np.intp],
+    scale: Scale,
+    fit: Callable[[NDArray[np.intp]], Floats],
 ) -> dict[str, float]:
-    """Errors of presses that the fit has not seen, for `PhotometricEntry`."""
-    halves = (good[::2], good[1::2]), (good[1::2], good[::2])
-    errors = [
-        errors_on(session, samples, others, _fit(samples, learned)[0], scale) for learned, others in halves
-    ]
-    return summary([*errors[0], *errors[1]])
+    """Errors of presses that a fit has not seen, for `PhotometricEntry`.
+
+    good : (n,), two presses or more, that are fitted and judged. fit : coefficients (2, 114) from some of
+    them. From `FEWEST_PRESSES` on, each half is judged by the other; fewer presses each by all others.
+    """
+    parts = 2 if len(good) >= FEWEST_PRESSES else len(good)
+    errors: list[list[float]] = []
+    for part in range(parts):
+        judged = np.arange(len(good)) % parts == part
+        errors += errors_on(session, samples, good[judged].tolist(), fit(good[~judged]), scale)
+    return summary(errors)

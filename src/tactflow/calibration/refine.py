@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactflow.calibration.file import Calibration, PhotometricEntry
 from tactflow.calibration.judgement import LEAST_EXPLAINED, check_error, check_explained, check_presses
-from tactflow.calibration.photometric import RIDGE, Photometry
+from tactflow.calibration.photometric import RIDGE, Photometry, fit_photometry, left_out
 from tactflow.calibration.presses import Session
 from tactflow.calibration.samples import TURNS, Misfit, Sample, errors_on, flat, prepared, shaped, summary
 from tactflow.engine.errors import ConfigError
@@ -23,6 +26,9 @@ press shows to 5 or 6 %; the squared ratio is 0.3."""
 BASE_WEIGHT: Final = 3.0
 """Weight of the prior of the coefficients. With 1 to 10, errors after 1, 3 and 9 presses of two Minis differ
 by a tenth at most."""
+SHARE_AFTER_ONE_PRESS: Final = 0.5
+"""Part of a default's error that is left after one press, beside the error of the press itself. On three
+Minis 0.4 to 0.9 of the error of the depth remain in all, and 0.6 to 0.9 of that of the normals."""
 
 
 def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: Calibration) -> Photometry:
@@ -33,49 +39,66 @@ def refine_photometry(session: Session, scale: Scale, ball_radius: float, base: 
     their prior is the mapped ones, and its precision is proportional to the Gram matrix of the presses that
     the base was learned from, so more presses adapt more of the dependence on position and colour.
 
-    Presses that do not look like a ball to the base are left out. base : with slopes. The other parameters
-    are those of `fit_photometry`.
+    Beside it the slopes are fitted from scratch, and from two presses on the better fit is kept, by its
+    normals on presses left out. Presses that do not look like a ball to the base are left out.
+
+    base : with slopes. The other parameters are those of `fit_photometry`.
 
     Raises ConfigError without presses, if most are not of a ball, or contacts are larger than the ball.
     """
     if base.slopes is None or base.photometric is None or base.information is None:
         raise ConfigError("calibrate --refine: required a calibration with depth")
     radii = np.full(len(session.presses), ball_radius)
-    check_presses(session, scale, radii, fewest=1)
+    check_presses(session, scale, radii)
     samples = prepared(session, scale, radii)
     start = flat(base.slopes)
     explained = np.array([_by_base(sample, start).explained for sample in samples])
     check_explained(float(np.median(explained)))
+    refined = _refinement(session, scale, samples, explained, base)
+    if refined.found.presses > 1:
+        # Where a fit from scratch fails, the refinement stands.
+        with suppress(ConfigError):
+            fresh = fit_photometry(session, scale, ball_radius)
+            if fresh.found.normal_error < refined.found.normal_error:
+                return fresh
+    check_error(refined.found)
+    return refined
+
+
+def _refinement(
+    session: Session, scale: Scale, samples: Sequence[Sample], explained: Floats, base: Calibration
+) -> Photometry:
+    """The refined base. samples : of all presses. explained : (n,), share of each that the base explains."""
+    assert base.slopes is not None
+    assert base.photometric is not None
+    assert base.information is not None
+    start, information, before = flat(base.slopes), base.information, base.photometric
     kept = explained >= LEAST_EXPLAINED
     good = np.flatnonzero(kept)
-    weights = _refined([samples[i] for i in good], start, base.information)
+
+    def fit(chosen: NDArray[np.intp]) -> Floats:
+        return _refined([samples[i] for i in chosen], start, information)
+
+    weights = fit(good)
     centers = np.array([sample.center(sample.start, weights) for sample in samples])
     misfit = np.array([s.misfit(c, weights).angle for s, c in zip(samples, centers, strict=True)])
-    before, count = base.photometric, len(good)
-    errors = []
-    for number in good.tolist():
-        # There is nothing to cross-validate a single press with.
-        others = [samples[i] for i in good if i != number or count == 1]
-        errors += errors_on(session, samples, [number], _refined(others, start, base.information), scale)
-    left_out = summary(errors)
-
-    def with_base(name: str) -> float:
-        # The known error of the base counts as one press more.
-        return float(np.sqrt((getattr(before, name) ** 2 + count * left_out[name] ** 2) / (1 + count)))
-
+    if len(good) > 1:
+        errors = left_out(session, samples, good, scale, fit)
+    else:
+        # Nothing is left out of a single press.
+        errors = summary(errors_on(session, samples, good.tolist(), weights, scale))
+        for name in ("normal_error", "depth_stderr"):
+            errors[name] = math.hypot(SHARE_AFTER_ONE_PRESS * getattr(before, name), errors[name])
     found = PhotometricEntry(
-        ball_radius=ball_radius,
-        presses=count,
-        rejected=len(samples) - count,
+        ball_radius=samples[0].ball_radius,
+        presses=len(good),
+        rejected=len(samples) - len(good),
         steepest=max(before.steepest or 0.0, *(samples[i].reach / samples[i].ball_radius for i in good)),
-        explained=float(np.median(explained)),
-        between=before.between / (1 + count) ** 0.5,
-        normal_error=with_base("normal_error"),
-        depth_stderr=with_base("depth_stderr"),
+        between=before.between * SHARE_AFTER_ONE_PRESS / math.sqrt(len(good)),
+        **errors,
     )
-    check_error(found)
     pixels = centers / (scale.x, scale.y) + scale.origin
-    return Photometry(SlopeModel(shaped(weights)), base.information, found, pixels, kept, misfit)
+    return Photometry(SlopeModel(shaped(weights)), information, found, pixels, kept, misfit)
 
 
 def _refined(samples: Sequence[Sample], start: Floats, information: Floats) -> Floats:

@@ -13,9 +13,10 @@ from typing import Any, Final, Literal, Protocol
 
 from tactflow.calibration import force
 from tactflow.calibration.darkness import fit_darkness
-from tactflow.calibration.file import Calibration, ScaleEntry, raw_corners, small_picture
+from tactflow.calibration.file import UNLIKE, Calibration, ScaleEntry, raw_corners, small_picture
 from tactflow.calibration.guide import Guide
-from tactflow.calibration.judgement import doubt
+from tactflow.calibration.judgement import FEWEST_PRESSES, doubt
+from tactflow.calibration.likeness import place
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import NEEDED, PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference
@@ -127,10 +128,7 @@ def learn(
     base : of the pipeline, where a refinement begins; otherwise it only helps to judge. Raises ConfigError if
     the session gives no calibration.
     """
-    if base is not None and (misfit := base.misfit(session.mapping)) is not None:
-        if wish.method == "refine":
-            raise ConfigError(f"calibrate --refine: the calibration of the pipeline does not fit: {misfit}")
-        base = None
+    base = None if base is None else _fitting_base(session, wish, base, say)
     scale, found_by = _scale(session, wish, base)
     say(
         f"scale: {scale.x:.5f} +- {scale.stderr[0]:.5f} mm per px in x, "
@@ -144,7 +142,8 @@ def learn(
         )
     depth: dict[str, Any] = {}
     if wish.ball_radius is not None:
-        say(f"{len(session.presses)} presses; learning from them ...")
+        count = len(session.presses)
+        say("1 press; learning from it ..." if count == 1 else f"{count} presses; learning from them ...")
         depth = _depth(session, wish.method, wish.ball_radius, scale, base, say)
     return Calibration(
         sensor=sensor,
@@ -159,6 +158,32 @@ def learn(
     )
 
 
+def _fitting_base(session: Session, wish: Wish, base: Calibration, say: Say) -> Calibration | None:
+    """The calibration of the pipeline, as it is for the pictures of the session; None where it does not fit.
+
+    Raises ConfigError if it does not fit, and a refinement was to have its scale.
+    """
+    size = session.mapping.size
+    words = base.misfit(session.mapping)
+    if words is None and base.kind is None:
+        unlike = base.unlikeness(session.untouched)
+        if unlike <= UNLIKE:
+            return base
+        words = f"its untouched gel differs by {100 * unlike:.0f} % of its brightness: another sensor"
+    elif words is None:
+        scale, words = place(base, session.untouched, session.mapping, session.dots)
+        if scale is not None:
+            return base.at(scale, size)
+        if wish.method == "refine" and base.slopes is None:
+            # Lengths do not depend on the light.
+            return base
+    if wish.method == "refine":
+        if wish.pitch is None and wish.area is None:
+            raise ConfigError(f"calibrate --refine: the calibration of the pipeline does not fit: {words}")
+        say(f"the calibration of the pipeline does not fit, and a new one is made: {words}")
+    return None
+
+
 def _scale(session: Session, wish: Wish, base: Calibration | None) -> tuple[Scale, str]:
     """Millimetres per pixel, and how they were found; those of the base unless the wish gives some."""
     size = session.mapping.size
@@ -168,7 +193,11 @@ def _scale(session: Session, wish: Wish, base: Calibration | None) -> tuple[Scal
         if wish.area is not None:
             width, height = wish.area
             return scale_from_area(wish.area, size), f"area of {width:g} x {height:g} mm"
-        assert base is not None
+        if base is None:
+            raise ConfigError(
+                "calibrate --refine: required one of --pitch MM and --area WIDTH HEIGHT, for the scale, "
+                "since the pipeline has no calibration"
+            )
         return base.scale_at(size), base.scale_entry.found_by
     except ValueError as problem:
         raise ConfigError(f"calibrate: {problem}") from None
@@ -187,7 +216,7 @@ def _depth(
     else:
         if base is not None and base.slopes is not None:
             apparent = apparent_radius(session, scale, radius, base)
-        if method == "refine" and base is not None:
+        if method == "refine" and base is not None and base.slopes is not None:
             colours = refine_photometry(session, scale, radius, base)
         else:
             colours = fit_photometry(session, scale, radius)
@@ -198,6 +227,8 @@ def _depth(
             "information": colours.information,
         }
         words = photometric_words(colours.found.model_dump())
+        if colours.found.presses < FEWEST_PRESSES:
+            words += "; more presses, all over the gel, make it better"
     if (question := doubt(session, scale, radius, apparent)) is not None:
         say(question)
     for press, is_kept, misfit in zip(session.presses, kept, misfits, strict=True):

@@ -77,7 +77,7 @@ OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
         "action": "store_true",
         "help": "start from the pipeline's calibration, such as the default of a kind of sensor, and adapt "
         "it to this sensor by one or more presses of the ball; the scale is kept unless --pitch or --area is "
-        "given",
+        "given. Slopes are also fitted from scratch, and the better of the two is kept",
     },
     "--darkness": {
         "action": "store_true",
@@ -205,10 +205,6 @@ def _base(args: argparse.Namespace, pipeline: str | None) -> Calibration | None:
         path = load(pipeline, source=args.source, sensor=args.sensor).calibration
         if path is not None:
             return Calibration.load(path)
-    if args.refine:
-        raise ConfigError(
-            "calibrate --refine: required a pipeline with a calibration, such as mini, mini_plain or digit"
-        )
     return None
 
 
