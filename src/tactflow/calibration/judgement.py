@@ -25,6 +25,9 @@ LEAST_EXPLAINED: Final = 0.7
 """Median share of the slopes of presses that a fit to others must explain. Two faces of an edge can explain
 0.36 of the slopes of a ball, (E|x|)^2 / E(x^2 + y^2) on a disc. Balls on five gels have 0.94 to 0.99, edges
 of a cube 0.53 with their own fit and 0.26 with that of a ball."""
+LEAST_EXPLAINED_ALONE: Final = 0.83
+"""The same of fewer presses, each with a fit of its own. Balls on four gels have 0.89 to 1, edges of a cube
+0.59 to 0.76."""
 LARGEST_ERROR: Final = 0.35
 """Relative error of depth above which a fit is refused. By hand: balls on five gels have 0.04 to 0.14."""
 SHALLOW: Final = 0.4
@@ -65,10 +68,10 @@ def check_presses(session: Session, scale: Scale, radii: Floats) -> None:
         )
 
 
-def check_explained(explained: float) -> None:
+def check_explained(explained: float, least: float = LEAST_EXPLAINED) -> None:
     """Raise ConfigError if too little of the slopes is explained for presses of a ball."""
-    if explained < LEAST_EXPLAINED:
-        share, required = distinct(100 * explained, 100 * LEAST_EXPLAINED)
+    if explained < least:
+        share, required = distinct(100 * explained, 100 * least)
         raise ConfigError(
             f"calibrate: the colours explain {share} % of the slopes that a ball would "
             f"have ({required} % required): the object is not a ball, nothing "

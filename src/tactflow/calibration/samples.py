@@ -104,6 +104,21 @@ class Sample:
         terms = self.terms[self.on_ball(center)].astype(np.float64)
         return np.asarray(terms.T @ terms)
 
+    def explained_alone(self, center: Floats) -> float:
+        """Share of the normals of the ball that a fit of the colours of this press alone explains, 0 to 1.
+
+        Like `Misfit.explained`, but nothing else is known of the sensor: the least that a ball must show.
+        """
+        ball = self.on_ball(center)
+        if np.count_nonzero(ball) < FEWEST_PIXELS:
+            return 0.0
+        true = self.true_normals(center, ball)
+        true -= true.mean(axis=0)
+        terms = self.terms[ball][:, :COLOUR_TERMS].astype(np.float64)
+        terms -= terms.mean(axis=0)
+        left = true - terms @ np.linalg.lstsq(terms, true, rcond=None)[0]
+        return 1 - float((left**2).sum() / (true**2).sum())
+
     def misfit(self, center: Floats, weights: Floats) -> Misfit:
         """Compare the fitted normals with those of the ball."""
         ball = self.on_ball(center)
