@@ -57,6 +57,8 @@ WITH_DEPTH = ("mini",)
 DOT_PITCH = {"mini": 2.03}
 """Spacing of the dots of a gel with dots, mm: of `mini_ball`, at the scale of `lab.depth`, 2.07 and 2.00
 along x and y."""
+GEL_THICKNESS = {"mini": 4.0}
+"""File -> thickness of the gel, mm."""
 OTHERS = {"mini": ("mini_ball", "mini_ball_9mm", "mini_ball_4mm")}
 """File -> sets of other sensors of the kind."""
 DIGITS = ("digit_fots", "digit_ball")
@@ -101,6 +103,7 @@ def make(file: str, sessions: Sessions) -> Calibration:
         sensor=file,
         kind=kind,
         dot_pitch=DOT_PITCH.get(file),
+        gel_thickness=GEL_THICKNESS.get(file),
         made_from=origin,
         raw_size=session.mapping.raw_size,
         size=session.mapping.size,
