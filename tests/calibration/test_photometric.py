@@ -128,7 +128,7 @@ def test_few_presses_give_a_calibration_that_states_a_larger_error(
     errors = summary(press_errors(replace(session, presses=others), found.model, SCALE, BALL))
     assert errors["normal_error"] < degrees
     assert found.found.presses == count
-    assert found.found.depth_stderr > learned.found.depth_stderr
+    assert found.found.normal_error > learned.found.normal_error
     assert found.found.between == found.found.depth_stderr
 
 

@@ -91,7 +91,7 @@ def test_stated_errors_after_one_press_hold_on_the_others(base: Calibration, oth
     refined = refine_photometry(some(other, slice(1)), SCALE, BALL, known)
     found = errors(refined.model, other)
     assert found["depth_stderr"] < refined.found.depth_stderr < wider.depth_stderr
-    assert refined.found.between == pytest.approx(wider.between / 2**0.5)
+    assert refined.found.between == pytest.approx(wider.between / 2)
 
 
 def test_presses_that_are_no_ball_are_refused(base: Calibration, other: Session) -> None:
@@ -116,7 +116,7 @@ def test_a_fit_from_scratch_is_kept_where_it_is_the_better_one(base: Calibration
     assert np.array_equal(refined.model.coefficients, fresh.model.coefficients)
     few = some(presses, slice(2))
     kept = refine_photometry(few, SCALE, BALL, base)
-    assert kept.found.normal_error < fit_photometry(few, SCALE, BALL).found.normal_error
+    assert kept.found.normal_error <= fit_photometry(few, SCALE, BALL).found.normal_error
 
 
 def test_a_press_that_is_no_ball_is_left_out_among_others(base: Calibration, other: Session) -> None:
@@ -158,7 +158,7 @@ def test_another_mini_has_depth_by_the_default_and_says_once_that_it_is_one(
     source = pictures_of(folder, "background.png", names, tmp_path / "presses")
     with caplog.at_level(logging.INFO, "tactflow"):
         results = list(tactflow.stream("mini_plain", source=str(source), images=True))
-    assert caplog.text.count("default calibration of a GelSight Mini: depth +- 11 %, lengths +- 5 %") == 1
+    assert caplog.text.count("default calibration of a GelSight Mini: depth +- 16 %, lengths +- 5 %") == 1
     deep = [result for result in results if result.depth]
     assert len(deep) == len(names)
     for result in deep:
