@@ -153,7 +153,7 @@ def as_it_is(picture: Picture) -> Picture:
         (as_it_is, [32, 24, 256, 192], ""),
         (np.fliplr, [32, 24, 256, 192], "the picture is mirrored"),
         (as_it_is, [96, 72, 128, 96], "it is cropped or zoomed"),
-        (as_it_is, None, "stages.preprocess.crop=[32, 24, 256, 192]"),
+        (as_it_is, None, "the housing around the gel; crop it to the sensing area"),
     ],
     ids=["as it is", "mirrored", "cropped twofold", "uncropped"],
 )

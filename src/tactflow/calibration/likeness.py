@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +27,7 @@ LIGHT_FLOOR: Final = 20.0
 """Grey levels added before the logarithm, so that the noise of a dark channel does not count."""
 LARGEST_MISFIT: Final = 0.09
 """RMS difference of the logarithms above which the light is that of another kind of sensor. Minis of five
-labs have 0.04 to 0.07, one that shows its housing 0.11, nine other kinds of sensor 0.18 to 0.6."""
+labs have 0.04 to 0.07, nine other kinds of sensor 0.18 to 0.6."""
 LEAST_ZOOM: Final = 0.45
 """Zoom below which nothing is recognised: the light of a small part of the gel is as even as that of many
 sensors."""
@@ -37,6 +38,11 @@ LARGEST_DISAGREEMENT: Final = 1.4
 """The same between the zoom by the pitch of the dots and that by the light, which errs by up to 1.25."""
 PITCH_ERROR: Final = 0.03
 """Relative standard error of the pitch of a kind's dots: on one gel it differs by 3.5 % between x and y."""
+LARGEST_BORDER_STEP: Final = 0.1
+"""Step of the logarithm of a channel near a border of the picture, over 1 / 50 of its side, above which it
+shows the housing around the gel. Five Minis, also with dots, have at most 0.07, one with its housing 0.15."""
+BORDER: Final = 1 / 8
+"""Part of the picture along each side in which the housing may show."""
 ZOOMS: Final = np.exp(np.arange(-1.2, 0.55, 0.05))
 """Zooms that are tried: 0.3 to 1.6 in steps of 5 %."""
 CROPS: Final = (0.9, 0.85, 0.8, 0.75, 0.7)
@@ -107,7 +113,7 @@ def place(
     if misfit is not None:
         return Placement(None, misfit)
     match = match_light(calibration.look, untouched)
-    if not match.fits:
+    if not match.fits or border_step(untouched) > LARGEST_BORDER_STEP:
         return Placement(None, _difference(calibration, untouched, mapping, match))
     size = mapping.size
     usual = calibration.scale_at(size)
@@ -155,7 +161,7 @@ def _difference(
     calibration: Calibration, untouched: NDArray[np.uint8], mapping: PixelMapping, match: Match
 ) -> str:
     """Why the light does not fit: a turned picture, the housing around the gel, or another sensor."""
-    for quarters in (2, 1, 3):
+    for quarters in () if match.fits else (2, 1, 3):
         if match_light(calibration.look, np.rot90(untouched, quarters)).fits:
             return (
                 f"by the light at rest, the picture is turned by {90 * quarters} degrees clockwise, or "
@@ -166,6 +172,11 @@ def _difference(
         return (
             "the picture shows the housing around the gel; crop it to the sensing area, such as "
             f"stages.preprocess.crop={cut}"
+        )
+    if match.fits:
+        return (
+            f"near its border the light changes by {100 * border_step(untouched):.0f} % in a step: the "
+            "picture shows the housing around the gel, or something touches it; see stages.preprocess.crop"
         )
     measured, limit = distinct(100 * match.misfit, 100 * LARGEST_MISFIT)
     return (
@@ -181,16 +192,40 @@ def _crop_to_gel(
     None if there is none."""
     height, width = untouched.shape[:2]
     wide, high = mapping.raw_size
-    least, crop = math.log(LARGEST_ZOOM), None
+    least, crop = LARGEST_MISFIT, None
     for share in CROPS:
         margin = (1 - share) / 2
         x, y = round(width * margin), round(height * margin)
-        match = match_light(calibration.look, untouched[y : height - y, x : width - x])
-        off = abs(math.log(match.zoom))
-        if match.fits and off < least:
-            least = off
-            crop = [round(part) for part in (wide * margin, high * margin, wide * share, high * share)]
+        part = untouched[y : height - y, x : width - x]
+        match = match_light(calibration.look, part)
+        zoomed = max(match.zoom, 1 / match.zoom) > LARGEST_ZOOM
+        if zoomed or match.misfit >= least or border_step(part) > LARGEST_BORDER_STEP:
+            continue
+        least = match.misfit
+        crop = [round(side) for side in (wide * margin, high * margin, wide * share, high * share)]
     return crop
+
+
+def border_step(untouched: NDArray[np.uint8]) -> float:
+    """Largest step of the logarithm of a channel near the border of a picture (H, W, 3) uint8.
+
+    >>> gel = np.full((120, 160, 3), 100, np.uint8)
+    >>> gel[:, :10] = 150
+    >>> border_step(gel) > 0.3 > border_step(gel[:, 20:])
+    True
+    """
+    height, width = untouched.shape[:2]
+    smooth = cv2.GaussianBlur(untouched, (0, 0), 1).astype(np.float32) + LIGHT_FLOOR
+    steps = []
+    for lines in (
+        smooth[height // 4 : height - height // 4].mean(axis=0),
+        smooth[:, width // 4 : width - width // 4].mean(axis=1),
+    ):
+        light, apart = np.log(lines), max(1, len(lines) // 50)
+        step = np.abs(light[apart:] - light[:-apart]).max(axis=1)
+        edge = max(1, round(len(step) * BORDER))
+        steps += [step[:edge].max(), step[-edge:].max()]
+    return float(max(steps))
 
 
 def _log_light(look: NDArray[np.floating]) -> Floats:
