@@ -66,8 +66,8 @@ DIGITS = ("digit_fots", "digit_ball")
 KIND_SCALE = 0.05
 """Relative standard error of the scale on another sensor of the kind: on three DIGITs their owners measured
 18.7, 19.6 and 21.1 pixels per mm."""
-COUNTS = (1, 3, 20)
-"""Own presses that a DIGIT is calibrated by."""
+COUNTS = (3, 20)
+"""Own presses from all over the gel that a DIGIT is calibrated by, beside single ones."""
 
 
 def main() -> None:
@@ -220,8 +220,7 @@ def judge_digits(sessions: Sessions, count: int) -> None:
         fitted = fit_photometry(session, scale, radii)
         base = replace_fit(make("digit", {**sessions, "digit_fots": sessions[other]}), fitted)
         print(digit_row(name, 0, "other DIGIT", fitted, judged), flush=True)
-        for own in COUNTS:
-            few, few_scale, balls = some(presses, own)
+        for own, (few, few_scale, balls) in few_of(presses):
             for way in ("refined", "from scratch"):
                 try:
                     if way == "refined":
@@ -232,6 +231,18 @@ def judge_digits(sessions: Sessions, count: int) -> None:
                     print(f"{name:15} {own:11d}  {way:12} refused: {problem}")
                 else:
                     print(digit_row(name, own, way, found, judged), flush=True)
+
+
+def few_of(presses: Presses) -> Iterator[tuple[int, Presses]]:
+    """Few presses: each of the three next to the middle, where a user presses first; others from all over."""
+    session, scale, radii = presses
+    middle = np.divide(session.mapping.size, 2)
+    far = [float(np.hypot(*(press.center - middle))) for press in session.presses]
+    for number in np.argsort(far)[:3].tolist():
+        one, balls = chosen(session, radii, slice(number, number + 1))
+        yield 1, (one, scale, balls)
+    for count in COUNTS:
+        yield count, some(presses, count)
 
 
 def replace_fit(known: Calibration, fitted: Photometry) -> Calibration:
