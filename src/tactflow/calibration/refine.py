@@ -77,7 +77,7 @@ def _refinement(
     good = np.flatnonzero(kept)
 
     def fit(chosen: NDArray[np.intp]) -> Floats:
-        return _refined([samples[i] for i in chosen], start, information)
+        return _refined([samples[i] for i in chosen.tolist()], start, information)
 
     weights = fit(good)
     centers = np.array([sample.center(sample.start, weights) for sample in samples])
