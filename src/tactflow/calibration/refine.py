@@ -93,7 +93,9 @@ def _refinement(
         ball_radius=samples[0].ball_radius,
         presses=len(good),
         rejected=len(samples) - len(good),
-        steepest=max(before.steepest or 0.0, *(samples[i].reach / samples[i].ball_radius for i in good)),
+        steepest=max(
+            before.steepest or 0.0, *(samples[i].reach / samples[i].ball_radius for i in good.tolist())
+        ),
         between=before.between * SHARE_AFTER_ONE_PRESS / math.sqrt(len(good)),
         **errors,
     )
