@@ -125,17 +125,11 @@ def test_the_contact_of_a_ball_is_found_with_its_middle(noise: float) -> None:
     assert math.hypot(x.mean() - center[0], y.mean() - center[1]) < 1  # measured 0.1 to 0.3
 
 
-def test_a_brightened_area_is_contact() -> None:
+@pytest.mark.parametrize("change", [40, -40], ids=["brighter", "darker"])
+def test_a_brighter_or_darker_area_is_contact(change: float) -> None:
     gel = _gel()
-    bright = gel + 40 * _sunk(gel.shape[:2], (61, 83), 24)[..., None]
-    mask = _detector(_noisy(gel, 1)).detect(_noisy(bright, 2)).mask > 0
-    assert _overlap(mask, _disc(mask.shape, (61, 83), 24)) > 0.9
-
-
-def test_a_darkened_area_is_contact_too() -> None:
-    gel = _gel()
-    dark = gel - 40 * _sunk(gel.shape[:2], (61, 83), 24)[..., None]
-    mask = _detector(_noisy(gel, 1)).detect(_noisy(dark, 2)).mask > 0
+    pressed = gel + change * _sunk(gel.shape[:2], (61, 83), 24)[..., None]
+    mask = _detector(_noisy(gel, 1)).detect(_noisy(pressed, 2)).mask > 0
     assert _overlap(mask, _disc(mask.shape, (61, 83), 24)) > 0.9
 
 

@@ -13,6 +13,8 @@ from lerobot.cameras.configs import CameraConfig, ColorMode
 class Output(StrEnum):
     """What the camera returns; (H, W) is the size of the processed frame.
 
+    Attributes
+    ----------
     image : (H, W, 3) uint8, the processed frame.
     difference : (H, W, 3) uint8, 128 + half of the change against the untouched gel, without its dots.
     depth : (H, W, 3) uint8, grey, depth of the indentation: `depth_mm` or more is 255.

@@ -19,9 +19,9 @@ from tactflow.tools.stress.parts import Listing, Part, Worst
 from tactflow.tools.stress.subjects import Subject
 from tactflow.vision import compiled
 
-STEP = 4
+STEP_FRAMES = 4
 """Every fourth frame of a scene."""
-LONGEST = 60
+MAX_FRAMES = 60
 """Longest part of a scene, frames."""
 
 
@@ -32,13 +32,13 @@ def run_arithmetic(subjects: Sequence[Subject], *, quick: bool) -> Part:
         "Loops in C with float32 and sums in any order, against the same loops in NumPy with float64: the "
         "largest difference of each number over all frames of all scenes.",
     )
-    cases = [Case(c.name, min(c.frames, LONGEST), c.query, c.suffix) for c in (*FULL, *TROUBLES)]
+    cases = [Case(c.name, min(c.frames, MAX_FRAMES), c.query, c.suffix) for c in (*FULL, *TROUBLES)]
     rows = []
     for subject in [subject for subject in subjects if not subject.reference]:
         worst = Worst(subject.name)
         largest: dict[str, float] = {}
         for case in QUICK[:1] if quick else cases:
-            plain = clip(case, STEP)
+            plain = clip(case, STEP_FRAMES)
             if bool(len(plain.scene.layout.rest)) != subject.dots:
                 continue
             fast = [numbers(result) for result in subject.run(plain.frames)]

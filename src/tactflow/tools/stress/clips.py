@@ -23,7 +23,7 @@ from tactflow.vision.types import Markers, MarkerStatus
 Image = NDArray[np.uint8]
 Matrix = NDArray[np.float64]
 
-DEEP: Final = 0.5
+DEEP_SHARE: Final = 0.5
 """Share of its full depth from which a contact must be found, as in the bench."""
 
 
@@ -31,7 +31,11 @@ DEEP: Final = 0.5
 class Clip:
     """Frames of a simulated scene at the size of processed frames, and where the truth about them lies.
 
-    scene : of the simulator. indices : its frames. frames : (H, W, 3) uint8 each; the first is the reference.
+    Attributes
+    ----------
+    scene : of the simulator.
+    indices : its frames.
+    frames : (H, W, 3) uint8 each; the first is the reference.
     matrices : (3, 3) for each frame, from the pixels of the plain clip to those of this one.
     """
 
@@ -46,7 +50,7 @@ class Clip:
         height, width = self.frames[number].shape[:2]
         matrix = self.matrices[number] @ self.mapping.matrix
         index = self.indices[number]
-        deep = any(p.depth >= DEEP * p.shape.depth - 1e-9 for p in self.scene.presses(index))
+        deep = any(p.depth >= DEEP_SHARE * p.shape.depth - 1e-9 for p in self.scene.presses(index))
         truth = _truth(self.scene, index, (width, height), matrix.tobytes())
         shift = (self.matrices[number] - self.matrices[0])[:2, 2]
         if shift.any():
@@ -115,9 +119,9 @@ class DotErrors:
         self._seen.append(errors[(status == MarkerStatus.TRACKED) & truth.visible[found]])
         # A dot that is inferred without a standard error is one of which nothing is claimed.
         unknown = np.where(status == MarkerStatus.TRACKED, 0.0, np.inf)
-        claimed = SILENT_STDERR * np.where(np.isnan(stated), unknown, stated)
+        claimed = SILENT_ERROR_STDERRS * np.where(np.isnan(stated), unknown, stated)
         lost = status == MarkerStatus.LOST
-        self._silent.append((errors > SILENT_PX) & (errors > claimed) & ~lost)
+        self._silent.append((errors > SILENT_ERROR_PX) & (errors > claimed) & ~lost)
 
     def summary(self) -> dict[str, float]:
         """`SEEN_RMS` and `SILENT_PERCENT`, where there were dots."""
@@ -138,25 +142,25 @@ def _truth(scene: Scene, index: int, size: tuple[int, int], matrix: bytes) -> Tr
 SEEN_RMS, SILENT_PERCENT = "seen_rms", "silent_percent"
 """RMS error of the displacement of dots that a method says it sees, px; share of dots that are wrong although
 nothing says so, %."""
-SILENT_PX: Final = 1.0
+SILENT_ERROR_PX: Final = 1.0
 """Error of a dot from which it is wrong, px: half the width of the edge of a dot."""
-SILENT_STDERR: Final = 4.0
+SILENT_ERROR_STDERRS: Final = 4.0
 """Error, in stated standard errors, which they do not explain: 1 in 16,000 of normal errors."""
 
-MARKED: Final = (Case("bright_cable", 40), Case("press", 44), Case("jumps", 40))
-BARE: Final = (Case("unmarked", 44),)
+MARKED_CASES: Final = (Case("bright_cable", 40), Case("press", 44), Case("jumps", 40))
+BARE_CASES: Final = (Case("unmarked", 44),)
 """Scenes for pipelines that track dots, and for those that do not. Every method sees the first one."""
-STEP: Final = 2
+STEP_FRAMES: Final = 2
 """Every second frame: contacts that come and go within a few frames, and half the work."""
 
 
 def cases_for(*, dots: bool, count: int | None = None) -> tuple[Case, ...]:
     """The first scenes for a pipeline that tracks dots or does not. count : None for all."""
-    return (MARKED if dots else BARE)[:count]
+    return (MARKED_CASES if dots else BARE_CASES)[:count]
 
 
 @lru_cache(maxsize=64)
-def clip(case: Case, step: int = STEP) -> Clip:
+def clip(case: Case, step: int = STEP_FRAMES) -> Clip:
     """Every `step`-th frame of a case, halved to 400 x 300 px."""
     scene = open_scene(f"{case.name}?frames={case.frames}&{case.query}".rstrip("&"))
     small = Preprocessor(scene.size, downsample=2)
@@ -174,7 +178,7 @@ def clean(case: Case, number: int, *, dots: bool) -> NDArray[np.float64]:
     """A frame of a clip without noise, (H, W, 3) float64. dots : with its markers."""
     query = f"{case.name}?frames={case.frames}&{case.query}".rstrip("&")
     scene = open_scene(f"{query}&noise=0" if dots else query)
-    index = number * STEP
+    index = number * STEP_FRAMES
     picture = scene.frame(index) if dots else scene.clean(index)
     half = (picture.shape[1] // 2, picture.shape[0] // 2)
     return np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.float64)

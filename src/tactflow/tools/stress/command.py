@@ -23,11 +23,11 @@ from tactflow.tools.stress.report import SCHEMA, Report, lines, save_picture, st
 from tactflow.tools.stress.same import Answers, load_answers, run_same
 from tactflow.tools.stress.subjects import Subject, stage_components, subjects, swapped
 
-BROKEN: Final = 3
+BROKEN_EXIT_CODE: Final = 3
 """Exit code when a promise is broken."""
 PARTS: Final = ("arithmetic", "perturbation", "conditioning", "swapped", "degenerate", "long", "same")
 """Names of the parts, in the order in which they run."""
-ONLY_FULL: Final = frozenset({"arithmetic", "swapped"})
+FULL_PARTS: Final = frozenset({"arithmetic", "swapped"})
 """Parts that a quick run leaves out: to compile all loops a second time takes longer than all the rest, and
 there are many stages to swap in."""
 SWAPPED_UNDER: Final = ("noise", "displacement a frame")
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
                 save_picture(report, path, PICTURE_OF)
         say(f"tactflow: wrote {path}")
     say(f"tactflow: {report.summary}")
-    return BROKEN if report.broken else 0
+    return BROKEN_EXIT_CODE if report.broken else 0
 
 
 def _parts(
@@ -143,7 +143,7 @@ def _parts(
         "long": lambda: run_endurance(who, quick=quick, length=args.frames),
         "same": same,
     }
-    chosen = args.part or [name for name in PARTS if not (quick and name in ONLY_FULL)]
+    chosen = args.part or [name for name in PARTS if not (quick and name in FULL_PARTS)]
     return {name: known[name] for name in PARTS if name in chosen}
 
 

@@ -16,9 +16,9 @@ from tactflow.tools.stress.parts import PROMISES, Worst
 from tactflow.vision.geometry.mapping import project
 from tactflow.vision.types import MarkerStatus
 
-FLOW_FLOOR: Final = 0.05
+FLOW_TOLERANCE_PX: Final = 0.05
 """Differences of flows that do not matter, px: the tolerance of results."""
-NUMBERS: Final[Mapping[str, str]] = {
+NUMBER_UNITS: Final[Mapping[str, str]] = {
     "dots": "px",
     "center": "px",
     "angle": "deg",
@@ -65,7 +65,7 @@ def difference(
             moved = project(by, np.array([one[key]], np.float64))[0]
             found[key] = float(metrics.distance(moved, other[key]))
     if "flow" in found:
-        found["flow_stated"] = found["flow"] / max(FLOW_FLOOR, one["flow_stderr"])
+        found["flow_stated"] = found["flow"] / max(FLOW_TOLERANCE_PX, one["flow_stderr"])
     if "angle" in one and "angle" in other:
         angle = np.radians(one["angle"])
         # Angles are counter-clockwise on the screen, whose y axis points down.
@@ -107,10 +107,10 @@ def add_differences(
 
 
 def cells(largest: Mapping[str, float]) -> list[str]:
-    """The differences as cells of a table with the columns `NUMBERS`."""
-    return [f"{largest[key]:.2g}" if key in largest else "-" for key in NUMBERS]
+    """The differences as cells of a table with the columns `NUMBER_UNITS`."""
+    return [f"{largest[key]:.2g}" if key in largest else "-" for key in NUMBER_UNITS]
 
 
 def heads() -> list[str]:
     """Columns for `cells`."""
-    return [f"{key}, {unit}" for key, unit in NUMBERS.items()]
+    return [f"{key}, {unit}" for key, unit in NUMBER_UNITS.items()]

@@ -19,11 +19,11 @@ from tactflow.tools.stress.subjects import Subject
 Array = NDArray[Any]
 Matrix = NDArray[np.float64]
 
-PIXELS: Final = 9
+CHANGED_PIXELS: Final = 9
 """Pixels that are changed by a grey level, one in each run."""
-MARGIN: Final = 2
+MARGIN_PX: Final = 2
 """Border that is cut off so that a picture can be shifted without inventing pixels, px."""
-SCENES: Final = 2
+SCENE_COUNT: Final = 2
 """Scenes that each pipeline is run on."""
 
 
@@ -31,7 +31,10 @@ SCENES: Final = 2
 class Turn:
     """A change of the whole recording that turns results along.
 
-    change : of an array (H, W, ...). matrix : (3, 3), of pixels, for a picture of size (width, height).
+    Attributes
+    ----------
+    change : of an array (H, W, ...).
+    matrix : (3, 3), of pixels, for a picture of size (width, height).
     """
 
     change: Callable[[Array], Array]
@@ -45,8 +48,8 @@ def _affine(a: float, b: float, x: float, c: float, d: float, y: float) -> Matri
 def _inner(right: int, down: int) -> Callable[[Array], Array]:
     def cut(array: Array) -> Array:
         height, width = array.shape[:2]
-        top, left = MARGIN - down, MARGIN - right
-        return array[top : top + height - 2 * MARGIN, left : left + width - 2 * MARGIN]
+        top, left = MARGIN_PX - down, MARGIN_PX - right
+        return array[top : top + height - 2 * MARGIN_PX, left : left + width - 2 * MARGIN_PX]
 
     return cut
 
@@ -62,7 +65,7 @@ TURNS: Final[Mapping[str, Turn]] = {
 
 
 def run_conditioning(
-    subjects: Sequence[Subject], *, quick: bool, seed: int = 1, scenes: int = SCENES
+    subjects: Sequence[Subject], *, quick: bool, seed: int = 1, scenes: int = SCENE_COUNT
 ) -> Part:
     """Every pipeline under changes that mean little. scenes : on so many scenes only."""
     part = Part(
@@ -99,13 +102,13 @@ def _changes(
     last = len(plain.frames) - 1
     random = np.random.default_rng(seed)
     largest: dict[str, float] = {}
-    for y, x, channel in _pixels(plain, random, 2 if quick else PIXELS):
+    for y, x, channel in _pixels(plain, random, 2 if quick else CHANGED_PIXELS):
         frame = plain.frames[last].copy()
         frame[y, x, channel] += 1 if frame[y, x, channel] < 255 else -1
         after = _numbers(subject.run([*plain.frames[:last], frame]))
         found = add_differences(worst, "pixel", [(before[last], after[last])], f"pixel ({x}, {y})")
         largest |= {key: max(largest.get(key, 0.0), value) for key, value in found.items()}
-    yield "one grey level in one pixel", largest, len(plain.frames) * (2 if quick else PIXELS)
+    yield "one grey level in one pixel", largest, len(plain.frames) * (2 if quick else CHANGED_PIXELS)
     if not quick:
         dither = random.integers(-1, 2, plain.frames[last].shape)
         frame = np.clip(plain.frames[last] + dither, 0, 255).astype(np.uint8)

@@ -32,11 +32,11 @@ Shape = tuple[int, int]
 SHAPES: Final[Sequence[Shape]] = ((1, 1), (1, 8), (8, 1), (8, 8), (17, 31), (60, 80), (150, 200), (8, 8000))
 """(H, W) of the pictures, px: from a pixel to a line camera."""
 QUICK_SHAPES: Final[Sequence[Shape]] = ((1, 8), (60, 80))
-LISTED: Final = (60, 80)
+LISTED_SHAPE: Final = (60, 80)
 """The shape whose answers are listed."""
-RANDOM_SIDE: Final = 64
+MAX_RANDOM_SIDE_PX: Final = 64
 """Longest side of a picture at random, px."""
-SHOWN: Final = 48
+MAX_ANSWER_LETTERS: Final = 48
 """Longest answer in a table, characters."""
 
 
@@ -94,8 +94,10 @@ def answer(value: Any) -> str:
 class Chain:
     """Every stage of the registry, fed with what the others make of a picture.
 
-    components : the stages. A stage whose inputs no other stage makes is given the picture or the mask where
-    the type fits.
+    Parameters
+    ----------
+    components : the stages. A stage whose inputs no other stage makes is given the picture or the mask
+        where the type fits.
     """
 
     def __init__(self, components: Sequence[Component]) -> None:
@@ -177,15 +179,17 @@ def run_degenerate(
     worst = {component.name: Worst(component.name) for component in components}
     answers: dict[str, dict[str, str]] = {}
     for shape in QUICK_SHAPES if quick else SHAPES:
-        for name, mask in MASKS.items() if not quick or shape == LISTED else ():
-            part.trials += _try_mask(components, worst, name, mask(shape), answers if shape == LISTED else {})
+        for name, mask in MASKS.items() if not quick or shape == LISTED_SHAPE else ():
+            part.trials += _try_mask(
+                components, worst, name, mask(shape), answers if shape == LISTED_SHAPE else {}
+            )
         pairs = [(a, b) for a in PICTURES for b in PICTURES]
         for first, second in pairs[:: 13 if quick else 1] if max(shape) < 1000 else pairs[::9]:
             pictures = [PICTURES[first](shape), PICTURES[second](shape)]
             part.trials += try_pictures(components, worst, f"{first}, then {second}, {shape}", pictures)
     random = np.random.default_rng(seed)
     for number in range(3 if quick else 400):
-        shape = (int(random.integers(1, RANDOM_SIDE)), int(random.integers(1, RANDOM_SIDE)))
+        shape = (int(random.integers(1, MAX_RANDOM_SIDE_PX)), int(random.integers(1, MAX_RANDOM_SIDE_PX)))
         pictures = [random_picture(random, shape) for _ in range(2)]
         part.trials += try_pictures(components, worst, f"at random, number {number}, {shape}", pictures)
         part.trials += _try_mask(
@@ -203,7 +207,9 @@ def run_degenerate(
 
 def _listing(title: str, answers: Mapping[str, Mapping[str, str]], columns: Sequence[str]) -> Listing:
     rows = [[case, *(row.get(column, "-") for column in columns)] for case, row in answers.items()]
-    return Listing(title, ["case", *columns], rows, f"Pictures of {LISTED[1]} x {LISTED[0]} px.", folded=True)
+    return Listing(
+        title, ["case", *columns], rows, f"Pictures of {LISTED_SHAPE[1]} x {LISTED_SHAPE[0]} px.", folded=True
+    )
 
 
 def _try_mask(
@@ -264,7 +270,7 @@ def _judge(worst: Worst, found: list[Any] | Exception, where: str) -> None:
 
 def _first(found: list[Any] | Exception) -> str:
     text = f"refused: {found}" if isinstance(found, Exception) else answer(found[0])
-    return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"
+    return text if len(text) <= MAX_ANSWER_LETTERS else text[: MAX_ANSWER_LETTERS - 1] + "…"
 
 
 def _shapes_have_their_direction(components: Sequence[Component], worst: Mapping[str, Worst]) -> None:
@@ -310,7 +316,7 @@ def _run_pipelines(part: Part, subjects: Sequence[Subject], *, quick: bool, seed
     ]
     cases += [("a gel, then black", (128, 176), [gel().reference, PICTURES["black"]((128, 176))])]
     for number in range(2 if quick else 60):
-        shape = (int(random.integers(8, RANDOM_SIDE)), int(random.integers(8, RANDOM_SIDE)))
+        shape = (int(random.integers(8, MAX_RANDOM_SIDE_PX)), int(random.integers(8, MAX_RANDOM_SIDE_PX)))
         cases.append(
             (f"at random, number {number}", shape, [random_picture(random, shape) for _ in range(2)])
         )
@@ -338,8 +344,8 @@ def _run_pipelines(part: Part, subjects: Sequence[Subject], *, quick: bool, seed
                 worst.add("rest", found[1].contact is not None, f"{name}, {shape}", count=True)
                 text = answer(found[-1].contact) if found[-1].contact else "no contact"
             part.trials += len(frames)
-            if shape == LISTED:
-                answers.setdefault(name, {})[subject.name] = text[:SHOWN]
+            if shape == LISTED_SHAPE:
+                answers.setdefault(name, {})[subject.name] = text[:MAX_ANSWER_LETTERS]
         part.checks += worst.checks()
     part.listings.append(
         _listing("What each pipeline answers to pictures", answers, [subject.name for subject in subjects])

@@ -17,15 +17,16 @@ Shape = tuple[int, int]
 
 SIZE: Final = (176, 128)
 """Width and height of the small gel, px."""
-PITCH: Final = 28
-RADIUS: Final = 6.0
+PITCH_PX: Final = 28
+DOT_RADIUS_PX: Final = 6.0
 """Distance and radius of its dots, px."""
-CONTACT: Final = (90.0, 61.0)
+CONTACT_CENTER_PX: Final = (90.0, 61.0)
 """Centre of the contact, px."""
-AXES: Final = (34.0, 19.0)
-"""Half axes of the contact, px; the long one at `TURN` degrees, counter-clockwise on the screen."""
-TURN: Final = 25.0
-RISE: Final = 45
+CONTACT_AXES_PX: Final = (34.0, 19.0)
+"""Half axes of the contact, px; the long one at `CONTACT_ANGLE_DEG` degrees, counter-clockwise on the
+screen."""
+CONTACT_ANGLE_DEG: Final = 25.0
+CONTACT_RISE_GREY: Final = 45
 """How much the contact brightens, grey levels."""
 
 
@@ -33,6 +34,8 @@ RISE: Final = 45
 class Gel:
     """Pictures of a gel, untouched and touched, and the truth about the second one.
 
+    Attributes
+    ----------
     mask : (H, W) uint8, 255 in contact.
     """
 
@@ -51,22 +54,24 @@ def gel(*, dots: bool = True, noise: float = 1.0) -> Gel:
     """
     width, height = SIZE
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    dot_grid = np.meshgrid(np.arange(20, width, PITCH), np.arange(23, height, PITCH))
+    dot_grid = np.meshgrid(np.arange(20, width, PITCH_PX), np.arange(23, height, PITCH_PX))
     origin = np.stack(dot_grid, axis=-1).reshape(-1, 2).astype(np.float64)
-    away = np.hypot(*(origin - CONTACT).T)
+    away = np.hypot(*(origin - CONTACT_CENTER_PX).T)
     position = origin + np.exp(-((away / 45) ** 2))[:, None] * [2.3, 1.1]
-    turn = np.radians(TURN)
-    along = (x - CONTACT[0]) * np.cos(turn) - (y - CONTACT[1]) * np.sin(turn)
-    across = (x - CONTACT[0]) * np.sin(turn) + (y - CONTACT[1]) * np.cos(turn)
-    inside = np.hypot(along / AXES[0], across / AXES[1])
-    rise = np.clip((1 - inside) * 8 + 0.5, 0, 1) * RISE
+    turn = np.radians(CONTACT_ANGLE_DEG)
+    along = (x - CONTACT_CENTER_PX[0]) * np.cos(turn) - (y - CONTACT_CENTER_PX[1]) * np.sin(turn)
+    across = (x - CONTACT_CENTER_PX[0]) * np.sin(turn) + (y - CONTACT_CENTER_PX[1]) * np.cos(turn)
+    inside = np.hypot(along / CONTACT_AXES_PX[0], across / CONTACT_AXES_PX[1])
+    rise = np.clip((1 - inside) * 8 + 0.5, 0, 1) * CONTACT_RISE_GREY
     shade = np.stack([110 + 0.10 * x, 120 + 0.08 * y, 115 - 0.05 * x + 0.05 * y], axis=-1)
     random = np.random.default_rng(5)
     pictures = []
     for centers, light in ((origin, np.zeros_like(rise)), (position, rise)):
         coverage = np.zeros_like(x)
         for dot_x, dot_y in centers if dots else ():
-            np.maximum(coverage, np.clip(RADIUS + 0.5 - np.hypot(x - dot_x, y - dot_y), 0, 1), out=coverage)
+            np.maximum(
+                coverage, np.clip(DOT_RADIUS_PX + 0.5 - np.hypot(x - dot_x, y - dot_y), 0, 1), out=coverage
+            )
         picture = (shade + light[..., None]) * (1 - 0.85 * coverage[..., None])
         picture += random.normal(0, noise, picture.shape)
         pictures.append(np.clip(np.rint(picture), 0, 255).astype(np.uint8))

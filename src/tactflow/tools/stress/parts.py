@@ -12,7 +12,11 @@ from typing import Any, Final
 class Promise:
     """A promise to users.
 
-    title : the promise, a sentence. tolerance : the largest value that keeps it. unit : of it, "" for counts.
+    Attributes
+    ----------
+    title : the promise, a sentence.
+    tolerance : the largest value that keeps it.
+    unit : of it, "" for counts.
     why : where the tolerance comes from.
     """
 
@@ -123,7 +127,11 @@ PROMISES: Final[Mapping[str, Promise]] = {
 class Check:
     """A promise, measured.
 
-    promise : key of `PROMISES`. subject : pipeline or stage. measured : the worst value.
+    Attributes
+    ----------
+    promise : key of `PROMISES`.
+    subject : pipeline or stage.
+    measured : the worst value.
     where : it was found.
     reference : for the classic script, which keeps the seed's meaning: listed, but not counted as broken.
     """
@@ -150,9 +158,15 @@ class Check:
 class Curve:
     """An error against the strength of a perturbation.
 
-    panel : name of the perturbation. unit : of its levels. quantity : key of the bench's quantities.
-    subject : pipeline, on a scene. levels : increasing, the first is without perturbation. errors : for each;
-    None where there is none. bound : smallest standard error of an unbiased method at each level, or None.
+    Attributes
+    ----------
+    panel : name of the perturbation.
+    unit : of its levels.
+    quantity : key of the bench's quantities.
+    subject : pipeline, on a scene.
+    levels : increasing, the first is without perturbation.
+    errors : for each; None where there is none.
+    bound : smallest standard error of an unbiased method at each level, or None.
     """
 
     panel: str
@@ -166,7 +180,12 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """A table. folded : the page shows it on request only; the terminal does not show it."""
+    """A table.
+
+    Attributes
+    ----------
+    folded : the page shows it on request only; the terminal does not show it.
+    """
 
     title: str
     columns: Sequence[str]
@@ -177,7 +196,12 @@ class Listing:
 
 @dataclass(slots=True)
 class Part:
-    """One kind of stress: what was done and what came out. trials : how often something was computed."""
+    """One kind of stress: what was done and what came out.
+
+    Attributes
+    ----------
+    trials : how often something was computed.
+    """
 
     title: str
     text: str

@@ -19,9 +19,9 @@ from tactflow.tools.stress.subjects import Subject
 Random = np.random.Generator
 Perturb = Callable[[Clip, float, Random], Clip]
 
-SHOWN: Final = (SEEN_RMS, "center_error", "flow_error", "hull_iou")
+CURVE_QUANTITIES: Final = (SEEN_RMS, "center_error", "flow_error", "hull_iou")
 """Quantities with a curve."""
-BREAKS: Final = {
+BREAKING_PERCENTS: Final = {
     "false_contacts": ("false contact", 0.0),
     "missed_half_depth": ("missed contact", 0.0),
     "lost_percent": ("lost dots", 5.0),
@@ -113,12 +113,12 @@ def _occluded(plain: Clip, level: float, random: Random) -> Clip:
         smooth = cv2.medianBlur(frame, 41)
         disc = np.zeros(frame.shape[:2], np.uint8)
         for x, y in np.rint(plain.truth(number)[0].position[covered]).astype(int):
-            cv2.circle(disc, (int(x), int(y)), COVER, 255, -1)
+            cv2.circle(disc, (int(x), int(y)), COVER_RADIUS_PX, 255, -1)
         frame[disc > 0] = smooth[disc > 0]
     return plain.changed(frames)
 
 
-COVER: Final = 13
+COVER_RADIUS_PX: Final = 13
 """Radius of what covers a dot, px: twice that of the dot."""
 
 
@@ -130,7 +130,14 @@ def _dropped(plain: Clip, level: float, random: Random) -> Clip:
 
 @dataclass(frozen=True, slots=True)
 class Perturbation:
-    """unit : of the levels. levels : increasing, the first is 0, without perturbation."""
+    """A change of pictures, at several levels.
+
+    Attributes
+    ----------
+    perturb : the pictures of a clip at a level.
+    unit : of the levels.
+    levels : increasing; the first is 0, without perturbation.
+    """
 
     perturb: Perturb
     unit: str
@@ -161,10 +168,10 @@ PERTURBATIONS: Final[Mapping[str, Perturbation]] = {
 }
 """Name -> perturbation."""
 
-OF_DOTS: Final = "occluded dots"
+DOT_PERTURBATION: Final = "occluded dots"
 """The perturbation that needs dots."""
-QUICK: Final = ("noise", "occluded dots")
-SCENES: Final = 2
+QUICK_PERTURBATIONS: Final = ("noise", "occluded dots")
+SCENE_COUNT: Final = 2
 """Scenes that each pipeline is run on."""
 
 
@@ -184,7 +191,8 @@ def noise_bound(case: Case, sigma: float, quantity: str) -> float | None:
         squares = []
         for x, y in truth.position[truth.visible]:
             region = (
-                np.hypot(*(np.indices(picture.shape[:2])[::-1] - np.array([x, y])[:, None, None])) < COVER
+                np.hypot(*(np.indices(picture.shape[:2])[::-1] - np.array([x, y])[:, None, None]))
+                < COVER_RADIUS_PX
             )
             squares.append(2 * _bound(picture, region, variance))
         return float(np.sqrt(np.mean(squares)))
@@ -218,11 +226,11 @@ def run_perturbation(
         "disturbs the whole recording with its reference, but for occlusion, displacement, dropped frames.",
     )
     rows = []
-    for name in names or (QUICK if quick else PERTURBATIONS):
+    for name in names or (QUICK_PERTURBATIONS if quick else PERTURBATIONS):
         perturbation = PERTURBATIONS[name]
         levels = perturbation.levels[:: 3 if quick else 1]
         for case, who in _pairs(subjects, short=quick or bool(names)):
-            if name == OF_DOTS and not who[0].dots:
+            if name == DOT_PERTURBATION and not who[0].dots:
                 continue
             plain = clip(case)
             found: dict[str, list[dict[str, float] | str]] = {subject.name: [] for subject in who}
@@ -235,7 +243,7 @@ def run_perturbation(
                 rows.append(_row(name, perturbation, levels, case, subject, found[subject.name]))
                 part.curves += _curves(name, perturbation, levels, case, subject, found[subject.name])
     heads = ["perturbation", "scene", "pipeline", "seen dots double", "centre doubles", "flow doubles"]
-    heads += [what for what, _ in BREAKS.values()] + ["refused"]
+    heads += [what for what, _ in BREAKING_PERCENTS.values()] + ["refused"]
     text = (
         "The level where an error is twice that of the unperturbed scene, and the first level with a false "
         "or missed contact, with more than 5 % of the dots lost, with exchanged dots, and with more than 1 % "
@@ -249,7 +257,7 @@ def _pairs(subjects: Sequence[Subject], *, short: bool) -> Iterator[tuple[Case, 
     """Scene and pipelines that suit it. short : the first scene only."""
     for dots in (True, False):
         who = [subject for subject in subjects if subject.dots == dots]
-        for case in cases_for(dots=dots, count=1 if short else SCENES) if who else ():
+        for case in cases_for(dots=dots, count=1 if short else SCENE_COUNT) if who else ():
             yield case, who
 
 
@@ -294,11 +302,11 @@ def _row(
     found: Sequence[dict[str, float] | str],
 ) -> list[str]:
     cells = [f"{name}, {perturbation.unit}", case.label, subject.name]
-    for quantity in SHOWN[:3]:
+    for quantity in CURVE_QUANTITIES[:3]:
         errors = _series(found, quantity)
         at = None if errors[0] is None else doubling(levels, errors)
         cells.append("-" if errors[0] is None else f"> {levels[-1]:g}" if at is None else f"{at:.2g}")
-    for quantity, (_, limit) in BREAKS.items():
+    for quantity, (_, limit) in BREAKING_PERCENTS.items():
         errors = _series(found, quantity)
         at = next((lv for lv, e in zip(levels, errors, strict=True) if e is not None and e > limit), None)
         known = any(error is not None for error in errors)
@@ -315,7 +323,7 @@ def _curves(
     subject: Subject,
     found: Sequence[dict[str, float] | str],
 ) -> Iterator[Curve]:
-    for quantity in SHOWN:
+    for quantity in CURVE_QUANTITIES:
         errors = _series(found, quantity)
         if all(error is None for error in errors):
             continue

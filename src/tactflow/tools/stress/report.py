@@ -46,7 +46,14 @@ ERROR: Final = Quantity("error", "error", "")
 
 @dataclass(slots=True)
 class Report:
-    """A run. quick : whether it was the short one. machine : what it ran on. wall_s : how long it took, s."""
+    """A run.
+
+    Attributes
+    ----------
+    quick : whether it was the short one.
+    machine : what it ran on.
+    wall_s : how long it took, s.
+    """
 
     quick: bool
     machine: dict[str, str]

@@ -23,7 +23,7 @@ Run = Callable[[Subject, Sequence[Any], Path], list[Result]]
 
 QUICK_FRAMES: Final = 8
 """Frames of a scene in a quick run."""
-DIGITS: Final = 5
+DECIMALS: Final = 5
 """Decimals of stored answers."""
 
 
@@ -42,7 +42,7 @@ def _with_sinks(*names: str) -> Run:
     return run
 
 
-EXACT: Final[Mapping[str, Run]] = {
+EXACT_VARIANTS: Final[Mapping[str, Run]] = {
     "once more": lambda subject, frames, _: subject.run(frames),
     "2 threads of OpenCV": lambda subject, frames, _: subject.run(frames, opencv_threads=2),
     "4 threads of OpenCV": lambda subject, frames, _: subject.run(frames, opencv_threads=4),
@@ -68,7 +68,7 @@ def run_same(
     answers: Answers = {}
     bits: list[list[Any]] = []
     far: list[list[Any]] = []
-    ways = dict(list(EXACT.items())[1::2]) if quick else EXACT
+    ways = dict(list(EXACT_VARIANTS.items())[1::2]) if quick else EXACT_VARIANTS
     for subject in subjects:
         worst = Worst(subject.name, reference=subject.reference)
         for case in cases_for(dots=subject.dots, count=1 if quick else None):
@@ -122,7 +122,7 @@ def _skipping(worst: Worst, skipping: Sequence[Any], fresh: Sequence[Any]) -> li
     largest: dict[str, float] = {}
     for number, (one, other) in enumerate(zip(skipping, fresh, strict=True)):
         found = difference(one, other)
-        late = {key for key, value in found.items() if value > LATE.get(key, np.inf)}
+        late = {key for key, value in found.items() if value > LATE_TOLERANCES.get(key, np.inf)}
         for key, value in found.items():
             if key in late and key not in before:
                 continue
@@ -134,16 +134,16 @@ def _skipping(worst: Worst, skipping: Sequence[Any], fresh: Sequence[Any]) -> li
     return cells(largest)
 
 
-LATE: Final = {"dots": 0.05, "center": 0.5, "flow": 0.05, "decision": 0.0}
+LATE_TOLERANCES: Final = {"dots": 0.05, "center": 0.5, "flow": 0.05, "decision": 0.0}
 """Differences that may last for one frame: tolerances of skipping."""
-_SKIPPING: Final = frozenset(f"skipping_{key}" for key in LATE)
+_SKIPPING: Final = frozenset(f"skipping_{key}" for key in LATE_TOLERANCES)
 
 
 def rounded(answers: Answers) -> Answers:
     """Answers to be stored."""
 
     def short(value: Any) -> Any:
-        return value if isinstance(value, bool) else np.round(value, DIGITS).tolist()
+        return value if isinstance(value, bool) else np.round(value, DECIMALS).tolist()
 
     return {
         label: [{key: short(value) for key, value in frame.items()} for frame in frames]

@@ -22,7 +22,7 @@ from tactflow.tools.bench.results import CLASSIC
 
 Image = NDArray[np.uint8]
 
-UPRIGHT: Mapping[str, Any] = {
+UNCHANGED_PICTURES: Mapping[str, Any] = {
     "rotate": 0,
     "downsample": 1,
     "crop": None,
@@ -36,8 +36,12 @@ UPRIGHT: Mapping[str, Any] = {
 class Subject:
     """A pipeline.
 
-    name : in reports. file : of the pipeline. dots : whether it tracks dots. settings : values of the file
-    that are replaced, as for `tactflow.load`.
+    Attributes
+    ----------
+    name : in reports.
+    file : of the pipeline.
+    dots : whether it tracks dots.
+    settings : values of the file that are replaced, as for `tactflow.load`.
     """
 
     name: str
@@ -63,7 +67,7 @@ class Subject:
         values = dict(self.settings) | {key.replace("__", "."): value for key, value in settings.items()}
         pipeline = tactflow.load(self.file, source=frames, settings=values)
         for id_, node in pipeline.nodes.items():
-            known = {key: value for key, value in UPRIGHT.items() if hasattr(node.params, key)}
+            known = {key: value for key, value in UNCHANGED_PICTURES.items() if hasattr(node.params, key)}
             if len(known) > 1:
                 pipeline = with_params(pipeline, id_, node.params.changed(**known))
         return pipeline
