@@ -184,7 +184,9 @@ def _further_steps(
         if recording is None:
             with rendered(case, folder) as scene:
                 scene.path.rename(source)
-        suited = {name: p for name, p in loaded.items() if not _is_for_one_camera(p)}
+        # The script would take a third of a quick run.
+        left_out = {CLASSIC} if result.quick else set()
+        suited = {name: p for name, p in loaded.items() if not _is_for_one_camera(p) and name not in left_out}
         own = next((name for name in reversed(suited) if name not in (CLASSIC, MARKERLESS)), DEFAULT)
         suited[f"{own}{UNSKIPPED}"] = replace(loaded[own], skipping=False)
         failures: dict[str, str] = {}
