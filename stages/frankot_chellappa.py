@@ -16,9 +16,9 @@ from tactflow.vision.types import Depth, Scale
 class FrankotChellappa(Stage):
     """Heights from the colour of the gel, as `depth` learns it, integrated over the whole picture at once.
 
-    Take it as the usual method of photometric stereo. It takes the picture to repeat beyond its borders, and
-    everything that differs from the untouched gel for a slope: contacts at the border and uneven light tilt
-    its surface. It states no standard errors.
+    Use it as the usual method of photometric stereo. It assumes that the picture repeats beyond its borders,
+    and takes every difference from the untouched gel for a slope: contacts at the border and uneven light
+    tilt its surface. It states no standard errors.
 
         depth: {use: frankot_chellappa, when: touching}
 
