@@ -76,11 +76,11 @@ def test_each_stage_says_why_it_runs_and_when_it_is_skipped(terminal: Terminal) 
     assert facts["compare"]["runs because"] == "out needs it"
     assert facts["compare"]["memory"].startswith("stateful")
     assert facts["compare"]["segment"] == "heavy"
-    assert facts["outline"]["memory"].startswith("none (pure)")
+    assert facts["outline"]["memory"].startswith("pure:")
     assert facts["out"]["runs because"] == "it is a sink, at most 5 times a second"
     assert facts["unused"] == {
-        "pruned because": "no sink needs its output",
-        "memory": "none (pure): runs only when its result is needed",
+        "left out because": "no sink needs its output",
+        "memory": "pure: runs only when its result is needed",
         "is": "./parts.py:Needy",
     }
     assert facts["outline"]["skipped when"] == (

@@ -83,15 +83,15 @@ def _facts(
         is_pruned = node in plan.pruned
         facts = {"at": str(node.mark)}
         if is_pruned:
-            facts["pruned because"] = "no sink needs its output"
+            facts["left out because"] = "no sink needs its output"
         else:
             facts["runs because"] = _reason(node, sinks[node.id])
             if skips := _skips(node, pipeline, uncertain):
                 facts["skipped when"] = "; ".join(skips)
         if node.component.kind == "stage":
-            facts["memory"] = "none (pure): runs only when its result is needed"
+            facts["memory"] = "pure: runs only when its result is needed"
             if node.component.memory == "stateful":
-                facts["memory"] = "stateful: sees every frame that is not dropped"
+                facts["memory"] = "stateful: runs in every frame in which its gates are open"
         if not is_pruned:
             facts["segment"] = plan.segment_of(node.id)
         name, origin = node.component.name, node.component.origin

@@ -25,7 +25,7 @@ COMMANDS: Final[dict[str, Command]] = {
         "check",
     ),
     "explain": Command(
-        "why each stage runs, is skipped or is left out, and what it cost", "tactflow.cli.explain"
+        "why each stage runs, is skipped or is left out; with --stats, what it cost", "tactflow.cli.explain"
     ),
     "graph": Command("print a pipeline as a Mermaid flowchart", "tactflow.cli.explain", "graph"),
     "pipelines": Command(

@@ -108,7 +108,8 @@ def _rows(components: Sequence[Component]) -> Iterator[Sequence[str]]:
 def _row(component: Component, indent: str = "") -> Sequence[str]:
     inputs = ", ".join(port.name + ("?" if port.optional else "") for port in component.ports.inputs)
     outputs = ", ".join(port.name for port in component.ports.outputs)
-    summary = inspect.cleandoc(component.cls.__doc__ or "").partition("\n")[0]
+    paragraph = " ".join(inspect.cleandoc(component.cls.__doc__ or "").partition("\n\n")[0].split())
+    summary = paragraph.partition(". ")[0].removesuffix(".") + "." if paragraph else ""
     return indent + component.name, component.kind, inputs, outputs, component.origin, summary
 
 

@@ -30,18 +30,17 @@ def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float
     min_area : px^2; components (8-connected, holes filled) with fewer pixels are ignored. Larger is safer
         against specks and misses small contacts.
     min_confidence : 0 to 1; a region whose confidence is not above it gets no direction: 0.3 is an axis ratio
-    of
-        1.36. Light from one side lengthens a mask in a way that its outline cannot distinguish from shape.
+        of 1.36. Light from one side lengthens a mask in a way that its outline cannot distinguish from shape.
         Higher withholds the direction of stubby shapes.
 
     Returns
-    ------- Contact or None, where nothing is large enough. `area` counts the pixels whose centre lies in or
-    on the hull
-        (Pick's theorem): for a convex region its number of pixels. The direction and the ellipse are those of
-        the second central moments; the direction is None where the anisotropy may be due to chance (see
-        `tactflow.vision.geometry.direction`), the ellipse where the region is no wider than a pixel or has
-        fewer than five. `confidence` is (l1 - l2) / (l1 + l2) of the principal variances l1 >= l2: 0 for a
-        disc, 0.6 for an ellipse of axis ratio 2, 1 for a line.
+    -------
+    Contact or None, where nothing is large enough. `area` counts the pixels whose centre lies in or on the
+        hull (Pick's theorem): for a convex region its number of pixels. The direction and the ellipse are
+        those of the second central moments; the direction is None where the anisotropy may be due to chance
+        (see `tactflow.vision.geometry.direction`), the ellipse where the region is no wider than a pixel or
+        has fewer than five. `confidence` is (l1 - l2) / (l1 + l2) of the principal variances l1 >= l2: 0 for
+        a disc, 0.6 for an ellipse of axis ratio 2, 1 for a line.
 
     Raises
     ------

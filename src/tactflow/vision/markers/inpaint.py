@@ -54,8 +54,7 @@ def remove_markers(
         inwards from the border of the mask, 10 ms and more; `ns` continues lines of equal brightness, as
         slow; `none` returns a copy of the image.
     radius : neighbourhood, px, > 0. For `normalized` about the radius of a dot: a larger one is smoother,
-    with
-        a much smaller one the middle of a dot is filled from far away; beyond 120 px it has no further
+        with a much smaller one the middle of a dot is filled from far away; beyond 120 px it has no further
         effect.
 
     Returns
