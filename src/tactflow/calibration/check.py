@@ -13,12 +13,18 @@ from tactflow.calibration.reference import Reference
 from tactflow.calibration.samples import press_errors, summary
 from tactflow.calibration.words import darkness_words, photometric_words
 
-DRIFTED: Final = 1.5
+MIN_DRIFT_RATIO: Final = 1.5
 """Ratio of the error on new presses to the stored one above which a calibration counts as drifted."""
 
 
 class Comparison(NamedTuple):
-    """fits : whether what was compared is as it was. lines : what was compared, in words."""
+    """A calibration against what a session shows.
+
+    Attributes
+    ----------
+    fits : whether the gel and the depth are still as they were.
+    lines : what was compared, in words.
+    """
 
     fits: bool
     lines: list[str]
@@ -49,13 +55,13 @@ def _check_depth(
         text = f"no presses today: to check the depth, press a ball of radius {radius} on the untouched gel"
         return Comparison(True, [text])
     if isinstance(then, DarknessEntry):
-        error, limit, unit = darkness_error(session, then, scale), DRIFTED * then.stderr, "mm RMS"
+        error, limit, unit = darkness_error(session, then, scale), MIN_DRIFT_RATIO * then.stderr, "mm RMS"
         now_words = f"depth {error:.3f} mm RMS off" if math.isfinite(error) else "none can be used"
         words = now_words, darkness_words(then)
     else:
         assert calibration.slopes is not None
         now = summary(press_errors(session, calibration.slopes, scale, then.ball_radius))
-        error, limit, unit = now["normal_error"], DRIFTED * then.normal_error, "degrees"
+        error, limit, unit = now["normal_error"], MIN_DRIFT_RATIO * then.normal_error, "degrees"
         words = photometric_words(now), photometric_words(then.model_dump())
     lines = [f"presses today, {len(session.presses)}: {words[0]}", f"when it was made: {words[1]}"]
     if error > limit:
@@ -68,4 +74,4 @@ def check_force(then: ForceEntry, watched: Watched, readings: Reference) -> Comp
     """Compare the force with the readings of a gauge."""
     now = try_force(then, readings.name, watched, readings)
     text = f"force: {now:.2f} N RMS from the gauge today; when it was made: {then.press.rmse:.2f} N"
-    return Comparison(now <= DRIFTED * then.press.rmse, [text])
+    return Comparison(now <= MIN_DRIFT_RATIO * then.press.rmse, [text])

@@ -24,14 +24,17 @@ from tactflow.vision.depth.surface import Rest, colour_change
 from tactflow.vision.depth.surroundings import surroundings
 from tactflow.vision.types import Scale
 
-FEWEST_RINGS: Final = 4
+MIN_RINGS: Final = 4
 """Rings, one pixel at half resolution wide, that a contact must have."""
 
 
 class Ring(NamedTuple):
     """Part of a press at one distance from its middle.
 
-    depth : mm, of the ball. darkening : relative, of its first and its second half.
+    Attributes
+    ----------
+    depth : mm, of the ball.
+    darkening : relative, of its first and its second half.
     """
 
     depth: float
@@ -41,8 +44,11 @@ class Ring(NamedTuple):
 class Darkness(NamedTuple):
     """A fit.
 
-    found : numbers for the calibration file. kept : (n,) bool, which presses were used. misfit : (n,)
-    float64, RMS error of the depth of each press, mm; infinite where it is unusable.
+    Attributes
+    ----------
+    found : numbers for the calibration file.
+    kept : (n,) bool, which presses were used.
+    misfit : (n,) float64, RMS error of the depth of each press, mm; infinite where it is unusable.
     """
 
     found: DarknessEntry
@@ -63,8 +69,8 @@ def fit_darkness(session: Session, scale: Scale, ball_radius: float) -> Darkness
     check_presses(session, scale, np.full(len(session.presses), ball_radius))
     rest = Rest(session.untouched)
     presses = [_rings(press, rest, scale, ball_radius) for press in session.presses]
-    kept = np.array([len(rings) >= FEWEST_RINGS for rings in presses])
-    good = [rings for rings in presses if len(rings) >= FEWEST_RINGS]
+    kept = np.array([len(rings) >= MIN_RINGS for rings in presses])
+    good = [rings for rings in presses if len(rings) >= MIN_RINGS]
     if not good:
         raise ConfigError(
             "calibrate: the contacts are too small, or much larger than the ball: press deeper, and see "
@@ -134,7 +140,7 @@ def _curve(rings: Sequence[Ring], halves: tuple[int, ...]) -> tuple[Floats, Floa
     levels, block = np.unique(np.round(fitted, 9), return_inverse=True)
     depths = np.bincount(block, depth) / np.bincount(block)
     above = (levels > 0) & (depths > 0)
-    if not explained or np.count_nonzero(above) < FEWEST_RINGS - 1:
+    if not explained or np.count_nonzero(above) < MIN_RINGS - 1:
         raise ConfigError(
             "calibrate --darkness: this gel does not become darker the deeper the ball presses; where it "
             "answers with colour, calibrate without --darkness"
@@ -153,7 +159,7 @@ def _held_out(presses: Sequence[Sequence[Ring]]) -> Floats:
         others = [ring for i, rings in enumerate(presses) if i != number for ring in rings]
         deepest = max((ring.depth for ring in others), default=0.0)
         judged = [ring for ring in press if ring.depth <= deepest]
-        if len(judged) >= FEWEST_RINGS:
+        if len(judged) >= MIN_RINGS:
             learned = [_curve(others, (0, 1))] * 2
         else:
             judged, learned = list(press), [_curve(press, (half,)) for half in (1, 0)]

@@ -8,12 +8,12 @@ from typing import Any, Final
 from tactflow.calibration.presses import Press, PressFinder, usual_radius
 from tactflow.vision.geometry.region import measure_region
 
-LIGHT: Final = 0.5
+LIGHT_RADIUS_RATIO: Final = 0.5
 """Radius of a contact over the usual one, below which a press is called light. Chosen by hand."""
-ROUND: Final = 1.7
+MAX_AXIS_RATIO: Final = 1.7
 """Longer over shorter axis of a contact above which it is not a ball's. Chosen by hand: presses of a ball on
 a real gel (mini_ball) reach 1.57."""
-PARTS: Final = 3
+PARTS_PER_SIDE: Final = 3
 """Columns and rows of parts into which the gel is divided; each part needs presses. Chosen by hand."""
 _ROWS: Final = ("upper", "middle", "lower")
 _COLUMNS: Final = ("left", "centre", "right")
@@ -33,14 +33,14 @@ def fault(press: Press, usual: float) -> str | None:
     """
     height, width = press.mask.shape
     x, y = press.center
-    if press.radius < LIGHT * usual:
+    if press.radius < LIGHT_RADIUS_RATIO * usual:
         return f"light, radius {press.radius:.0f} px where {usual:.0f} px is usual; press harder"
     if min(x, y, width - 1 - x, height - 1 - y) < press.radius:
         return f"cut off by the border of the picture at ({x:.0f}, {y:.0f}); press further inside"
     region = measure_region(press.mask)
     if region.pixels:
         major, minor = region.moments().principal
-        if major > ROUND**2 * minor:
+        if major > MAX_AXIS_RATIO**2 * minor:
             return "not round; press the ball straight, and nothing else"
     return None
 
@@ -61,7 +61,10 @@ def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str,
     done = len(presses) - lasts
     good = [press for press, wrong in zip(presses[:done], faults[:done], strict=True) if wrong is None]
     parts = [
-        tuple(int(PARTS * x / side) for x, side in zip(press.center[::-1], press.mask.shape, strict=True))
+        tuple(
+            int(PARTS_PER_SIDE * x / side)
+            for x, side in zip(press.center[::-1], press.mask.shape, strict=True)
+        )
         for press in good
     ]
     row, column = min(_FIRST, key=parts.count)
@@ -88,9 +91,12 @@ def progress(presses: Sequence[Press], lasts: bool, wanted: int) -> Mapping[str,
 class Guide:
     """Reports whether each press was good, and where to press next.
 
-    wanted : number of presses that are enough. say : shows a line.
-
     `state` (see `progress`) may be read from any thread, as the live page does.
+
+    Parameters
+    ----------
+    wanted : number of presses that are enough.
+    say : shows a line.
     """
 
     def __init__(self, wanted: int, say: Callable[[str], None]) -> None:

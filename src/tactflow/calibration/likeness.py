@@ -52,8 +52,10 @@ CROPS: Final = (0.9, 0.85, 0.8, 0.75, 0.7)
 class Match(NamedTuple):
     """How the light at rest of a picture compares with that of a calibration.
 
-    misfit : RMS difference of the logarithms. zoom : side of the part of the gel that the picture shows, over
-    that of the calibration.
+    Attributes
+    ----------
+    misfit : RMS difference of the logarithms.
+    zoom : side of the part of the gel that the picture shows, over that of the calibration.
     """
 
     misfit: float
@@ -66,8 +68,13 @@ class Match(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """scale : of the pictures; None where the calibration must not be used. words : why not, and what to do;
-    or how the scale was found."""
+    """How a calibration applies to pictures.
+
+    Attributes
+    ----------
+    scale : of the pictures; None where the calibration must not be used.
+    words : why not, and what to do; or how the scale was found.
+    """
 
     scale: Scale | None
     words: str

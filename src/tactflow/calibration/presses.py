@@ -21,12 +21,12 @@ Picture = NDArray[np.uint8]
 
 NEEDED: Final = {"image": "preprocess", "contact": "hull"}
 """Ports that a pipeline must have -> the stage that gives them."""
-SAME: Final = 0.03
+MAX_REST_DIFFERENCE: Final = 0.03
 """Largest RMS difference of the untouched gel within a session, relative to its brightness. Chosen by hand,
 between the scatter within a session (0.01) and the limit for using a calibration (0.1)."""
-MOVED_ON: Final = 0.5
+MOVED_ON_RADII: Final = 0.5
 """Distance from the current press, in its radii, beyond which a contact is a new press. Chosen by hand."""
-MOVED_ALONE: Final = 0.1
+MOVED_ALONE_RADII: Final = 0.1
 """The same for pictures that were taken one by one, and for the change of the radius. Chosen by hand."""
 
 
@@ -34,9 +34,14 @@ MOVED_ALONE: Final = 0.1
 class Press:
     """One press of the ball, at the moment when its contact was largest.
 
-    seq : of the frame. image : (H, W, 3) uint8, without markers. mask : (H, W) uint8, 255 in contact.
-    hidden : (H, W) bool, where a marker was. center : (x, y) of the contact, px. radius : of a disc of its
-    area, px.
+    Attributes
+    ----------
+    seq : of the frame.
+    image : (H, W, 3) uint8, without markers.
+    mask : (H, W) uint8, 255 in contact.
+    hidden : (H, W) bool, where a marker was.
+    center : (x, y) of the contact, px.
+    radius : of a disc of its area, px.
     """
 
     seq: int
@@ -51,9 +56,12 @@ class Press:
 class Session:
     """What a recording shows that a calibration needs.
 
-    untouched : (H, W, 3) uint8, mean of the latest reference frames, without markers. mapping : from raw to
-        processed pixels.
-    presses : in order. dots : (N, 2) float64, markers of the untouched gel, px; empty without markers.
+    Attributes
+    ----------
+    untouched : (H, W, 3) uint8, mean of the latest reference frames, without markers.
+    mapping : from raw to processed pixels.
+    presses : in order.
+    dots : (N, 2) float64, markers of the untouched gel, px; empty without markers.
     frames : how many there were.
     """
 
@@ -70,8 +78,15 @@ class PressFinder:
     A press lasts as long as something touches about the same place; the frame with its largest contact is
     kept.
 
+    Parameters
+    ----------
     pictures : frames were taken one by one, so each contact that moves or changes its size is a new press.
-    presses : so far. frames : number of results that were added. lasts : whether the last press goes on.
+
+    Attributes
+    ----------
+    presses : so far.
+    frames : number of results that were added.
+    lasts : whether the last press goes on.
     """
 
     def __init__(self, pictures: bool = False) -> None:
@@ -114,11 +129,11 @@ class PressFinder:
     def _drop_presses_of_another_look(self, before: Picture) -> None:
         """Drop the presses so far if the gel looked different `before` the new reference."""
         differs = difference(self.untouched, before)
-        if differs > SAME:
+        if differs > MAX_REST_DIFFERENCE:
             logger.warning(
                 "calibrate: the new reference differs by %s %% of its brightness from the one before "
                 "(%s %% at most); the presses before it, %d, are left out: press there again",
-                *distinct(100 * differs, 100 * SAME),
+                *distinct(100 * differs, 100 * MAX_REST_DIFFERENCE),
                 len(self.presses),
             )
             self.presses.clear()
@@ -129,7 +144,7 @@ class PressFinder:
             last = self.presses[-1]
             moved = float(np.hypot(*np.subtract(press.center, last.center))) / last.radius
             changed = abs(press.radius / last.radius - 1)
-            if max(moved, changed) < MOVED_ALONE if self.pictures else moved < MOVED_ON:
+            if max(moved, changed) < MOVED_ALONE_RADII if self.pictures else moved < MOVED_ON_RADII:
                 if press.radius > last.radius:
                     self.presses[-1] = press
                 return

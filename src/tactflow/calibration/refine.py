@@ -20,10 +20,10 @@ from tactflow.vision.arrays import Floats
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.types import Scale
 
-MAP_WEIGHT: Final = 0.3
+MAP_WEIGHT_PRESSES: Final = 0.3
 """Weight of the prior of the difference between two sensors, in presses: normals differ by some 10 %, which a
 press shows to 5 or 6 %; the squared ratio is 0.3."""
-BASE_WEIGHT: Final = 3.0
+BASE_WEIGHT_PRESSES: Final = 3.0
 """Weight of the prior of the coefficients. With 1 to 10, errors after 1, 3 and 9 presses of two Minis differ
 by a tenth at most."""
 SHARE_AFTER_ONE_PRESS: Final = 0.5
@@ -117,11 +117,11 @@ def _refined(samples: Sequence[Sample], start: Floats, information: Floats) -> F
         terms, normals = np.concatenate(seen), np.concatenate(true)
         found = terms @ start.T
         step = np.linalg.solve(
-            found.T @ found + MAP_WEIGHT * start @ information @ start.T, found.T @ (normals - found)
+            found.T @ found + MAP_WEIGHT_PRESSES * start @ information @ start.T, found.T @ (normals - found)
         )
         mapped = start + step.T @ start
         misfit = terms.T @ (normals - terms @ mapped.T)
-        weights = mapped + np.linalg.solve(terms.T @ terms + BASE_WEIGHT * known, misfit).T
+        weights = mapped + np.linalg.solve(terms.T @ terms + BASE_WEIGHT_PRESSES * known, misfit).T
     return weights
 
 

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from tactflow.vision.markers.lattice import nearest
 from tactflow.vision.types import Scale
 
-FEWEST_LINKS: Final = 8
+MIN_LINKS: Final = 8
 """Least number of links between neighbouring dots in each direction. Chosen by hand."""
-POINTED: Final = 0.5
+EDGE_STDERR_PX: Final = 0.5
 """Standard error of an edge of the picture, px. Chosen by hand."""
-LONGER: Final = 1.35
+MAX_LINK_RATIO: Final = 1.35
 """Largest distance of neighbours over the typical one: less than the diagonal of a square, 1.41."""
 
 
@@ -56,9 +56,9 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
         raise ValueError(f"pitch: required > 0 mm, got {pitch:g}")
     groups = _links(np.asarray(dots, np.float64).reshape(-1, 2))
     fewest = min(len(group) for group in groups)
-    if fewest < FEWEST_LINKS:
+    if fewest < MIN_LINKS:
         raise ValueError(
-            f"scale by pitch: required a grid with {FEWEST_LINKS} pairs of neighbours along each direction, "
+            f"scale by pitch: required a grid with {MIN_LINKS} pairs of neighbours along each direction, "
             f"found {fewest}; give the size of the picture with --area instead"
         )
     means = np.array([np.median(group, axis=0) for group in groups])
@@ -100,7 +100,7 @@ def scale_from_area(area: tuple[float, float], size: tuple[int, int]) -> Scale:
     (0.1, 0.1, 0.000295)
     """
     x, y = area[0] / size[0], area[1] / size[1]
-    stderr = math.sqrt(2) * POINTED * x / size[0], math.sqrt(2) * POINTED * y / size[1]
+    stderr = math.sqrt(2) * EDGE_STDERR_PX * x / size[0], math.sqrt(2) * EDGE_STDERR_PX * y / size[1]
     return Scale(x, y, stderr, centre(size))
 
 
@@ -112,7 +112,7 @@ def _links(dots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.f
     typical = np.median(distances[:, : min(2, distances.shape[1])])
     first = np.repeat(np.arange(len(dots)), near.shape[1])
     links = dots[near.ravel()] - dots[first]
-    links = links[np.hypot(*links.T) < LONGER * typical]
+    links = links[np.hypot(*links.T) < MAX_LINK_RATIO * typical]
     across = np.abs(links[:, 0]) >= np.abs(links[:, 1])
     # Each pair of neighbours is found from both sides.
     return links[across & (links[:, 0] > 0)], links[~across & (links[:, 1] > 0)]

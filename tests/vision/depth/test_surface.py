@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactflow.vision.depth.poisson import ALL_OPEN, Sides, integrate
-from tactflow.vision.depth.slopes import BAND, STEEPEST, SlopeModel, coordinates, place_terms
+from tactflow.vision.depth.slopes import BAND_ROWS, MAX_HORIZONTAL_PART, SlopeModel, coordinates, place_terms
 from tactflow.vision.depth.surface import Rest, Surface, SurfaceErrors, colour_change
 from tactflow.vision.depth.surroundings import resting, surroundings
 from tactflow.vision.types import Scale
@@ -68,7 +68,7 @@ def test_the_window_is_inside_the_picture_and_the_contact_in_the_window(corner: 
     assert window.bottom <= 40
     assert 0 <= window.left <= corner[1] // 2
     assert window.right <= 60
-    rows = near.repeat(BAND, axis=0)[: window.height]
+    rows = near.repeat(BAND_ROWS, axis=0)[: window.height]
     assert rows.shape == (window.height, window.width)
     assert (rows[mask[window.whole][::2, ::2] > 0] > 0).all()
 
@@ -184,9 +184,9 @@ def test_slopes_are_those_of_normals_that_are_a_polynomial_of_colour_and_place_a
     colours = [b, g, r, b * b, b * g, b * r, g * g, g * r, r * r, b * b * b, b * b * g, b * b * r]
     colours += [b * g * g, b * g * r, b * r * r, g * g * g, g * g * r, g * r * r, r * r * r]
     expected = np.einsum("p,c,pcd->d", place_terms((60, 50))[:, 31, 44], colours, ANY)
-    expected /= max(1.0, np.hypot(*expected) / STEEPEST)
+    expected /= max(1.0, np.hypot(*expected) / MAX_HORIZONTAL_PART)
     assert found[:, 31, 44] == pytest.approx(expected / np.sqrt(1 - (expected**2).sum()), abs=1e-3)
-    assert np.hypot(*found).max() <= STEEPEST / np.sqrt(1 - STEEPEST**2) + 1e-4
+    assert np.hypot(*found).max() <= MAX_HORIZONTAL_PART / np.sqrt(1 - MAX_HORIZONTAL_PART**2) + 1e-4
 
 
 def test_beyond_the_steepest_normal_of_the_balls_normals_are_in_proportion_to_the_colour() -> None:
@@ -198,20 +198,20 @@ def test_beyond_the_steepest_normal_of_the_balls_normals_are_in_proportion_to_th
         slope = model.slopes(change.astype(np.float32), *coordinates((60, 40)), everywhere, steepest)
         return np.asarray(slope / np.sqrt(1 + (slope**2).sum(axis=0)))
 
-    whole = normals(SlopeModel(ANY), change, STEEPEST)
+    whole = normals(SlopeModel(ANY), change, MAX_HORIZONTAL_PART)
     found = normals(SlopeModel(ANY), change, steepest)
     length = np.hypot(*found)
-    beyond = (length > 1.01 * steepest) & (length < 0.99 * STEEPEST)
+    beyond = (length > 1.01 * steepest) & (length < 0.99 * MAX_HORIZONTAL_PART)
     assert np.allclose(found[:, length < steepest], whole[:, length < steepest], atol=1e-4)
     assert beyond.mean() > 0.1
     part = steepest / np.maximum(length, steepest)
-    there = normals(SlopeModel(ANY), change * part[..., None], STEEPEST)
+    there = normals(SlopeModel(ANY), change * part[..., None], MAX_HORIZONTAL_PART)
     assert np.abs(there - found * part)[:, beyond].max() < 2e-3
     linear = ANY.copy()
     linear[:, 3:] = 0
-    for limit in (steepest, STEEPEST):
+    for limit in (steepest, MAX_HORIZONTAL_PART):
         same = normals(SlopeModel(linear), change, limit)
-        assert np.allclose(same, normals(SlopeModel(linear), change, STEEPEST), atol=1e-3)
+        assert np.allclose(same, normals(SlopeModel(linear), change, MAX_HORIZONTAL_PART), atol=1e-3)
 
 
 def test_coefficients_of_another_shape_are_refused() -> None:

@@ -84,8 +84,12 @@ def memory_mb() -> float:
 class Window:
     """Means over a part of the recording; lists of single frames would grow, and count as memory.
 
-    frames, contacts, seen : their numbers, and that of the frames at rest with dots. dots : mean displacement
-    of the dots at rest, px. center, area : means of the contacts, px, px^2. memory : MB.
+    Attributes
+    ----------
+    frames, contacts, seen : their numbers, and that of the frames at rest with dots.
+    dots : mean displacement of the dots at rest, px.
+    center, area : means of the contacts, px, px^2.
+    memory : MB.
     """
 
     frames: int = 0

@@ -22,7 +22,7 @@ from tactflow.vision.depth.surface import Rest, colour_change, measured
 from tactflow.vision.depth.surroundings import surroundings
 from tactflow.vision.types import Depth, Scale
 
-STEPS: Final = 512
+TABLE_ENTRIES: Final = 512
 """Entries of the table of a curve; linear between them, which is off by 3e-5 of the depth on simulated
 gels."""
 
@@ -32,7 +32,10 @@ class DarknessModel:
 
     Monotone cubic interpolation (PCHIP) through 0 and the given points; beyond the last one, the depth stays.
 
-    darkening : (n,), > 0, increasing. depth : (n,), mm, > 0, increasing.
+    Parameters
+    ----------
+    darkening : (n,), > 0, increasing.
+    depth : (n,), mm, > 0, increasing.
 
     Raises ValueError on other points.
 
@@ -48,7 +51,7 @@ class DarknessModel:
         # Only here, as SciPy takes a while to load.
         from scipy.interpolate import PchipInterpolator
 
-        self._darkening = np.linspace(0, x[-1], STEPS)
+        self._darkening = np.linspace(0, x[-1], TABLE_ENTRIES)
         self._depth = PchipInterpolator(x, y)(self._darkening)
 
     @property
@@ -64,8 +67,12 @@ class DarknessModel:
 class DarkSurface:
     """Height maps of a gel by its darkening; takes the place of `Surface`.
 
-    model : of the depth. scale : mm per px of the processed frame. stderr : of the depth of a pixel, mm; None
-    where it is not known. A contact that is at least as deep as the deepest press has no standard errors.
+    Parameters
+    ----------
+    model : of the depth.
+    scale : mm per px of the processed frame.
+    stderr : of the depth of a pixel, mm; None where it is not known. A contact that is at least as deep as
+        the deepest press has no standard errors.
     thickness : of the gel, mm, as in `Surface`.
     """
 

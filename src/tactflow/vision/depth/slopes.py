@@ -25,20 +25,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats32, Indices
+from tactflow.vision.arrays import Bytes, Floats32, Indices
 from tactflow.vision.compiled import kernel
 
-Bytes = NDArray[np.uint8]
-
-BAND: Final = 8
+BAND_ROWS: Final = 8
 """Rows that are computed over the same columns. Chosen by hand: to find the columns of each row would take
 four times as long."""
-STEEPEST: Final = 0.95
+MAX_HORIZONTAL_PART: Final = 0.95
 """Largest horizontal part of a unit normal: a slope of 3. Steeper slopes have no colour of their own."""
-HALVINGS: Final = 12
+BISECTION_COUNT: Final = 12
 """Bisections that locate a point on a line of colours to 1 / 4096 of its length."""
 
-FACTORS: Final = np.array(
+TERM_FACTORS: Final = np.array(
     (
         *((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)),
         *((0, 3), (0, 4), (0, 5), (0, 6), (0, 7), (0, 8), (1, 6), (1, 7), (1, 8), (2, 8)),
@@ -55,6 +53,8 @@ PLACE_TERMS: Final = 6
 class SlopeModel:
     """Slopes of the gel's surface from relative changes of its colour.
 
+    Parameters
+    ----------
     coefficients : (6, 19, 2): for each term of the place and of the colour, x and y of the normal.
 
     Raises ValueError on another shape, or on numbers that are not finite.
@@ -85,14 +85,14 @@ class SlopeModel:
         return SlopeModel(self.coefficients * factors[:, None, None])
 
     def slopes(
-        self, change: Floats32, x: Floats32, y: Floats32, near: Bytes, steepest: float = STEEPEST
+        self, change: Floats32, x: Floats32, y: Floats32, near: Bytes, steepest: float = MAX_HORIZONTAL_PART
     ) -> Floats32:
         """(2, h, w) float32: how much the surface rises to the right, and down, towards the camera.
 
         change : (h, w, 3) float32, change of the light over the light at rest. x : (w,), y : (h,) float32,
-        `coordinates` of the pixels. near : (bands, w) uint8, one row for `BAND` rows: slopes are computed
-        from its first column that is not 0 to the last; elsewhere they are 0. steepest : horizontal part of
-        a unit normal up to which the polynomial holds, `SurfaceErrors.steepest`.
+        `coordinates` of the pixels. near : (bands, w) uint8, one row for `BAND_ROWS` rows: slopes are
+        computed from its first column that is not 0 to the last; elsewhere they are 0. steepest :
+        horizontal part of a unit normal up to which the polynomial holds, `SurfaceErrors.steepest`.
         """
         slope = np.zeros((2, *change.shape[:2]), np.float32)
         slopes_of_colour(
@@ -103,10 +103,10 @@ class SlopeModel:
             near,
             steepest,
             slope,
-            FACTORS,
-            BAND,
-            HALVINGS,
-            STEEPEST,
+            TERM_FACTORS,
+            BAND_ROWS,
+            BISECTION_COUNT,
+            MAX_HORIZONTAL_PART,
         )
         return slope
 
@@ -127,9 +127,9 @@ def slopes_of_colour(
 ) -> None:
     """Add the slopes of the pixels near the contact to 0.
 
-    change, x, y, near, steepest : of `SlopeModel.slopes`. coefficients : (2, 19, 6).
-    slope : (2, h, w), all 0. factors : pairs of terms, `FACTORS`. band : rows per row of `near`. halvings :
-    of the search for `steepest`. most : largest horizontal part of a unit normal.
+    change, x, y, near, steepest : of `SlopeModel.slopes`. coefficients : (2, 19, 6). slope : (2, h, w), all
+    0. factors : pairs of terms, `TERM_FACTORS`. band : rows per row of `near`. halvings : of the search for
+    `steepest`. most : largest horizontal part of a unit normal.
     """
     dtype = coefficients.dtype
     for row in range(len(y)):
@@ -169,7 +169,7 @@ def _beyond(first: Floats32, second: Floats32, normal: Floats32, steepest: float
     return found
 
 
-def colour_terms(change: Floats32, factors: Indices = FACTORS) -> Floats32:
+def colour_terms(change: Floats32, factors: Indices = TERM_FACTORS) -> Floats32:
     """(19, n) float32: all products of one to three channels of (..., 3), pixel by pixel.
 
     >>> float(colour_terms(np.full((1, 1, 3), 2, np.float32)).sum())

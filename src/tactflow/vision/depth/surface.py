@@ -15,16 +15,16 @@ import numpy as np
 
 from tactflow.vision.arrays import Floats32
 from tactflow.vision.depth.possible import deepest_possible
-from tactflow.vision.depth.slopes import STEEPEST, Bytes, SlopeModel, coordinates
-from tactflow.vision.depth.surroundings import CELL, LEAST_GAIN, Resting, Window, resting, surroundings
+from tactflow.vision.depth.slopes import MAX_HORIZONTAL_PART, Bytes, SlopeModel, coordinates
+from tactflow.vision.depth.surroundings import CELL_PX, MIN_GAIN, Resting, Window, resting, surroundings
 from tactflow.vision.geometry.downsample import cell_means
 from tactflow.vision.types import Depth, Scale
 
-DIM: Final = 20.0
+LIGHT_OFFSET_GREY: Final = 20.0
 """Grey levels added to the light at rest before a change is divided by it, so that the noise of a dark
 channel does not count as colour. Chosen by hand."""
 
-UNEXPLAINED: Final = 5.4
+UNEXPLAINED_ERROR: Final = 5.4
 """Relative error of depth and volume, over the share of the slopes (sum of squares) that no surface explains:
 slopes made wrong by gloss, shadows or new colours contradict each other. This and the two below maximise the
 likelihood of presses on five sensors and of 19 simulated scenes, each with the same weight. When the judged
@@ -33,9 +33,9 @@ the volumes 65 and 92 %. The error of balls that were not used for the calibrati
 the likelihood of the presses of a left-out sensor is lower."""
 STEEP_ERROR: Final = 0.235
 """The same where all slopes are steep; it grows with the root of the steep share."""
-ROUNDED: Final = 0.014
+ROUNDING_ERROR: Final = 0.014
 """The same of any contact: averaging rounds it off."""
-STEEP: Final = 0.95
+STEEP_FRACTION: Final = 0.95
 """A slope is steep above this fraction of the steepest of the calibration, by the horizontal part of the
 normal."""
 
@@ -52,23 +52,27 @@ class SurfaceErrors(NamedTuple):
 class Rest:
     """The untouched gel, prepared for `colour_change`, at half resolution.
 
+    Parameters
+    ----------
     untouched : (H, W, 3), BGR, without markers; H and W at least 8; of the dtype of the pictures that are
-    compared with it, so that both are rounded alike.
+        compared with it, so that both are rounded alike.
     """
 
     def __init__(self, untouched: Bytes | Floats32) -> None:
         self.window = Window(0, untouched.shape[0] // 4 * 2, 0, untouched.shape[1] // 4 * 2)
         self.light = _halved(untouched, self.window)
-        self.weight: Floats32 = np.reciprocal(self.light + np.float32(DIM), dtype=np.float32)
+        self.weight: Floats32 = np.reciprocal(self.light + np.float32(LIGHT_OFFSET_GREY), dtype=np.float32)
         self.x, self.y = coordinates((self.window.right, self.window.bottom))
         self.level: Floats32 = self.light * self.weight
-        self._cells = cell_means(untouched, CELL)
-        self._cell_weight = np.reciprocal(self._cells + np.float32(DIM), dtype=np.float32)
+        self._cells = cell_means(untouched, CELL_PX)
+        self._cell_weight = np.reciprocal(self._cells + np.float32(LIGHT_OFFSET_GREY), dtype=np.float32)
         self._cell_level: Floats32 = self._cells * self._cell_weight
 
     def around(self, image: Bytes | Floats32, mask: Bytes) -> Resting:
         """Where the gel around a contact is at rest. image, mask : as `Surface.depth` takes them."""
-        change = np.asarray(cv2.subtract(cell_means(image, CELL), self._cells, dtype=cv2.CV_32F), np.float32)
+        change = np.asarray(
+            cv2.subtract(cell_means(image, CELL_PX), self._cells, dtype=cv2.CV_32F), np.float32
+        )
         return resting(change * self._cell_weight, self._cell_level, mask)
 
 
@@ -82,7 +86,7 @@ def colour_change(image: Bytes | Floats32, rest: Rest, window: Window, gain: Flo
     halved = _halved(image, window)
     change = np.asarray(cv2.subtract(halved, rest.light[window.part], dtype=cv2.CV_32F), np.float32)
     change *= rest.weight[window.part]
-    gain = np.maximum(gain, np.float32(LEAST_GAIN))
+    gain = np.maximum(gain, np.float32(MIN_GAIN))
     # (image / gain - light) * weight, so that a gel that has not changed gives 0 exactly.
     change -= (gain - 1) * rest.level[window.part]
     change /= gain
@@ -131,8 +135,10 @@ class Surface:
         slope, steep, window = self._slopes(image, rest, mask, gradients)
         low, relative = self._integrated(slope, window, rest.window), None
         if self._errors is not None and gradients is None:
-            unexplained = UNEXPLAINED * self._unexplained(slope, low, mask[window.whole])
-            relative = math.hypot(unexplained, STEEP_ERROR * math.sqrt(steep), self._errors.between, ROUNDED)
+            unexplained = UNEXPLAINED_ERROR * self._unexplained(slope, low, mask[window.whole])
+            relative = math.hypot(
+                unexplained, STEEP_ERROR * math.sqrt(steep), self._errors.between, ROUNDING_ERROR
+            )
         return measured(low, window, mask, self._scale, relative, self._thickness)
 
     def heights(self, image: Bytes, rest: Rest, mask: Bytes) -> Floats32:
@@ -172,7 +178,11 @@ class Surface:
         rows, columns = window.part
         steepest = None if self._errors is None else self._errors.steepest
         slope = self._model.slopes(
-            change, rest.x[columns], rest.y[rows], around.near, STEEPEST if steepest is None else steepest
+            change,
+            rest.x[columns],
+            rest.y[rows],
+            around.near,
+            MAX_HORIZONTAL_PART if steepest is None else steepest,
         )
         steep = _steep_part(slope, steepest)
         return slope, steep, window
@@ -244,7 +254,7 @@ def _steep_part(slope: Floats32, steepest: float | None) -> float:
     """Share of slopes (2, h, w) that are steep, 0 to 1; 0 where `steepest` is not known."""
     if steepest is None:
         return 0.0
-    flat = STEEP * steepest
+    flat = STEEP_FRACTION * steepest
     length = cv2.magnitude(slope[0], slope[1])
     total = float(length.sum())
     cv2.threshold(length, flat / math.sqrt(1 - flat * flat), 0, cv2.THRESH_TOZERO, length)

@@ -8,23 +8,23 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Floats32
-from tactflow.vision.depth.slopes import BAND, Bytes
+from tactflow.vision.depth.slopes import BAND_ROWS, Bytes
 from tactflow.vision.geometry.region import measure_region
 
-LEAST_MARGIN: Final = 12
+MIN_MARGIN_PX: Final = 12
 """Smallest margin around the contact in which the gel may have sunk, pixels at half resolution; that of a
 calibration. With 8, errors under `mixed` are two to seven times as large."""
-CELL: Final = 8
+CELL_PX: Final = 8
 """Side of the cells in which the gel at rest is searched for, px of the picture."""
-FADED: Final = 0.05
+REST_CHANGE_RATIO: Final = 0.05
 """Change of the light at which the gel counts as at rest, over that at the rim of the contact, both less that
 far away: what lies beyond adds a hundredth to the depth."""
 
 
-LIT: Final = 0.5
+MIN_LIT_LEVEL: Final = 0.5
 """Least `level` of a cell that shows how much the light has changed: its light at rest is then at least `DIM`
 of `surface`, so that grey levels of noise are a small part of it."""
-LEAST_GAIN: Final = 0.1
+MIN_GAIN: Final = 0.1
 """Smallest gain that is divided by: a picture that is darker shows no gel."""
 
 
@@ -70,7 +70,7 @@ class Surroundings(NamedTuple):
     near: Bytes
 
 
-def surroundings(mask: Bytes, whole: Window, margin: int = LEAST_MARGIN) -> Surroundings:
+def surroundings(mask: Bytes, whole: Window, margin: int = MIN_MARGIN_PX) -> Surroundings:
     """Around the contact of a mask (H, W) uint8, 255 in contact; not all 0.
 
     margin : how far from the contact, pixels at half resolution.
@@ -88,8 +88,10 @@ def surroundings(mask: Bytes, whole: Window, margin: int = LEAST_MARGIN) -> Surr
 class Resting(NamedTuple):
     """Where the gel around a contact is at rest.
 
-    margin : distance from the contact, pixels at half resolution. gain : (3,) float32, the light there, over
-    the light of the untouched gel.
+    Attributes
+    ----------
+    margin : distance from the contact, pixels at half resolution.
+    gain : (3,) float32, the light there, over the light of the untouched gel.
     """
 
     margin: int
@@ -100,28 +102,28 @@ def resting(change: Floats32, level: Floats32, mask: Bytes) -> Resting:
     """Find the distance from a contact beyond which the gel is at rest, and how its light has changed there.
 
     The change of the light decreases with the distance from the contact: the gel is at rest from the first
-    ring around it in which the mean change has faded (`FADED`). Exposure and white balance multiply a channel
-    by a factor all over the picture, which the gel far from the contact shows.
+    ring around it in which the mean change has faded (`REST_CHANGE_RATIO`). Exposure and white balance
+    multiply a channel by a factor all over the picture, which the gel far from the contact shows.
 
-    change : (h, w, 3) float32, relative change of the light in cells of `CELL` x `CELL` pixels. level :
+    change : (h, w, 3) float32, relative change of the light in cells of `CELL_PX` x `CELL_PX` pixels. level :
     (h, w, 3) float32, by how much `change` grows if the light doubles. mask : (H, W) uint8, 255 in contact;
     not all 0.
     """
     height, width = change.shape[:2]
-    middle = CELL // 2
-    contact = mask[middle : height * CELL : CELL, middle : width * CELL : CELL]
+    middle = CELL_PX // 2
+    contact = mask[middle : height * CELL_PX : CELL_PX, middle : width * CELL_PX : CELL_PX]
     if contact.all() or not contact.any():
-        return Resting(LEAST_MARGIN, np.ones(3, np.float32))
+        return Resting(MIN_MARGIN_PX, np.ones(3, np.float32))
     ring = cv2.distanceTransform((contact == 0).view(np.uint8), cv2.DIST_L2, 5).astype(np.intp)
-    outside = ring >= min(2 * LEAST_MARGIN // CELL, ring.max())
+    outside = ring >= min(2 * MIN_MARGIN_PX // CELL_PX, ring.max())
     more = _relative_growth(change[outside], level[outside])
     off = change - more * level
     strength = np.sqrt(np.einsum("ijk,ijk->ij", off, off)).ravel()
     rings = ring.ravel()
     profile = np.bincount(rings, strength) / np.maximum(np.bincount(rings), 1)
     far = float(profile[1:].min())
-    faded = np.flatnonzero(profile[1:] <= far + FADED * (profile[1] - far))
-    return Resting(max(LEAST_MARGIN, (int(faded[0]) + 1) * CELL // 2), 1 + more)
+    faded = np.flatnonzero(profile[1:] <= far + REST_CHANGE_RATIO * (profile[1] - far))
+    return Resting(max(MIN_MARGIN_PX, (int(faded[0]) + 1) * CELL_PX // 2), 1 + more)
 
 
 def _relative_growth(change: Floats32, level: Floats32) -> Floats32:
@@ -131,7 +133,7 @@ def _relative_growth(change: Floats32, level: Floats32) -> Floats32:
     """
     growth = np.zeros(3, np.float32)
     for channel in range(3):
-        lit = level[:, channel] >= LIT
+        lit = level[:, channel] >= MIN_LIT_LEVEL
         if lit.any():
             # The middle of a sorted column; `np.median` takes three times as long.
             ratios = np.sort(change[lit, channel] / level[lit, channel])
@@ -140,10 +142,10 @@ def _relative_growth(change: Floats32, level: Floats32) -> Floats32:
 
 
 def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
-    """(bands, w): the part of a window near the contact, in bands of `BAND` rows; not 0 there."""
-    bands = -(-window.height // BAND)
-    contact = np.zeros((bands * BAND, window.width), np.uint8)
+    """(bands, w): the part of a window near the contact, in bands of `BAND_ROWS` rows; not 0 there."""
+    bands = -(-window.height // BAND_ROWS)
+    contact = np.zeros((bands * BAND_ROWS, window.width), np.uint8)
     size = (window.width, window.height)
     cv2.resize(mask[window.whole], size, contact[: window.height], interpolation=cv2.INTER_AREA)
-    reach = np.ones((2 * -(-margin // BAND) + 1, 2 * margin + 1), np.uint8)
-    return np.asarray(cv2.dilate(contact.reshape(bands, BAND, -1).max(axis=1), reach), np.uint8)
+    reach = np.ones((2 * -(-margin // BAND_ROWS) + 1, 2 * margin + 1), np.uint8)
+    return np.asarray(cv2.dilate(contact.reshape(bands, BAND_ROWS, -1).max(axis=1), reach), np.uint8)

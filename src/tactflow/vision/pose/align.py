@@ -43,8 +43,13 @@ MIN_POINTS: Final = 12
 class Gel(NamedTuple):
     """The best rigid motion in the plane of the gel that is in contact in two frames.
 
-    before, now : its middle, x + iy, mm. turn : radians. variance : of each coordinate of `now`, mm^2. spread
-    : mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance / spread.
+    Attributes
+    ----------
+    before, now : its middle, x + iy, mm.
+    turn : radians.
+    variance : of each coordinate of `now`, mm^2.
+    spread : mean square distance of the gel from its middle, mm^2; the variance of `turn` is variance /
+        spread.
     overlap : share of the gel in contact now that was in contact before.
     """
 
@@ -59,9 +64,13 @@ class Gel(NamedTuple):
 class Alignment(NamedTuple):
     """A motion from a template to an imprint.
 
-    motion : (4, 4), about the template's centre, mm. covariance : (6, 6), see `rigid`. overlap : share of the
-    present contact that both show. misfit : sum of squares of the normals' differences, over their expected
-    variances. residual : RMS difference of a normal's component.
+    Attributes
+    ----------
+    motion : (4, 4), about the template's centre, mm.
+    covariance : (6, 6), see `rigid`.
+    overlap : share of the present contact that both show.
+    misfit : sum of squares of the normals' differences, over their expected variances.
+    residual : RMS difference of a normal's component.
     """
 
     motion: Floats
@@ -74,10 +83,14 @@ class Alignment(NamedTuple):
 class _Comparison(NamedTuple):
     """Imprints at one motion.
 
-    shown : number of points that both show. error, weight : (N, 2), (N,), of their normals. by_normals : (6,
-    6), their information. system : (7, 7), normal equations: the sum of the outer products of rows of six
-    derivatives and an error, over standard deviations. So it holds the information (6, 6), the gradient (6,),
-    and in the corner the sum of squares.
+    Attributes
+    ----------
+    shown : number of points that both show.
+    error, weight : (N, 2), (N,), of their normals.
+    by_normals : (6, 6), their information.
+    system : (7, 7), normal equations: the sum of the outer products of rows of six derivatives and an
+        error, over standard deviations. So it holds the information (6, 6), the gradient (6,), and in the
+        corner the sum of squares.
     """
 
     shown: int

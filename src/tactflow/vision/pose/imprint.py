@@ -35,10 +35,15 @@ MIN_PATCH_CELLS: Final = 2.0
 class Imprint(NamedTuple):
     """The surface under a contact, in cells of `CELL_PX` x `CELL_PX` px.
 
-    planes : (h, w, 4) float32: x and y of the unit normal out of the gel, height above the untouched gel, mm
-        (<= 0), weight in [0, 1], 0 outside the contact.
-    first : (2,), x and y of the centre of the first cell, mm. cell : (2,), mm. area : cells with a weight.
-    height : mean, mm. error : relative standard error of heights and slopes.
+    Attributes
+    ----------
+    planes : (h, w, 4) float32: x and y of the unit normal out of the gel, height above the untouched gel,
+        mm (<= 0), weight in [0, 1], 0 outside the contact.
+    first : (2,), x and y of the centre of the first cell, mm.
+    cell : (2,), mm.
+    area : cells with a weight.
+    height : mean, mm.
+    error : relative standard error of heights and slopes.
     """
 
     planes: Floats32
@@ -93,8 +98,13 @@ def _gradient(values: Floats32, cell: Floats) -> tuple[Floats32, Floats32]:
 class Template(NamedTuple):
     """An imprint that others are compared with; lengths in mm from `center`.
 
-    imprint : it. center : (3,), mean of its points. every : cells per point.
-    points : (N, 6): where each is, x and y of its normal, its weight. blocks : (N,), the patch of each.
+    Attributes
+    ----------
+    imprint : it.
+    center : (3,), mean of its points.
+    every : cells per point.
+    points : (N, 6): where each is, x and y of its normal, its weight.
+    blocks : (N,), the patch of each.
     by : (N, 3, 6): derivatives of x and y of each point's normal, and of its height, by a small motion.
     signal : standard deviation of x and y of the normals.
     levers : (6, 6), mean square displacement of the points along the gel by a small motion.

@@ -43,9 +43,13 @@ class _Frame(NamedTuple):
 class _Keyframe(NamedTuple):
     """A frame that others are compared with.
 
-    center : (3,), of its template, from that of the first one, mm. motion, back : (4, 4), from the start to
-    it about its centre, and its inverse. carry : (6, 6), of `back`, see `adjoint`. covariance : (6, 6), of
-    the motion. by_slopes : (6,), what of the motion is in proportion to the slopes.
+    Attributes
+    ----------
+    center : (3,), of its template, from that of the first one, mm.
+    motion, back : (4, 4), from the start to it about its centre, and its inverse.
+    carry : (6, 6), of `back`, see `adjoint`.
+    covariance : (6, 6), of the motion.
+    by_slopes : (6,), what of the motion is in proportion to the slopes.
     """
 
     frame: _Frame
@@ -65,6 +69,8 @@ class PoseTracker:
     the keyframe is replaced, and the errors of both add up; within one they do not grow. Where the object
     slides over the gel, or the normals contradict the gel, only the normals count, until the next keyframe.
 
+    Parameters
+    ----------
     scale : mm per px.
 
     Examples
