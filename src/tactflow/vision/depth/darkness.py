@@ -16,8 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Floats, Floats32
-from tactflow.vision.depth.slopes import Bytes
+from tactflow.vision.arrays import Bytes, Floats, Floats32
 from tactflow.vision.depth.surface import Rest, colour_change, measured
 from tactflow.vision.depth.surroundings import surroundings
 from tactflow.vision.types import Depth, Scale

@@ -8,7 +8,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from tactflow.vision.depth.slopes import Bytes
+from tactflow.vision.arrays import Bytes
 from tactflow.vision.types import Scale
 
 DEPTH_BY_HALF_WIDTH: Final = 1.0

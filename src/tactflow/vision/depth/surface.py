@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import Bytes, Floats32
 from tactflow.vision.depth.possible import deepest_possible
-from tactflow.vision.depth.slopes import MAX_HORIZONTAL_PART, Bytes, SlopeModel, coordinates
+from tactflow.vision.depth.slopes import MAX_HORIZONTAL_PART, SlopeModel, coordinates
 from tactflow.vision.depth.surroundings import CELL_PX, MIN_GAIN, Resting, Window, resting, surroundings
 from tactflow.vision.geometry.downsample import cell_means
 from tactflow.vision.types import Depth, Scale

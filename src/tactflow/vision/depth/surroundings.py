@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Floats32
-from tactflow.vision.depth.slopes import BAND_ROWS, Bytes
+from tactflow.vision.arrays import Bytes, Floats32
+from tactflow.vision.depth.slopes import BAND_ROWS
 from tactflow.vision.geometry.region import measure_region
 
 MIN_MARGIN_PX: Final = 12
