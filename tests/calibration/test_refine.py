@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import tactflow
+from tactflow.calibration import KINDS
 from tactflow.calibration.file import Calibration, ScaleEntry, raw_corners, small_picture
 from tactflow.calibration.judgement import doubt
 from tactflow.calibration.photometric import fit_photometry
@@ -158,7 +159,10 @@ def test_another_mini_has_depth_by_the_default_and_says_once_that_it_is_one(
     source = pictures_of(folder, "background.png", names, tmp_path / "presses")
     with caplog.at_level(logging.INFO, "tactflow"):
         results = list(tactflow.stream("mini_plain", source=str(source), images=True))
-    assert caplog.text.count("default calibration of a GelSight Mini: depth +- 16 %, lengths +- 5 %") == 1
+    known = Calibration.load(KINDS / "mini.yaml").photometric
+    assert known is not None
+    stated = f"depth +- {100 * known.depth_stderr:.0f} %, lengths +- 5 %"
+    assert caplog.text.count(f"default calibration of a GelSight Mini: {stated}") == 1
     deep = [result for result in results if result.depth]
     assert len(deep) == len(names)
     for result in deep:

@@ -50,9 +50,9 @@ CHANNELS: Final = 3
 """Terms of the colour that are a channel itself, not a product."""
 SINGLE_RIDGE: Final = 10.0
 """Ridge penalty, for a single press, of coefficients that depend on the position, of which it shows one, and
-of products of channels, which it shows few of. It falls with the cube of the number of presses. Elsewhere on
-two DIGITs and a Mini, normals by a single press are 8, 14 and 6 degrees off in the mean, instead of 17, 18 and
-6 with a tenth of it; from twenty presses on the fit is as good as without it."""
+of products of channels, which it shows few of. It falls with the cube of the number of presses. Elsewhere
+on two DIGITs and a Mini, normals by a single press are 8, 14 and 6 degrees off in the mean, instead of 17, 18
+and 6 with a tenth of it; from twenty presses on the fit is as good as without it."""
 SINGLE_CHANNEL_RIDGE: Final = 0.1
 """The same of the three channels themselves, whose differences a single press may hardly show."""
 SINGLE_PRESS_ERRORS: Final[Mapping[str, float]] = {"normal_error": 8.5, "depth_stderr": 0.25}
