@@ -54,7 +54,7 @@ setup(
         "tactflow.plugins",
         *(
             f"tactflow.plugins.{name}"
-            for name in ("arrays", "lerobot", "onnx", "parquet", "replay_buffer", "rosbags")
+            for name in ("arrays", "lerobot", "onnx", "parquet", "replay_buffer", "rosbags", "shm")
         ),
     ],
     long_description=re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", absolute, readme) if REPOSITORY else readme,

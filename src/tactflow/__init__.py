@@ -7,8 +7,8 @@
 ...         break
 0.53 s: contact at x = 115 px
 
-What `__all__` lists is public and changes only with a line in CHANGELOG.md. Nothing is imported before it is
-used.
+What `__all__` lists is public and changes only with a line in CHANGELOG.md. Plug-ins add names by the entry
+points `tactflow.api`. Nothing is imported before it is used.
 """
 
 from __future__ import annotations
@@ -80,11 +80,21 @@ __all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"tactflow has no {name}; public are {', '.join(__all__)}")
-    value = getattr(import_module(_HOME[name]), name)
+    value = getattr(import_module(_HOME[name]), name) if name in _HOME else _of_plugin(name)
     globals()[name] = value
     return value
+
+
+def _of_plugin(name: str) -> Any:
+    from tactflow.system.plugins import plugins
+
+    # Python itself asks for names in underscores, `__path__` and the like.
+    points = () if name.startswith("_") else plugins("tactflow.api")
+    for point in points:
+        if point.name == name:
+            return point.load()
+    public = [*__all__, *(point.name for point in points)]
+    raise AttributeError(f"tactflow has no {name}; public are {', '.join(public)}")
 
 
 def __dir__() -> list[str]:

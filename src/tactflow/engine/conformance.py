@@ -42,7 +42,7 @@ def component(cls: type[Any], name: str, origin: str, reserved: Collection[str])
             place = cls.__module__
         raise ConfigError(f"{place}: {cls.__name__}{problem}")
     memory: Memory = getattr(cls, "memory", "pure")
-    ports = Ports((), ()) if declares(cls) else read_ports(cls, METHODS[kind])
+    ports = Ports((), ()) if kind == "stage" and declares(cls) else read_ports(cls, METHODS[kind])
     delivery = Delivery()
     if kind == "sink":
         delivery = Delivery(**{field.name: getattr(cls, field.name) for field in fields(Delivery)})
@@ -50,8 +50,9 @@ def component(cls: type[Any], name: str, origin: str, reserved: Collection[str])
 
 
 def declares(cls: type[Any]) -> bool:
-    """Whether the ports of a class depend on its parameters (`Stage.declare`)."""
-    return issubclass(cls, Stage) and cls.declare.__func__ is not Stage.declare.__func__  # type: ignore[attr-defined]
+    """Whether the ports of a class depend on its parameters (`Stage.declare`, `Sink.declare`)."""
+    base = next((base for base in (Stage, Sink) if issubclass(cls, base)), None)
+    return base is not None and cls.declare.__func__ is not base.declare.__func__  # type: ignore[attr-defined]
 
 
 def configured(component: Component, params: StageParams) -> Component:
@@ -59,6 +60,9 @@ def configured(component: Component, params: StageParams) -> Component:
     if not declares(component.cls):
         return component
     declared = component.cls.declare(params)
+    if component.kind == "sink":
+        ports = component.ports
+        return replace(component, ports=replace(ports, inputs=[*ports.inputs, *declared]))
     return replace(component, ports=Ports(declared.inputs, declared.outputs), memory=declared.memory)
 
 

@@ -199,6 +199,14 @@ class Sink(Part):
     """Whether it gets every reference frame even if it wants none, and a reference image that is not part of
     the source (`Frame.seq` -1)."""
 
+    @classmethod
+    def declare(cls, params: Any) -> Sequence[Port] | None:  # noqa: ARG003 (for sinks whose ports are settings)
+        """Further inputs that depend on the parameters; `write` takes their values as `*values`.
+
+        None, the default: the annotations of `write` name all inputs.
+        """
+        return None
+
     def begin(self) -> None:
         """Replace earlier output. Called once when every part of the run is open, before the first frame.
 

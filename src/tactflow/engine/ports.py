@@ -206,6 +206,9 @@ def _ports(function: Callable[..., Any], method: str) -> Ports:
         return Ports((), (Port("frame", Frame),))
     hints = _hints(function)
     parameters = list(inspect.signature(function).parameters.values())[1:]
+    if method == "write":
+        # Their types are those that `Sink.declare` gives.
+        parameters = [parameter for parameter in parameters if parameter.kind != parameter.VAR_POSITIONAL]
     inputs: list[Port] = []
     result: ResultParameter | None = None
     named = {parameter.name for parameter in parameters}

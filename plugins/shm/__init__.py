@@ -1,0 +1,1 @@
+"""Pictures and arrays in shared memory: the sink `shm` and its reader."""
