@@ -3,10 +3,10 @@
     python lab/shared_memory.py                  # 4 sensors, 2 readers each, 60 Hz, 800 x 600
     python lab/shared_memory.py --sensors 1
 
-Each sensor is a process that hands pictures of a simulated gel to the sink alone, at a fixed rate, so that the
-cost is that of the transport. Each reader gets every picture as an array, and its message. Printed is CPU time
-(user and system, all threads) per picture, which other load on the machine hardly changes, and the share of one
-processor that this is at the full rate.
+Each sensor is a process that hands pictures of a simulated gel to the sink alone, at a fixed rate, so that
+the cost is that of the transport. Each reader gets the pictures as arrays, with their messages. The table has
+the CPU time of a picture (user and system, all threads), which other load on the machine changes least, and
+the share of one processor that this is at the full rate.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def write(transport: str, sensor: int, readers: int, frames: int) -> None:
     connected = "readers" if transport == "shm" else "subscriptions"
     # Two subscribers to one topic count as one subscription.
     needed = readers if transport == "shm" else 1
-    while sink.counters()[connected] < needed:
+    while not sink.wants() or sink.counters()[connected] < needed:
         time.sleep(0.01)
     time.sleep(1.0)
     start, used = time.perf_counter(), 0.0
@@ -124,10 +124,8 @@ def measure(transport: str, sensors: int, readers: int, frames: int) -> str:
     share = (writer + readers * reader) * RATE_HZ * sensors / 10
     rate = statistics.median(rate for _, rate in writers)
     got = 100 * statistics.mean(count / frames for _, count in seen)
-    name = TRANSPORTS[transport]
-    return (
-        f"| {name} | {sensors} | {writer:.2f} | {reader:.2f} | {share:.0f} % | {rate:.0f} Hz | {got:.0f} % |"
-    )
+    times = f"{writer:.2f} | {reader:.2f} | {share:.0f} %"
+    return f"| {TRANSPORTS[transport]} | {sensors} | {times} | {rate:.0f} Hz | {got:.0f} % |"
 
 
 def main() -> None:
