@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import Final
 
 from tactflow.engine.errors import StageError
-from tactflow.plugins.shm.layout import Picture, Ring
 from tactflow.system.files import expanded, lock
+
+from .layout import Picture, Ring
 
 MAX_REQUEST_BYTES: Final = 256
 """Longest request of a reader, bytes: the name of a port."""

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from tactflow.engine.errors import StageError
 from tactflow.message.result import Result
-from tactflow.plugins.shm.door import REFUSAL, RETRY_SECONDS, address_of, may_talk
-from tactflow.plugins.shm.layout import Picture, RingView
+
+from .door import REFUSAL, RETRY_SECONDS, address_of, may_talk
+from .layout import Picture, RingView
 
 MAX_ANSWER_BYTES: Final = 4096
 """Bytes read from the socket at once: more than its queue holds messages of one byte."""

@@ -14,10 +14,11 @@ from tactflow.engine.contract import Sink
 from tactflow.engine.errors import StageError
 from tactflow.engine.ports import Port
 from tactflow.message.result import MessageParams, Result, encode_message
-from tactflow.plugins.shm.door import Door, address_of
-from tactflow.plugins.shm.layout import MAX_DIMENSIONS, Picture
 from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.types import Depth, Markers
+
+from .door import Door, address_of
+from .layout import MAX_DIMENSIONS, Picture
 
 log = logging.getLogger("tactflow")
 

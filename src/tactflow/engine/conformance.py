@@ -51,8 +51,8 @@ def component(cls: type[Any], name: str, origin: str, reserved: Collection[str])
 
 def declares(cls: type[Any]) -> bool:
     """Whether the ports of a class depend on its parameters (`Stage.declare`, `Sink.declare`)."""
-    base = next((base for base in (Stage, Sink) if issubclass(cls, base)), None)
-    return base is not None and cls.declare.__func__ is not base.declare.__func__  # type: ignore[attr-defined]
+    bases: tuple[Any, ...] = (Stage, Sink)
+    return any(issubclass(cls, base) and cls.declare.__func__ is not base.declare.__func__ for base in bases)
 
 
 def configured(component: Component, params: StageParams) -> Component:
