@@ -173,3 +173,27 @@ def test_a_failed_export_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(words) == 4
     assert "no-such.mcap: no such file" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_batch_makes_one_buffer_of_all_recordings_that_are_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recordings, out = tmp_path / "recordings", tmp_path / "out"
+    recordings.mkdir()
+    images = [r.image for r in tactflow.stream(source=SPECS[0], settings={"sinks": {}}, images=True)]
+    for index in range(2):
+        np.save(recordings / f"press-{index}.npy", np.stack(images[10 * index : 10 * index + 10]))
+    (recordings / "press-2.npy").write_bytes(b"damaged")
+    common = ["batch", "markerless", str(recordings), "--out", str(out), "--format", "csv", "--workers", "1"]
+    # The size of a picture tells that `--set` applies to the data set, too.
+    settings = ["--set", "stages.preprocess={use: preprocess, downsample: 1, rotate: 0}"]
+    assert main([*common, *settings, "--dataset", "replay-buffer", "--fps", "15"]) == 3
+    assert "out/replay-buffer: 2 episodes at 15 fps" in capsys.readouterr().err
+    root = zarr.open_group(out / "replay-buffer" / "replay_buffer.zarr", mode="r")
+    # 10 frames at 30 Hz; the last one is at 0.3 s.
+    assert root["meta/episode_ends"][:].tolist() == [5, 10]
+    for begin, recording in ((0, images[:10:2]), (5, images[10:20:2])):
+        stored = root["data/main_img"][begin : begin + 5]
+        assert np.array_equal(stored, np.stack(recording)[..., ::-1])
+    assert main([*common, "--dataset", "no-such"]) == 2
+    assert "there is no format no-such" in capsys.readouterr().err

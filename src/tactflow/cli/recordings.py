@@ -32,7 +32,8 @@ EXPORTS = "tactflow.exports"
 """Group of entry points: name of a format -> function that writes a dataset. It is called with a folder to
 fill, `(name, results)` of each recording, and `fps`, `task` and `pictures` as keywords. One whose
 `fps` is None by default can keep every frame and its time."""
-_frame_rate = number(int, 1, 1000, "1 to 1000 frames a second")
+frame_rate = number(int, 1, 1000, "1 to 1000 frames a second")
+"""Parses the frame rate of a dataset."""
 
 
 def add_arguments_export(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +59,7 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--fps",
-        type=_frame_rate,
+        type=frame_rate,
         help="frame rate of the dataset (default: that of the first recording; hdf5: every frame)",
     )
     parser.add_argument(
@@ -80,25 +81,69 @@ def run_export(args: argparse.Namespace) -> int:
     ConfigError : there is no such format, or the folder is there already. Nothing was written.
     TactflowError : as `tactflow run`, or another run is writing to the folder; nothing is left behind.
     """
-    exporter, recordings = _exporter(args.format), listed_sources(args, "recordings")
+    from tactflow.streaming import stream
+
+    find_exporter(args.format)
+    recordings = listed_sources(args, "recordings")
     if args.out.is_file() or (args.out.is_dir() and any(args.out.iterdir())):
         raise ConfigError(f"--out: {args.out} already exists; give another folder")
-    rate = signature(exporter).parameters.get("fps")
-    keeps_every_frame = rate is not None and rate.default is None
-    fps = args.fps if args.fps or keeps_every_frame else _rate(recordings[0])
-    started: list[str] = []
-    try:
-        with notes(), writing(args.out), locked_folder(args.out), completed(args.out.resolve()) as folder:
-            episodes = _episodes(recordings, args.pipeline, started)
-            exporter(folder, episodes, fps=fps, task=args.task, pictures=args.pictures)
-    except StageError as error:
-        raise StageError(f"{started[-1]}: {error}" if started else str(error)) from error
-    count = len(recordings)
-    say(f"{args.out}: {count} {'episode' if count == 1 else 'episodes'}{f' at {fps} fps' if fps else ''}")
+
+    def results(recording: str) -> Iterable[Result]:
+        return stream(args.pipeline, source=recording, settings={"sinks": {}}, images=True)
+
+    options = {"fps": args.fps, "task": args.task, "pictures": args.pictures}
+    say(write_dataset(args.format, recordings, results, args.out, **options))
     return 0
 
 
-def _exporter(name: str) -> Callable[..., None]:
+def write_dataset(
+    format_: str,
+    recordings: Sequence[str],
+    results: Callable[[str], Iterable[Result]],
+    out: Path,
+    *,
+    fps: int | None = None,
+    task: str = "touch",
+    pictures: str = "video",
+) -> str:
+    """Write a dataset with an episode for each recording; returns a line about it.
+
+    Parameters
+    ----------
+    format_ : name of an export.
+    recordings : sources.
+    results : gives the results of a recording, with pictures.
+    out : folder; replaced if it exists.
+    fps : frame rate of the dataset, Hz; None: that of the first recording, or every frame if the format can.
+    task, pictures : as for `tactflow export`.
+
+    Raises
+    ------
+    ConfigError : there is no such format. TactflowError : as `tactflow run`, or another run is writing to the
+        folder; nothing is left behind.
+    """
+    exporter = find_exporter(format_)
+    rate = signature(exporter).parameters.get("fps")
+    keeps_every_frame = rate is not None and rate.default is None
+    fps = fps if fps or keeps_every_frame else _rate(recordings[0])
+    started: list[str] = []
+
+    def episodes() -> Iterator[tuple[str, Iterable[Result]]]:
+        for recording in recordings:
+            started.append(recording)
+            yield recording, results(recording)
+
+    try:
+        with notes(), writing(out), locked_folder(out), completed(out.resolve()) as folder:
+            exporter(folder, episodes(), fps=fps, task=task, pictures=pictures)
+    except StageError as error:
+        raise StageError(f"{started[-1]}: {error}" if started else str(error)) from error
+    count = len(recordings)
+    return f"{out}: {count} {'episode' if count == 1 else 'episodes'}{f' at {fps} fps' if fps else ''}"
+
+
+def find_exporter(name: str) -> Callable[..., None]:
+    """The function that writes datasets of a format. Raises ConfigError if there is no such format."""
     formats = {entry.name: entry for entry in plugins(EXPORTS)}
     if name not in formats:
         raise ConfigError(f"there is no format {name}{did_you_mean(name, formats)}")
@@ -106,17 +151,6 @@ def _exporter(name: str) -> Callable[..., None]:
         return cast(Callable[..., None], formats[name].load())
     except Exception as error:
         raise ConfigError(f"{name}: {formats[name].value} cannot be loaded: {error}") from error
-
-
-def _episodes(
-    recordings: Sequence[str], pipeline: str | None, started: list[str]
-) -> Iterator[tuple[str, Iterable[Result]]]:
-    """The name and the results of each recording; appends the name of each that is started to `started`."""
-    from tactflow.streaming import stream
-
-    for recording in recordings:
-        started.append(recording)
-        yield recording, stream(pipeline, source=recording, settings={"sinks": {}}, images=True)
 
 
 def _rate(recording: str) -> int:

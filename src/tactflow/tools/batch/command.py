@@ -20,6 +20,7 @@ from tactflow.cli.options import (
     listed_sources,
     writing,
 )
+from tactflow.cli.recordings import find_exporter, frame_rate, write_dataset
 from tactflow.config.load import sensor_names
 from tactflow.config.shipped import find_pipeline, packaged_pipelines
 from tactflow.engine.errors import ConfigError, StageError
@@ -30,7 +31,7 @@ from tactflow.tools.batch.recordings import Recording, find_recordings
 from tactflow.tools.batch.report import chosen_format, write_page, write_runs
 from tactflow.tools.batch.run import Batch, Result, make_plan
 from tactflow.tools.batch.store import Format, Outcome, Store
-from tactflow.tools.batch.work import Request, resolved
+from tactflow.tools.batch.work import Request, resolved, results_of
 from tactflow.tools.batch.workers import DaskCluster, LocalProcesses
 
 MAX_MESSAGE_LETTERS = 200
@@ -51,6 +52,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format",
         choices=get_args(Format),
         help="of the results and of the table of runs (default: parquet, or csv where pyarrow is missing)",
+    )
+    parser.add_argument(
+        "--dataset",
+        metavar="FORMAT",
+        help="also make one dataset of all recordings that are done, in DIR/FORMAT: lerobot, replay-buffer "
+        "or another format of `tactflow export`",
+    )
+    parser.add_argument(
+        "--fps", type=frame_rate, help="frame rate of the dataset (default: that of the first recording)"
     )
     add_overrides(parser)
     add_sensor(parser)
@@ -82,6 +92,8 @@ def run(args: argparse.Namespace) -> int:
     StageError : the table or the page cannot be written.
     """
     format_, note = chosen_format(args.format)
+    if args.dataset is not None:
+        find_exporter(args.dataset)
     file, words = _pipeline_and_sources(listed_sources(args, "words"))
     sensors = sensor_names(file, args.overrides)
     if len(sensors) > 1 and args.sensor is None:
@@ -120,6 +132,10 @@ def run(args: argparse.Namespace) -> int:
             write_runs(store, runs, format_)
             page = write_page(store, runs, f"{file.stem}: {len(runs)} recordings")
         tell(f"report: {page}")
+        sources = [recording.source for recording, outcome in runs if outcome.status == "done"]
+        if args.dataset is not None and sources and not result.undone and of == 1:
+            out = store.path / args.dataset
+            tell(write_dataset(args.dataset, sources, results_of(request), out, fps=args.fps))
     if signals and result.undone:
         return INTERRUPTED_EXIT_CODE
     return StageError.exit_code if result.undone or result.failed else 0

@@ -10,7 +10,7 @@ import os
 import socket
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,11 +22,13 @@ import tactflow
 from tactflow.api import make_runner
 from tactflow.config.files_used import files_named
 from tactflow.config.load import load_pipeline
+from tactflow.config.overrides import from_settings
 from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
 from tactflow.engine.graph import Mark, Node, Pipeline
 from tactflow.message.result import Result
 from tactflow.outputs import DISK_FULL
+from tactflow.streaming import stream
 from tactflow.system.clock import SYSTEM
 from tactflow.tools.batch.recordings import Recording
 from tactflow.tools.batch.store import Format, Outcome, Store, file_name, fingerprint, remove
@@ -103,6 +105,18 @@ def load(request: Request) -> Pipeline:
     if "source" not in pipeline.source.component.params.model_fields:
         raise ConfigError(f"{pipeline.source.mark}: a batch needs a source with the parameter source")
     return replace(pipeline, nodes=nodes, opencv_threads=1)
+
+
+def results_of(request: Request) -> Callable[[str], Iterable[Result]]:
+    """A function that gives the results of a recording, with pictures, for a dataset."""
+
+    def results(source: str) -> Iterable[Result]:
+        overrides = [*request.overrides, *from_settings({"sinks": {}})]
+        pipeline = load_pipeline(Path(request.file), overrides, sensor=request.sensor)
+        node = _source_node(pipeline, _input(pipeline, source))
+        return stream(replace(pipeline, nodes={**pipeline.nodes, node.id: node}), images=True)
+
+    return results
 
 
 _loaded = functools.lru_cache(maxsize=2)(load)
@@ -232,19 +246,29 @@ def _pipeline_for(task: Task, path: Path) -> Pipeline:
     # One part per table, so that repeated runs write identical files.
     flush = {"flush": math.inf} if task.request.format == "parquet" else {}
     params = sink.params.changed(path=str(path), overwrite=True, **flush)
-    source = pipeline.source
-    input_ = {"source": task.recording.source, "realtime": False}
-    input_ = {key: value for key, value in input_.items() if key in type(source.params).model_fields}
+    source, input_ = pipeline.source, _input(pipeline, task.recording.source)
     stages = dict(pipeline.settings["stages"])
     stages[source.id] = {**(stages[source.id] or {}), **input_}
     # Results store the settings as metadata.
     settings = {**pipeline.settings, "stages": stages, "sinks": {sink.component.name: {}}}
     nodes = {
         **pipeline.nodes,
-        source.id: replace(source, params=source.params.changed(**input_), mark=_SOURCE_POSITION),
+        source.id: _source_node(pipeline, input_),
         sink.id: replace(sink, params=params),
     }
     return replace(pipeline, nodes=nodes, settings=settings)
+
+
+def _input(pipeline: Pipeline, source: str) -> dict[str, Any]:
+    """The parameters of the source stage that make it read a recording."""
+    input_ = {"source": source, "realtime": False}
+    return {key: value for key, value in input_.items() if key in type(pipeline.source.params).model_fields}
+
+
+def _source_node(pipeline: Pipeline, input_: Mapping[str, Any]) -> Node:
+    """The source stage with these parameters."""
+    params = pipeline.source.params.changed(**input_)
+    return replace(pipeline.source, params=params, mark=_SOURCE_POSITION)
 
 
 def _describe(error: Exception) -> str:
