@@ -107,7 +107,7 @@ $(LEROBOT)/.installed: requirements.lock plugins/lerobot/camera/pyproject.toml p
 lerobot-datasets: $(LEROBOT)/.installed
 	$(LEROBOT)/bin/python $(PIP) install \
 		"torch<2.11" "torchvision<0.26" "accelerate<2" "datasets<5" "huggingface-hub<0.36" "av<16" \
-		pandas pyarrow jsonlines einops
+		"diffusers<0.36" "gymnasium<2" "deepdiff<9" imageio pyserial termcolor pandas pyarrow jsonlines einops
 
 PIN_gs_sdk := gs_sdk==2.0.0
 PIN_opentouch-interface := opentouch-interface==0.2.0 torch==2.13.0
