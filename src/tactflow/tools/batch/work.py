@@ -22,7 +22,7 @@ import tactflow
 from tactflow.api import make_runner
 from tactflow.config.files_used import files_named
 from tactflow.config.load import load_pipeline
-from tactflow.config.overrides import from_settings
+from tactflow.config.overrides import Override, from_settings
 from tactflow.engine.collect import with_collector
 from tactflow.engine.errors import ConfigError, SourceError, StageError, TactflowError
 from tactflow.engine.graph import Mark, Node, Pipeline
@@ -111,7 +111,7 @@ def results_of(request: Request) -> Callable[[str], Iterable[Result]]:
     """A function that gives the results of a recording, with pictures, for a dataset."""
 
     def results(source: str) -> Iterable[Result]:
-        overrides = [*request.overrides, *from_settings({"sinks": {}})]
+        overrides: list[Override | str] = [*request.overrides, *from_settings({"sinks": {}})]
         pipeline = load_pipeline(Path(request.file), overrides, sensor=request.sensor)
         node = _source_node(pipeline, _input(pipeline, source))
         return stream(replace(pipeline, nodes={**pipeline.nodes, node.id: node}), images=True)
