@@ -186,3 +186,19 @@ def test_edges_of_a_cube_are_refused_as_presses_of_a_ball(
         assert terminal(*words, *how) == 2
         assert "the object is not a ball" in terminal.err
     assert not list(tmp_path.rglob("*.yaml"))
+
+
+def test_a_digit_has_depth_after_one_press_of_a_ball(
+    shared_data: Path, tmp_path: Path, terminal: Terminal
+) -> None:
+    folder = shared_data / "digit_ball"
+    source = pictures_of(folder, "000.png", ["002.png"], tmp_path / "press")
+    words = ["calibrate", "digit", "--from", str(source), "--refine", "--ball-radius", "4.4"]
+    assert terminal(*words, "--out", "mine.yaml") == 0
+    assert "1 press; learning from it" in terminal.err
+    assert "more presses, all over the gel, make it better" in terminal.err
+    others = pictures_of(folder, "000.png", ["005.png", "012.png"], tmp_path / "others")
+    results = list(tactflow.stream("digit", source=str(others), settings={"calibration": "mine.yaml"}))
+    depths = [result.depth.greatest for result in results if result.depth]
+    assert len(depths) == 2
+    assert all(0.3 < depth < 4.4 for depth in depths)
