@@ -40,7 +40,10 @@ PITCH_ERROR: Final = 0.03
 """Relative standard error of the pitch of a kind's dots: on one gel it differs by 3.5 % between x and y."""
 LARGEST_BORDER_STEP: Final = 0.1
 """Step of the logarithm of a channel near a border of the picture, over 1 / 50 of its side, above which it
-shows the housing around the gel. Five Minis, also with dots, have at most 0.07, one with its housing 0.15."""
+shows the housing around the gel. Minis of five labs have 0.04 to 0.06, one with its housing 0.15; where dots
+were removed, up to 0.15, so that there the dots tell."""
+WIDEST_WITH_DOTS: Final = 1.1
+"""Zoom by the pitch of the dots up to which a picture shows no housing: that begins beyond 1.2."""
 BORDER: Final = 1 / 8
 """Part of the picture along each side in which the housing may show."""
 ZOOMS: Final = np.exp(np.arange(-1.2, 0.55, 0.05))
@@ -120,18 +123,25 @@ def place(
     if misfit is not None:
         return Placement(None, misfit)
     match = match_light(calibration.look, untouched)
-    if not match.fits or border_step(untouched) > LARGEST_BORDER_STEP:
+    usual = calibration.scale_at(mapping.size)
+    by_dots = None if dots is None else _scale_by_dots(calibration, dots, mapping.size)
+    # Where dots were removed, a border is not smooth; but dots that are far apart show that it is the gel.
+    is_inner = by_dots is not None and by_dots.x <= WIDEST_WITH_DOTS * usual.x
+    if not match.fits or (not is_inner and border_step(untouched) > LARGEST_BORDER_STEP):
         return Placement(None, _difference(calibration, untouched, mapping, match))
-    size = mapping.size
-    usual = calibration.scale_at(size)
-    if dots is not None and calibration.dot_pitch is not None:
-        try:
-            by_dots = scale_from_pitch(dots, calibration.dot_pitch, size)
-        except ValueError:
-            # Too few, or not in a grid: then the light alone tells.
-            return _placement_by_light(usual, match)
+    if by_dots is not None:
         return _placement_by_dots(usual, by_dots, match)
     return _placement_by_light(usual, match)
+
+
+def _scale_by_dots(calibration: Calibration, dots: Floats, size: tuple[int, int]) -> Scale | None:
+    """The scale by the pitch of the kind's dots; None where there are too few, or in no grid."""
+    if calibration.dot_pitch is None:
+        return None
+    try:
+        return scale_from_pitch(dots, calibration.dot_pitch, size)
+    except ValueError:
+        return None
 
 
 def _placement_by_light(usual: Scale, match: Match) -> Placement:

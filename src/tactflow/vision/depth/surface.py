@@ -40,6 +40,14 @@ STEEP_FRACTION: Final = 0.95
 normal."""
 
 
+MIRRORED_RATIO: Final = 1.2
+"""Share of the slopes that no surface explains, over that after left and right are exchanged, above which a
+picture is mirrored. 122 presses of balls and an edge on five Minis, and mugs in a gripper, have at most 0.7,
+their mirror images 2.0 or more; half way between, as a ratio."""
+MIRRORED_MISFIT: Final = 0.2
+"""Largest of the latter shares: the mirror images of these presses have 0.14 at most."""
+
+
 class SurfaceErrors(NamedTuple):
     """Errors of a calibration: the largest horizontal part of a normal that it was fitted to, None where not
     known, and the relative difference of depths between sensors of its kind, if it was made with another
@@ -152,16 +160,19 @@ class Surface:
         """Whether the slopes contradict each other less if left and right are exchanged; see `depth`.
 
         Of slopes from a mirrored picture only those along y have the right sign. No surface has such slopes:
-        it explains about half of them, and nearly all once the others are turned around. Of 122 presses of
-        four balls and an edge on five Minis none is said to be mirrored, and of their mirror images 121.
+        it explains about half of them, and nearly all once the others are turned around.
         """
+        from tactflow.vision.depth.poisson import integrate
+
         slope, _, window = self._slopes(image, rest, mask)
-        misfits = []
+        everywhere, misfits = np.full((2 * window.height, 2 * window.width), 255, np.uint8), []
         for sign in (1, -1):
             turned = slope * np.array([sign, 1], np.float32)[:, None, None]
-            low = self._integrated(turned, window, rest.window)
-            misfits.append(self._unexplained(turned, low, mask[window.whole]))
-        return misfits[1] < misfits[0]
+            # Not cut off at 0, so that pits and saddles count as well as bumps.
+            step = (-2 * self._scale.x, -2 * self._scale.y)
+            heights = integrate(turned, step, window.open_sides(rest.window))
+            misfits.append(self._unexplained(turned, heights, everywhere))
+        return misfits[1] < MIRRORED_MISFIT and misfits[0] > MIRRORED_RATIO * misfits[1]
 
     def _slopes(
         self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None
