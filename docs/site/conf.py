@@ -29,6 +29,8 @@ autodoc_default_options = {"members": True, "inherited-members": "BaseModel,Exce
 autodoc_typehints = "none"
 napoleon_google_docstring = False
 napoleon_use_rtype = False
+# Attributes are a list: as entries of their own they would stand twice, beside the properties.
+napoleon_use_ivar = True
 sphinx_gallery_conf = {
     "examples_dirs": "examples/gallery",
     "gallery_dirs": "gallery",
@@ -58,7 +60,7 @@ html_sidebars = {"accuracy": [], "peers": [], "changes": []}
 
 
 def itemize(_app: Any, _what: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Make a list of the lines `name : meaning` above the sections of a docstring."""
+    """Make a list of the lines `name : meaning` above the sections of a docstring, and entries within them."""
     underlines = [index for index, line in enumerate(lines) if re.fullmatch(r"-{3,}", line)]
     end = underlines[0] - 1 if underlines else len(lines)
     made: list[str] = []
@@ -69,7 +71,11 @@ def itemize(_app: Any, _what: str, _name: str, _object: Any, _options: Any, line
         if starts or (not listed and made and made[-1].startswith(("* ", "  "))):
             made.append("")
         made.append(f"* {line}" if starts else f"  {line.strip()}" if listed else line)
-    lines[:end] = made
+    entries: list[str] = []
+    for line in lines[end:]:
+        entry = re.fullmatch(r"(\*{0,2}\w[\w, *]*) : (.+)", line)
+        entries += [line] if entry is None else [entry[1], f"    {entry[2]}"]
+    lines[:] = [*made, *entries]
 
 
 def setup(app: Any) -> None:

@@ -85,6 +85,8 @@ class Annotator:
     Arrows are yellow for tracked markers, white for inferred ones, dim gray for lost ones. The hull is green,
     the principal axis orange with a dot on the centroid and its angle beside it.
 
+    Raises ValueError for values out of range. Not to be shared between threads: it owns a font with a cache.
+
     Parameters
     ----------
     arrow_scale : length of an arrow over the displacement it shows; 1 ends it where the marker is now.
@@ -93,8 +95,8 @@ class Annotator:
     text : whether numbers are written.
     deepest : mm, for the "depth" view: height of the lightest colour.
 
-    Raises ValueError for values out of range. Not to be shared between threads: it owns a font with a cache.
-
+    Examples
+    --------
     >>> image = np.zeros((300, 400, 3), np.uint8)
     >>> hull = np.array([[100.0, 100], [200, 100], [200, 180]])
     >>> contact = Contact(4000.0, (166.0, 127.0), -38.7, 0.8, hull, None)

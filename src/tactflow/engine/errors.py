@@ -26,6 +26,8 @@ class ConfigError(TactflowError):
     ----------
     mistakes : messages, all reported at once.
 
+    Examples
+    --------
     >>> ConfigError("pipeline.yaml:3:1  colour: unknown key").mistakes
     ('pipeline.yaml:3:1  colour: unknown key',)
     """

@@ -33,6 +33,8 @@ class Frame:
     damaged : True if the image is not what the camera took, or shows no gel. No stage processes it: the
         results of the previous frame are repeated. Never a reference.
 
+    Examples
+    --------
     >>> Frame("main", 36, 1.2, np.zeros((600, 800, 3), np.uint8)).seq
     36
     """
@@ -60,6 +62,8 @@ class Absent:
     ----------
     reason : a short snake_case word.
 
+    Examples
+    --------
     >>> Absent("no_contact")
     Absent(reason='no_contact')
     """

@@ -65,6 +65,8 @@ class MarkerOrder:
     ----------
     origin : (N, 2) float64, px, positions in the first recording; None until a frame has markers.
 
+    Examples
+    --------
     >>> order = MarkerOrder()
     >>> first = np.array([[10.0, 10.0], [20.0, 10.0], [30.0, 10.0]])
     >>> tracked = np.zeros(3, np.uint8)

@@ -46,6 +46,8 @@ class Result(Tick):
     pose : motion of the object since it was touched; with the stage of that name and a calibration.
     features : output of a stage `network`.
 
+    Examples
+    --------
     >>> import tactflow
     >>> result = next(tactflow.stream(source="sim:press", max_frames=1))
     >>> result.seq, result.contact, len(result.markers.position)

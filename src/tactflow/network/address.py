@@ -15,6 +15,8 @@ class Address(NamedTuple):
     host : name, number or `*` (all interfaces); None for ipc.
     port : None where the system picks one (`*`, 0) and for ipc.
 
+    Examples
+    --------
     >>> Address.parse("tcp://127.0.0.1:*")
     Address(text='tcp://127.0.0.1:*', host='127.0.0.1', port=None)
     """

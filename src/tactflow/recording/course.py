@@ -176,6 +176,8 @@ class Course:
     empty, damaged : indices of the first frames without a gel or damaged, and their numbers.
     clipped : mean share of the gel that is clipped, 0 to 1.
 
+    Examples
+    --------
     >>> course = Course()
     >>> for seq in (0, 1, 2, 5, 6):
     ...     course.add(Glance(seq / 10, seq, 1.0, False, 0.0))

@@ -84,15 +84,17 @@ class Watched(FrameReader):
 
     The constructor opens it and must succeed, so that a wrong address is an error immediately.
 
+    Raises SourceError if the source cannot be opened, and from `read` if there was no good frame for
+    `no_frame_timeout`, or the source failed and `reconnect` is False. Any reader can replace a camera:
+
     Parameters
     ----------
     opener : opens the source; also called for each reconnection, in another thread.
     name : for messages.
     clock : for time, and for waiting between attempts.
 
-    Raises SourceError if the source cannot be opened, and from `read` if there was no good frame for
-    `no_frame_timeout`, or the source failed and `reconnect` is False. Any reader can replace a camera:
-
+    Examples
+    --------
     >>> from tactflow.sources import open_source
     >>> source = Watched(lambda: open_source("sim:idle?frames=100"), Watch(), "example")
     >>> image, t = source.read()

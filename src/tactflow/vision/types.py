@@ -69,6 +69,8 @@ class Contact:
     separate : every separate contact of the frame, that with the most pixels first; empty where there is
         only this one.
 
+    Examples
+    --------
     >>> square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
     >>> Contact(4.0, (1.0, 1.0), None, None, square, None).center
     (1.0, 1.0)
@@ -103,6 +105,8 @@ class Markers:
     probability : (N,) float64, of being a marker at all, 0 to 1, by its looks in the reference frame and
         its motion since; NaN where unknown. None where the method does not tell.
 
+    Examples
+    --------
     >>> origin = np.array([[10.0, 20.0]])
     >>> markers = Markers(origin, origin + [1.0, 0.5], np.zeros(1, np.uint8), np.array([0.01]))
     >>> markers.displacement
@@ -141,6 +145,8 @@ class Flow:
     divergence_stderr : 1.
     shear_stderr : of each part, 1. None where unknown.
 
+    Examples
+    --------
     >>> Flow((1.2, -0.3), 9).mean
     (1.2, -0.3)
     """
@@ -176,6 +182,8 @@ class Slip:
     rotation_stderr : degrees.
     speed_stderr : px/s. Standard errors; None where unknown.
 
+    Examples
+    --------
     >>> Slip(False, 0.7).stick_ratio
     0.7
     """
@@ -205,6 +213,8 @@ class Scale:
     stderr : (x, y) of their standard errors, mm per px.
     origin : (x, y), px: where the mm coordinates are 0.
 
+    Examples
+    --------
     >>> scale = Scale(0.1, 0.1, (0.001, 0.001), (159.5, 119.5))
     >>> scale.point((169.5, 119.5)), scale.area(100.0)
     ((1.0, 0.0), 1.0)
@@ -260,6 +270,8 @@ class Depth:
     volume_stderr : the same for it.
     pressed : the part of the volume that lies in the contact, mm^3.
 
+    Examples
+    --------
     >>> Depth(np.zeros((2, 3), np.float32), 0.0, None, 0.0, None).heights.shape
     (2, 3)
     """
@@ -283,6 +295,8 @@ class Force:
     stderr : standard error of each component, N; None where `value` is, NaN where it is not known.
     in_range : whether the contact is like those the calibration was fitted to; `stderr` only holds there.
 
+    Examples
+    --------
     >>> Force((None, None, 2.5), (None, None, 0.2), True).value[2]
     2.5
     """
@@ -309,6 +323,8 @@ class Pose:
         (degrees). What is not seen has large variances: 57 degrees, and as many mm as that turns the
         object's surface by.
 
+    Examples
+    --------
     >>> Pose("tracked", 12, (0, 0, -0.3), (0.1, 0, 0), (0, 0, 5), np.eye(6)).stderr[0]
     1.0
     """
@@ -335,6 +351,8 @@ class Features:
     values : (N,) float32.
     unit : of them.
 
+    Examples
+    --------
     >>> Features(np.zeros(2, np.float32), "1").values.shape
     (2,)
     """

@@ -129,12 +129,14 @@ class DamageTest:
     an eighth of them show it displaced. It is examined only if it differs from the last whole one in one
     point of 100. After 30 displaced pictures, the displacement is taken for the camera's own.
 
+    Raises ValueError for a picture of another type or shape.
+
     Parameters
     ----------
     reference : (H, W, 3) uint8 BGR, a whole picture.
 
-    Raises ValueError for a picture of another type or shape.
-
+    Examples
+    --------
     >>> from tactflow.sim import open_scene
     >>> scene = open_scene("press")
     >>> test = DamageTest(scene.frame(0))

@@ -91,14 +91,16 @@ class RestTest:
     edges near them have, beyond the sensor's own noise, since the last frame in which they were measured; on
     a sensor whose noise hides 0.05 px, they always may have.
 
+    Raises ValueError for a frame of another type or shape, or a parameter out of range.
+
     Parameters
     ----------
     frame : (H, W, 3) uint8 BGR, the untouched gel.
     repeatability, tint : see `ContactDetector`.
     false_alarms : share of still frames in which the dots are measured nevertheless, in (0, 0.5].
 
-    Raises ValueError for a frame of another type or shape, or a parameter out of range.
-
+    Examples
+    --------
     >>> still = np.full((48, 64, 3), 100, np.uint8)
     >>> test = RestTest(still)
     >>> test.look(still)

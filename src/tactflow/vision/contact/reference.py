@@ -30,6 +30,8 @@ class ReferenceCheck:
     ----------
     reference : (H, W, 3) uint8 BGR, without markers.
 
+    Examples
+    --------
     >>> from tactflow.sim import open_scene
     >>> scene = open_scene("unmarked")
     >>> free, touched = scene.frame(0), scene.frame(60)

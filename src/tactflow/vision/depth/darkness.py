@@ -31,13 +31,15 @@ class DarknessModel:
 
     Monotone cubic interpolation (PCHIP) through 0 and the given points; beyond the last one, the depth stays.
 
+    Raises ValueError on other points.
+
     Parameters
     ----------
     darkening : (n,), > 0, increasing.
     depth : (n,), mm, > 0, increasing.
 
-    Raises ValueError on other points.
-
+    Examples
+    --------
     >>> DarknessModel([0.2, 0.4], [0.5, 1.0])(np.array([-0.1, 0.0, 0.2, 0.3, 0.9])).round(3).tolist()
     [0.0, 0.0, 0.5, 0.75, 1.0]
     """

@@ -53,12 +53,14 @@ PLACE_TERMS: Final = 6
 class SlopeModel:
     """Slopes of the gel's surface from relative changes of its colour.
 
+    Raises ValueError on another shape, or on numbers that are not finite.
+
     Parameters
     ----------
     coefficients : (6, 19, 2): for each term of the place and of the colour, x and y of the normal.
 
-    Raises ValueError on another shape, or on numbers that are not finite.
-
+    Examples
+    --------
     >>> model = SlopeModel(np.zeros((PLACE_TERMS, COLOUR_TERMS, 2)))
     >>> everywhere = np.ones((1, 5), np.uint8)
     >>> model.slopes(np.ones((4, 5, 3), np.float32), *coordinates((5, 4)), everywhere).shape

@@ -22,14 +22,16 @@ _undistort: Final[Any] = getattr(cv2, "undistortPointsIter", cv2.undistortPoints
 class Lens:
     """A camera's intrinsic calibration, as `cv2.calibrateCamera` or `cv2.fisheye.calibrate` gives it.
 
+    Raises ValueError for a matrix of another form, or other numbers of coefficients.
+
     Parameters
     ----------
     camera_matrix : (3, 3), px, without skew: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
     distortion : 4, 5, 8, 12 or 14 coefficients of the polynomial model, or 4 of the fisheye model.
     fisheye : which of the two models.
 
-    Raises ValueError for a matrix of another form, or other numbers of coefficients.
-
+    Examples
+    --------
     >>> lens = Lens([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.2, 0, 0, 0])
     >>> lens.distort(np.array([[100.0, 100.0]])).round(2)
     array([[111.97, 107.62]])

@@ -35,6 +35,8 @@ class PixelMapping:
     matrix : (3, 3) float64, homogeneous, from undistorted raw to processed pixels.
     lens : whose distortion was removed before, or None.
 
+    Examples
+    --------
     >>> from tactflow.vision.geometry import Preprocessor
     >>> mapping = Preprocessor((800, 600), downsample=2).mapping
     >>> mapping.to_processed([[0.5, 0.5], [2.5, 0.5]])

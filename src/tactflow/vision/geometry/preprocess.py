@@ -31,6 +31,8 @@ _ROTATIONS: Final = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.
 class Preprocessor:
     """Turns raw frames of one size into processed frames, all steps in one pass where that is exact.
 
+    Raises ValueError for values out of range, a degenerate homography or a crop outside the frame.
+
     Parameters
     ----------
     raw_size : (width, height) of the raw frames, px.
@@ -49,8 +51,8 @@ class Preprocessor:
         axis, so that fine structure is averaged rather than aliased; sampling is bilinear, at positions
         rounded to 1/32 pixel (the same in every frame, so displacements are not affected).
 
-    Raises ValueError for values out of range, a degenerate homography or a crop outside the frame.
-
+    Examples
+    --------
     >>> preprocess = Preprocessor((800, 600), rotate=90, downsample=2)
     >>> preprocess(np.zeros((600, 800, 3), np.uint8)).shape
     (400, 300, 3)

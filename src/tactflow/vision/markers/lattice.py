@@ -65,6 +65,8 @@ class Lattice:
     ----------
     points : (N, 2) float64, px.
 
+    Examples
+    --------
     >>> x, y = np.meshgrid(np.arange(0, 100, 10.0), np.arange(0, 100, 10.0))
     >>> lattice = Lattice(np.column_stack([x.ravel(), y.ravel()]))
     >>> len(lattice.links), round(lattice.closed_share, 2)

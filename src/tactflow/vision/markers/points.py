@@ -113,6 +113,8 @@ class NearestTracker:
     max_displacement : between two frames, px, > 0; beyond half the distance of neighbouring marks, the
         nearest detection may be the neighbour.
 
+    Examples
+    --------
     >>> tracker = NearestTracker(np.array([[10.0, 10.0], [30.0, 10.0]]), 8.0)
     >>> markers = tracker.link(np.array([[12.0, 11.0], [90.0, 90.0]]))
     >>> markers.position.tolist(), markers.status.tolist()
