@@ -60,7 +60,7 @@ html_sidebars = {"accuracy": [], "peers": [], "changes": []}
 
 
 def itemize(_app: Any, _what: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Make a list of the lines `name : meaning` above the sections of a docstring, and entries within them."""
+    """Make a list of the lines `name : meaning` above the sections of a docstring, and entries in them."""
     underlines = [index for index, line in enumerate(lines) if re.fullmatch(r"-{3,}", line)]
     end = underlines[0] - 1 if underlines else len(lines)
     made: list[str] = []
