@@ -17,6 +17,7 @@ import logging
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ RIDGE_PENALTY = 1.0
 """Weight of the squared coefficients of features between 0 and 1."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class Grasp:
     """A recording."""
 
@@ -54,10 +55,19 @@ class Grasp:
         """What is grasped."""
         return self.name.rpartition("_")[0]
 
+    @cached_property
+    def offset(self) -> float:
+        """Of the frames' clock against the gauge's, s; 0 where it cannot be estimated."""
+        try:
+            found = align(self.name, self.watched, self.reference, self.watched.change_at_rest)
+        except ConfigError:
+            return 0.0
+        return found.offset.seconds
+
     def force(self) -> Floats:
-        """(n,): that of each frame, N."""
+        """(n,): that of each frame, N, by the gauge's clock as `calibrate force` estimates it."""
         seconds = self.reference.seconds(self.watched.frames, self.watched.times)
-        return np.interp(self.watched.times, seconds, self.reference.force[:, 2])
+        return np.interp(self.watched.times - self.offset, seconds, self.reference.force[:, 2])
 
     def missed(self) -> Floats:
         """Forces of `MIN_TOUCH_FORCE_N` or more, N, in frames in which no contact is found."""

@@ -8,7 +8,7 @@ from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Unmarked, Untouched
-from tactflow.vision.force import LightChange, seen
+from tactflow.vision.force import LightChange, seen, seen_without_contact
 from tactflow.vision.types import Contact, Depth, Flow, Scale
 from tactflow.vision.types import Force as ForceOnGel
 
@@ -18,7 +18,9 @@ logger = logging.getLogger("tactflow")
 class Force(Stage):
     """Force in N, by the force part of the sensor's calibration; nothing without it.
 
-    A contact larger than those that the calibration was fitted to is a warning, once.
+    A calibration without heights measures the change of the light of the whole gel. Where that is larger than
+    it is ever at rest, it is a force, though no contact is found: a soft object that covers all of the gel
+    has no outline. A contact larger than those that the calibration was fitted to is a warning, once.
 
     >>> import numpy as np
     >>> import tactflow
@@ -40,17 +42,19 @@ class Force(Stage):
 
     def process(
         self,
-        contact: Contact,
+        contact: Contact | None,
         scale: Scale,
         unmarked: Unmarked,
         untouched: Untouched,
         depth: Depth | None = None,
         flow: Flow | None = None,
     ) -> ForceOnGel | Absent:
-        """The force of this frame's contact."""
+        """The force of this frame's contact, or of the gel as a whole."""
         model, known = self._model, self._entry
         if model is None or known is None:
             return Absent("no_calibration")
+        if contact is None and (model.needs_depth or model.least_change is None):
+            return Absent("no_contact")
         change = 0.0
         if model.needs_depth:
             if depth is None:
@@ -58,7 +62,13 @@ class Force(Stage):
         else:
             light_change = self.once(LightChange, untouched)
             change = scale.area(light_change(unmarked)) - model.change_at_rest
-        force = model.force(seen(contact, scale, depth, change, flow))
+        if contact is not None:
+            features = seen(contact, scale, depth, change, flow)
+        elif model.least_change is not None and change > model.least_change:
+            features = seen_without_contact(change)
+        else:
+            return Absent("no_contact")
+        force = model.force(features)
         if not force.in_range and not self._warned:
             self._warned = True
             logger.warning(

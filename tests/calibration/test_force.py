@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tactflow.calibration.force import Watched, fit_force
-from tactflow.calibration.reference import Reference, read_reference
+from tactflow.calibration.reference import Reference, read_reference, time_offset
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.force import Seen
 
@@ -47,6 +47,7 @@ def session(seed: int, presses: int = 6) -> tuple[Watched, Reference]:
         {name: values * error for name, values in true.items()},
         {name: values * error for name, values in moved.items()},
         touched,
+        np.zeros(len(times)),
         0.0,
     )
     return seen, Reference("gauge.csv", gauge, False, force)
@@ -100,7 +101,8 @@ def test_a_clock_that_is_ahead_and_a_gauge_that_is_turned_are_noticed() -> None:
     }
     turned["1"] = replace(turned["1"], time=late.time - 0.317)
     fit = fit_force(watched, turned)
-    assert fit.entry.recordings["1"] == pytest.approx(0.317, abs=0.004)
+    assert fit.entry.recordings["1"] == fit.offsets["1"].seconds == pytest.approx(0.317, abs=0.004)
+    assert 0 < fit.offsets["1"].stderr < 0.004
     assert fit.entry.recordings["0"] == pytest.approx(0, abs=0.004)
     # What is y of the picture was called x: its x axis points down.
     assert fit.turned == pytest.approx(-90, abs=1)
@@ -109,6 +111,40 @@ def test_a_clock_that_is_ahead_and_a_gauge_that_is_turned_are_noticed() -> None:
     assert plain is not None
     assert fit.entry.drag is not None
     assert fit.entry.drag.stiffness == pytest.approx(plain.stiffness, rel=0.02)
+
+
+def test_the_error_of_a_clock_covers_how_far_it_is_off() -> None:
+    off = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        times = np.arange(300) / 60
+        starts = np.cumsum(rng.uniform(0.3, 1.4, 5))
+        press = sum(rng.uniform(0.5, 1) * np.exp(-(((times - at) / 0.15) ** 2)) for at in starts)
+        # Noise that lasts for several frames, as that of a contact's outline.
+        noise = 0.2 * np.convolve(rng.standard_normal(310), np.ones(11) / 11**0.5, "valid")
+        features = np.where(press > 0.01, press * (1 + noise), 0)[:, None]
+        force = np.stack([press, press, 5 * press], axis=1)
+        found = time_offset(Reference("gauge.csv", times, False, force), times, times, features)
+        off.append(found.seconds / found.stderr)
+    assert 0.5 < np.mean(np.abs(off) < 1) < 0.85
+    assert np.mean(np.abs(off) < 2) > 0.85
+
+
+def test_a_change_of_the_whole_gel_beyond_that_at_rest_is_learned_as_a_force() -> None:
+    watched, references = sessions(range(3))
+    rng = np.random.default_rng(5)
+    by_change = {
+        name: replace(
+            one,
+            press={"root_change": one.press["volume"]},
+            change=np.where(one.touched, one.press["volume"], rng.normal(0, 0.1, len(one.times))),
+        )
+        for name, one in watched.items()
+    }
+    entry = fit_force(by_change, references).entry
+    # The largest hundredth of a normal distribution.
+    assert entry.least_change == pytest.approx(0.233, abs=0.08)
+    assert fit_force(watched, references).entry.least_change is None
 
 
 def test_a_gauge_with_one_axis_that_writes_zeros_for_the_others_gives_no_drag() -> None:

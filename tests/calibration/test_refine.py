@@ -138,8 +138,12 @@ def test_a_diameter_in_place_of_the_radius_is_asked_about(base: Calibration, oth
     assert question is not None
     assert "not its diameter" in question
     assert f"about {seen:.2g} mm" in question
-    # Without another calibration, small contacts raise the question.
-    assert doubt(other, SCALE, BALL) is None
+    # Without another calibration, contacts that a ball of half the radius could make raise the question.
+    contact = float(np.median([press.radius for press in other.presses])) * SCALE.x
+    assert doubt(other, SCALE, contact) is None
+    question = str(doubt(other, SCALE, BALL))
+    assert "which fits both" in question
+    assert "press deeper" not in question
     assert "if that is right, press deeper" in str(doubt(other, SCALE, 4 * BALL))
 
 

@@ -29,10 +29,21 @@ BY_CHANGE = LinearForceEntry(stiffness={"root_change": 0.1}, greatest={"root_cha
 DRAG = LinearForceEntry(stiffness={"shear_by_area": 0.5}, greatest={"shear_by_area": 4.0}, **FIT)  # type: ignore[arg-type]
 
 
-def stage(folder: Path, press: LinearForceEntry, drag: LinearForceEntry | None = None) -> Any:
+def stage(
+    folder: Path,
+    press: LinearForceEntry,
+    drag: LinearForceEntry | None = None,
+    least_change: float | None = None,
+) -> Any:
     """The stage with a calibration that knows such a force."""
     force = ForceEntry(
-        press=press, drag=drag, change_at_rest=0.2, recordings={"a": 0.0}, presses=9, left_out="press"
+        press=press,
+        drag=drag,
+        change_at_rest=0.2,
+        least_change=least_change,
+        recordings={"a": 0.0},
+        presses=9,
+        left_out="press",
     )
     made = Calibration(
         sensor="main",
@@ -71,6 +82,21 @@ def test_without_heights_the_change_of_the_light_stands_for_them(tmp_path: Path)
     # Another exposure is no change.
     darker = force.process(CONTACT, SCALE, np.uint8(0.8 * pressed), gel)
     assert darker.value[2] == pytest.approx(found.value[2], abs=0.05)
+
+
+def test_a_change_of_the_whole_gel_is_a_force_without_a_contact(tmp_path: Path) -> None:
+    gel = np.full((96, 128, 3), 90, np.uint8)
+    soft = gel.copy()
+    soft[:, :64] = 100
+    change = SCALE.area(LightChange(gel)(soft)) - 0.2
+    sensitive, dull = (stage(tmp_path, BY_CHANGE, least_change=part * change) for part in (0.9, 1.1))
+    found = sensitive.process(None, SCALE, soft, gel)
+    assert found.value == (None, None, pytest.approx(0.1 * change))
+    assert found.stderr[2] is not None
+    assert dull.process(None, SCALE, soft, gel) == Absent("no_contact")
+    assert sensitive.process(None, SCALE, gel, gel) == Absent("no_contact")
+    for unable in (stage(tmp_path, BY_CHANGE), stage(tmp_path, BY_DEPTH, least_change=0.1)):
+        assert unable.process(None, SCALE, soft, gel) == Absent("no_contact")
 
 
 def test_what_is_no_gel_does_not_count() -> None:

@@ -134,14 +134,15 @@ class LinearForceEntry(_Entry):
 class ForceEntry(_Entry):
     """`force` of the file.
 
-    press : of z. drag : of x and y; None where the reference had no such columns. change_at_rest : see
-    `ForceModel`. recordings : source -> offset of its frames' time against that of its CSV, s. presses : in
-    all of them. left_out : what the errors are cross-validated over.
+    press : of z. drag : of x and y; None where the reference had no such columns. change_at_rest,
+    least_change : see `ForceModel`. recordings : source -> offset of its frames' time against that of its
+    CSV, s. presses : in all of them. left_out : what the errors are cross-validated over.
     """
 
     press: LinearForceEntry
     drag: LinearForceEntry | None = None
     change_at_rest: float
+    least_change: float | None = None
     recordings: dict[str, float]
     presses: int
     left_out: LeftOut
@@ -149,7 +150,7 @@ class ForceEntry(_Entry):
     def model(self) -> ForceModel:
         """The model that the stage `force` evaluates."""
         drag = None if self.drag is None else self.drag.model()
-        return ForceModel(self.press.model(), drag, self.change_at_rest)
+        return ForceModel(self.press.model(), drag, self.change_at_rest, self.least_change)
 
 
 class Calibration(_Entry):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from tactflow.calibration.file import ForceEntry, LeftOut, LinearForceEntry
-from tactflow.calibration.reference import Reference, time_offset
+from tactflow.calibration.reference import Reference, TimeOffset, time_offset
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
 from tactflow.vision.arrays import Floats
@@ -32,6 +32,12 @@ FEWEST_GROUPS: Final = 3
 """With at least this many objects, or else recordings, the fit is cross-validated over them. By hand."""
 GAP: Final = 3
 """Frames without a contact that do not end a press: a light one flickers. Chosen by hand."""
+UNLOADED: Final = 0.01
+"""Force over the greatest of a recording, up to which nothing presses: the noise of a gauge."""
+FALSE_FORCES: Final = 0.01
+"""Share of the frames at rest whose change of light exceeds the limit for a force without a contact."""
+FEWEST_AT_REST: Final = 20
+"""Frames at rest from which this limit can be learned: fewer do not show how the light varies."""
 RATIOS: Final = np.concatenate([[0.0], np.logspace(-3, 1, 41)])
 """Candidates for the ratio of the relative to the absolute part of the standard error, per N."""
 
@@ -43,7 +49,8 @@ class Watched:
     frames, times : (n,) float64, number and time (s). press : feature -> (n,) float64, of `BY_DEPTH` where
     heights are known, else of `BY_CHANGE`, which includes the change at rest; 0 where nothing touches.
     drag : feature -> (n,) complex128, x + i y; NaN where the flow is not known. touched : (n,) bool.
-    change_at_rest : see `ForceModel`.
+    change : (n,) float64, of the light of the whole gel, touched or not, mm^2. change_at_rest : see
+    `ForceModel`.
     """
 
     frames: Floats
@@ -51,6 +58,7 @@ class Watched:
     press: dict[str, Floats]
     drag: dict[str, NDArray[np.complex128]]
     touched: NDArray[np.bool_]
+    change: Floats
     change_at_rest: float
 
 
@@ -85,7 +93,8 @@ class Watcher:
         frames, times = np.array(self._frames, float).T
         contacts = [contact or Seen({}, {}) for contact in self._contacts]
         touched = np.array([contact is not None for contact in self._contacts])
-        at_rest = np.array(self._changes)[~touched]
+        changes = np.array(self._changes)
+        at_rest = changes[~touched]
         by_depth = any("volume" in contact.press for contact in contacts)
         unknown = (math.nan, math.nan)
         return Watched(
@@ -100,6 +109,7 @@ class Watcher:
                 for name in BY_SHEAR
             },
             touched=touched,
+            change=changes,
             change_at_rest=float(np.median(at_rest)) if len(at_rest) else 0.0,
         )
 
@@ -108,16 +118,19 @@ class Watcher:
 class Aligned:
     """The n frames of a recording that have both a contact and a force.
 
-    name : of the recording. offset : of its time against the reference's, s. press : (n, k) float64.
+    name : of the recording. offset : of its time against the reference's. press : (n, k) float64.
     drag : (n, 2) complex128. force : (n, 3) float64, N. presses : (n,) int, which press a frame belongs to.
+    change_unloaded : (m,), of the whole gel in frames without a contact and without a force, less that at
+        rest, mm^2.
     """
 
     name: str
-    offset: float
+    offset: TimeOffset
     press: Floats
     drag: NDArray[np.complex128]
     force: Floats
     presses: NDArray[np.intp]
+    change_unloaded: Floats
 
 
 def align(name: str, watched: Watched, reference: Reference, change_at_rest: float) -> Aligned:
@@ -136,21 +149,26 @@ def align(name: str, watched: Watched, reference: Reference, change_at_rest: flo
     press = np.stack(list(known.values()), axis=1)
     seconds = reference.seconds(watched.frames, watched.times)
     offset = time_offset(reference, seconds, watched.times, press)
-    now = watched.times - offset
-    chosen = watched.touched & (now >= seconds[0]) & (now <= seconds[-1])
+    now = watched.times - offset.seconds
+    known_force = (now >= seconds[0]) & (now <= seconds[-1])
+    chosen = watched.touched & known_force
     force = np.stack([np.interp(now, seconds, part) for part in reference.force.T], axis=1)
     began = np.flatnonzero(chosen)
     numbers = np.cumsum((np.diff(began, prepend=began[0]) > GAP).astype(np.intp))
     drag = np.stack(list(watched.drag.values()), axis=1)
-    return Aligned(name, offset, press[chosen], drag[chosen], force[chosen], numbers)
+    unloaded = np.abs(force[:, 2]) <= UNLOADED * float(np.abs(force[:, 2]).max())
+    at_rest = watched.change[~watched.touched & known_force & unloaded] - change_at_rest
+    return Aligned(name, offset, press[chosen], drag[chosen], force[chosen], numbers, at_rest)
 
 
 class Fit(NamedTuple):
-    """entry : for the calibration file; without `drag` where the flow does not explain fx and fy. turned :
-    direction of the gauge's x axis in the picture, degrees, counter-clockwise; None without fx and fy.
-    mirrored : whether its y axis is mirrored relative to the picture's."""
+    """entry : for the calibration file; without `drag` where the flow does not explain fx and fy. offsets :
+    recording -> that of its clock. turned : direction of the gauge's x axis in the picture, degrees,
+    counter-clockwise; None without fx and fy. mirrored : whether its y axis is mirrored relative to the
+    picture's."""
 
     entry: ForceEntry
+    offsets: dict[str, TimeOffset]
     turned: float | None = None
     mirrored: bool = False
 
@@ -178,15 +196,19 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
     left_out, groups = _left_out(aligned, presses)
     force = np.concatenate([part.force for part in aligned])
     features = np.concatenate([part.press for part in aligned])
+    offsets = {part.name: part.offset for part in aligned}
+    (features_of_press,) = names
+    by_depth = features_of_press != BY_CHANGE
     entry = ForceEntry(
-        press=_learn(next(iter(names)), features, force[:, 2], groups),
+        press=_learn(features_of_press, features, force[:, 2], groups),
         change_at_rest=at_rest,
-        recordings={part.name: part.offset for part in aligned},
+        least_change=None if by_depth else _least_change(aligned),
+        recordings={part.name: part.offset.seconds for part in aligned},
         presses=int(first[-1]),
         left_out=left_out,
     )
     if not all(references[name].sideways for name in watched):
-        return Fit(entry)
+        return Fit(entry, offsets)
     drag = np.concatenate([part.drag for part in aligned])
     known = np.isfinite(drag).all(axis=1)
     if len(np.unique(groups[known])) < 2:
@@ -202,7 +224,16 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
     learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups, 2))
     entry = entry.model_copy(update={"drag": learned if learned.r2 > 0 else None})
     # y points down, so that a positive angle of a complex number is clockwise as seen.
-    return Fit(entry, -float(np.degrees(np.angle(turn))), mirrored)
+    return Fit(entry, offsets, -float(np.degrees(np.angle(turn))), mirrored)
+
+
+def _least_change(aligned: Sequence[Aligned]) -> float | None:
+    """Change of the whole gel beyond that at rest that is a force, though no contact is found, mm^2; None
+    where the recordings show too few frames at rest to tell."""
+    at_rest = np.concatenate([part.change_unloaded for part in aligned])
+    if len(at_rest) < FEWEST_AT_REST:
+        return None
+    return max(float(np.quantile(at_rest, 1 - FALSE_FORCES)), 0.0)
 
 
 def _left_out(aligned: Sequence[Aligned], presses: NDArray[np.intp]) -> tuple[LeftOut, NDArray[np.intp]]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
@@ -160,11 +160,20 @@ def recordings_with_csv(source: str) -> dict[str, Path]:
     return pairs
 
 
-def time_offset(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
-    """By how much the time of the frames is ahead of the reference's, s.
+class TimeOffset(NamedTuple):
+    """By how much the time of the frames is ahead of the reference's, and its standard error, s; the error is
+    infinite where the best shift is the largest that was tried."""
+
+    seconds: float
+    stderr: float
+
+
+def time_offset(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> TimeOffset:
+    """By how much the time of the frames is ahead of the reference's.
 
     It is the shift, to a fraction of a frame, with which the contact explains the force best, and includes
-    any delay of the gel's response.
+    any delay of the gel's response. Its standard error is that of least squares, for residuals that are
+    correlated and larger under larger forces (Newey and West, Econometrica 55, 1987).
 
     seconds : (M,) times of the reference. times : (N,) of the frames. features : (N, k), what the force is
     linear in, 0 where nothing touches.
@@ -189,12 +198,33 @@ def time_offset(reference: Reference, seconds: Floats, times: Floats, features: 
             "turned (fz > 0 presses)"
         )
     if not 0 < best < len(shifts) - 1:
-        return float(shifts[best])
+        return TimeOffset(float(shifts[best]), math.inf)
     before, at, after = explained[best - 1 : best + 2]
     bend = before - 2 * at + after
+    if not (np.isfinite(bend) and bend < 0):
+        return TimeOffset(float(shifts[best]), math.inf)
     # The vertex of the parabola through the three.
-    part = 0.5 * (before - after) / bend if np.isfinite(bend) and bend < 0 else 0.0
-    return float(shifts[best] + part * step)
+    part = 0.5 * (before - after) / bend
+    offset = float(shifts[best] + part * step)
+    return TimeOffset(offset, _offset_stderr(reference, seconds, times - offset, features))
+
+
+def _offset_stderr(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
+    """Standard error of the best shift, s. times : of the frames, by the reference's clock."""
+    force, residual = _residual(reference, seconds, times, features)
+    if len(force) < FEWEST_SAMPLES:
+        return math.inf
+    step = float(np.median(np.diff(times)))
+    # By how much the residual grows for a shift of a second, and the second derivative of the sum of squares:
+    # the rate of the force alone would count its noise as information.
+    rate = np.gradient(force, step)
+    score, information = rate * residual, float(rate @ np.gradient(force - residual, step))
+    variance = float(score @ score)
+    lags = math.isqrt(len(score))
+    correlated = sum(
+        2 * (1 - lag / (lags + 1)) * float(score[lag:] @ score[:-lag]) for lag in range(1, lags + 1)
+    )
+    return math.sqrt(variance + max(correlated, 0.0)) / information if information > 0 else math.inf
 
 
 def _explained(reference: Reference, seconds: Floats, times: Floats, features: Floats) -> float:
@@ -203,9 +233,15 @@ def _explained(reference: Reference, seconds: Floats, times: Floats, features: F
     touched = features.any(axis=1)
     if np.count_nonzero(there & touched) < max(OVERLAP * np.count_nonzero(touched), 1):
         return math.nan
-    force = np.interp(times[there], seconds, reference.force[:, 2])
+    force, residual = _residual(reference, seconds, times, features)
     spread = float(((force - force.mean()) ** 2).sum())
-    if spread == 0:
-        return math.nan
-    residual = force - features[there] @ nnls(features[there], force)[0]
-    return 1 - float(residual @ residual) / spread
+    return math.nan if spread == 0 else 1 - float(residual @ residual) / spread
+
+
+def _residual(
+    reference: Reference, seconds: Floats, times: Floats, features: Floats
+) -> tuple[Floats, Floats]:
+    """(n,) each: the force, N, in the frames that have one, and what the features leave of it."""
+    there = (times >= seconds[0]) & (times <= seconds[-1])
+    force = np.interp(times[there], seconds, reference.force[:, 2])
+    return force, np.asarray(force - features[there] @ nnls(features[there], force)[0])

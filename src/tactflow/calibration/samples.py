@@ -32,6 +32,9 @@ the slope. Colours are not blurred there, since noise regularises what is undete
 under `dark_channel` have errors of 5.6 % instead of 3.8."""
 TURNS: Final = 3
 """Iterations of fit and centres; later ones move centres by less than 0.05 px on wedge_ball."""
+RINGS: Final = (0.25, 0.5, 0.75, 1.0)
+"""Inner and outer limit of two rings around the middle of a press, in parts of `reach`: how the slope grows
+from one to the other tells the shape."""
 FEWEST_PIXELS: Final = 12
 """Least number of pixels at half resolution inside a contact to judge its depth. Chosen by hand."""
 RIM: Final = 6
@@ -118,6 +121,27 @@ class Sample:
         terms -= terms.mean(axis=0)
         left = true - terms @ np.linalg.lstsq(terms, true, rcond=None)[0]
         return 1 - float((left**2).sum() / (true**2).sum())
+
+    def growth(self, center: Floats, weights: Floats) -> float:
+        """Exponent with which the fitted slope grows with the distance from the middle: 1 for a ball.
+
+        It is 0 for a cone, and large for a punch. NaN where a contact is too small to show it.
+        """
+        ball = self.on_ball(center)
+        away = np.stack([self.x[ball], self.y[ball]], axis=1) - center
+        distance = np.hypot(away[:, 0], away[:, 1])
+        outward = np.sum(self.normals(weights, ball) * away, axis=1)
+        rings = [
+            (distance >= inner * self.reach) & (distance < outer * self.reach)
+            for inner, outer in zip(RINGS[::2], RINGS[1::2], strict=True)
+        ]
+        if min(np.count_nonzero(ring) for ring in rings) < FEWEST_PIXELS:
+            return math.nan
+        slopes = [float((outward[ring] / distance[ring]).mean()) for ring in rings]
+        places = [float(distance[ring].mean()) for ring in rings]
+        if min(slopes) <= 0:
+            return math.nan
+        return math.log(slopes[1] / slopes[0]) / math.log(places[1] / places[0])
 
     def misfit(self, center: Floats, weights: Floats) -> Misfit:
         """Compare the fitted normals with those of the ball."""

@@ -15,7 +15,7 @@ from tactflow.calibration import force
 from tactflow.calibration.darkness import fit_darkness
 from tactflow.calibration.file import UNLIKE, Calibration, ScaleEntry, raw_corners, small_picture
 from tactflow.calibration.guide import Guide
-from tactflow.calibration.judgement import FEWEST_PRESSES, doubt
+from tactflow.calibration.judgement import FEWEST_PRESSES, STRETCHED, doubt
 from tactflow.calibration.likeness import place
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import NEEDED, PressFinder, Session
@@ -139,6 +139,12 @@ def learn(
         say(
             f"that is an error of {100 * error:.1f} %: --pitch is for dots in a square grid; these are "
             "not, or the picture is stretched. Use --area WIDTH HEIGHT, the size of the whole picture"
+        )
+    ratio = max(scale.x / scale.y, scale.y / scale.x)
+    if wish.area is not None and ratio > STRETCHED:
+        say(
+            f"pixels are {ratio:.2f} times as long in one direction as in the other: is --area the WIDTH and "
+            "then the HEIGHT of the picture as it is processed?"
         )
     depth: dict[str, Any] = {}
     if wish.ball_radius is not None:

@@ -32,7 +32,11 @@ def photometric_words(errors: Mapping[str, float]) -> str:
 def force_words(fit: Fit, readings: Mapping[str, Reference]) -> list[str]:
     """What was learned about the force, and what not. readings : of the gauge, by recording."""
     entry = fit.entry
-    words = [f"{name}: its clock is {s:+.3f} s ahead of its CSV's" for name, s in entry.recordings.items()]
+    words = [
+        f"{name}: its clock is {offset.seconds:+.3f} +- {offset.stderr:.3f} s ahead of its CSV's, which is "
+        "taken into account"
+        for name, offset in fit.offsets.items()
+    ]
     words.append(f"force, {entry.presses} presses: {_quality(entry.press, entry.left_out)}")
     if "volume" not in entry.press.stiffness:
         words.append(

@@ -103,6 +103,11 @@ class LightChange:
         return float(root.mean()) * float(image.shape[0] * image.shape[1])
 
 
+def seen_without_contact(change: float) -> Seen:
+    """Features of a gel in which no contact is found. change : as in `seen`, mm^2."""
+    return Seen({"root_change": max(change, 0.0)}, {})
+
+
 def seen(contact: Contact, scale: Scale, depth: Depth | None, change: float, flow: Flow | None) -> Seen:
     """Features of a contact.
 
@@ -156,7 +161,9 @@ class ForceModel:
     """The force on the gel from what is seen of a contact.
 
     press : of z. drag : of x and of y, the same for both; None where the calibration had no such reference.
-    change_at_rest : the change of a gel that nothing touches, from noise alone, mm^2.
+    change_at_rest : the change of a gel that nothing touches, from noise alone, mm^2. least_change : beyond
+        it, from which the change is a force though no contact is found, as under a soft object that covers
+        all of the gel, mm^2; None: it never is.
 
     >>> model = ForceModel(LinearForce({"volume": 2.0}, {"volume": 1.0}, (0.1, 0.0)), None, 0.0)
     >>> model.force(Seen({"volume": 0.5, "area": 3.0}, {}))
@@ -166,6 +173,7 @@ class ForceModel:
     press: LinearForce
     drag: LinearForce | None
     change_at_rest: float
+    least_change: float | None = None
 
     @property
     def needs_depth(self) -> bool:
