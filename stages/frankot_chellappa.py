@@ -50,7 +50,7 @@ class FrankotChellappa(Stage):
             return Absent("no_contact")
         rest = self.once(Rest, untouched)
         everywhere = np.ones((rest.window.height, rest.window.width), np.uint8)
-        change = colour_change(unmarked, rest, rest.window, np.zeros(3, np.float32))
+        change = colour_change(unmarked, rest, rest.window, np.ones(3, np.float32))
         height, width = contact_mask.shape
         model = self.once(known.at, scale, (width, height)).slopes if known.kind else known.slopes
         assert model is not None
