@@ -93,7 +93,7 @@ def swaps(file: Path, sensor: str | None = None) -> list[Trial]:
 
     >>> from tactflow.config.shipped import find_pipeline
     >>> [trial.name for trial in swaps(find_pipeline("markerless"))][-3:]
-    ['hull: classic_hull', 'hull: fit_line', 'hull: min_area_rect']
+    ['hull: fit_line', 'hull: min_area_rect', 'depth: frankot_chellappa']
     """
     original = load_pipeline(file, sensor=sensor)
     found = []
