@@ -188,7 +188,7 @@ def test_edges_of_a_cube_are_refused_as_presses_of_a_ball(
     words = ["calibrate", "mini_plain", "--from", str(source), "--ball-radius", "3"]
     for how in (["--refine"], ["--area", "20.3", "15.2"]):
         assert terminal(*words, *how) == 2
-        assert "the object is not a ball" in terminal.err
+        assert "those of a ball are round" in terminal.err
     assert not list(tmp_path.rglob("*.yaml"))
 
 
