@@ -118,8 +118,8 @@ def _check_outlines(presses: Sequence[Press], scale: Scale) -> None:
     if common and stretch > (STRETCHED if many else ELONGATED_ONCE):
         raise ConfigError(
             f"calibrate: the contacts are {stretch:.2f} times as long in one direction of the picture as in "
-            f"the other, in mm, and those of a ball are round; pixels are {scale.x:.4g} x {scale.y:.4g} mm: "
-            "give --area WIDTH HEIGHT in this order, and press nothing but the ball"
+            "the other, in mm, and those of a ball are round: the object is not a ball, or pixels are not "
+            f"{scale.x:.4g} x {scale.y:.4g} mm; give --area WIDTH HEIGHT in this order"
         )
     if elongation > (ELONGATED if many else ELONGATED_ONCE):
         raise ConfigError(
