@@ -34,10 +34,10 @@ def check_color_image(image: NDArray[Any]) -> None:
         )
 
 
-def check_mask(mask: NDArray[Any], shape: tuple[int, ...] | None = None) -> None:
-    """Raise ValueError if an array is not an (H, W) uint8 mask, or not of a shape."""
+def check_mask(mask: NDArray[Any], shape: tuple[int, ...] | None = None, name: str = "mask") -> None:
+    """Raise ValueError if an array is not an (H, W) uint8 mask, or not of a shape. name : of the argument."""
     wanted = "(H, W)" if shape is None else shape
     if mask.ndim != 2 or mask.dtype != np.uint8 or (shape is not None and mask.shape != shape):
         raise ValueError(
-            f"required a uint8 mask of shape {wanted}, got shape {mask.shape}, dtype {mask.dtype}"
+            f"{name}: required a uint8 mask of shape {wanted}, got shape {mask.shape}, dtype {mask.dtype}"
         )

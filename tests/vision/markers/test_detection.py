@@ -314,7 +314,11 @@ def test_gray_pictures_are_accepted() -> None:
         (np.zeros((80, 80, 3), np.uint8), {"dot_radius": 0.5}, "dot_radius 1 to 20 px, got 0.5"),
         (np.zeros((80, 80, 3), np.uint8), {"dot_radius": 40.0}, "dot_radius 1 to 20 px, got 40"),
         (np.zeros((80, 80, 3), np.uint8), {"polarity": "red"}, "polarity"),
-        (np.zeros((80, 80, 3), np.uint8), {"valid": np.ones((80, 79), np.uint8)}, r"valid to be \(80, 80\)"),
+        (
+            np.zeros((80, 80, 3), np.uint8),
+            {"valid": np.ones((80, 79), np.uint8)},
+            r"valid: required a uint8 mask of shape \(80, 80\)",
+        ),
     ],
 )
 def test_wrong_input_is_refused_in_words(

@@ -189,7 +189,7 @@ class ContactDetector:
         """
         self._check(image)
         if valid is not None:
-            check_mask(valid, image.shape[:2])
+            check_mask(valid, image.shape[:2], "valid")
         if self._background is not None:
             self._background.add(image)
             return

@@ -334,7 +334,7 @@ def _require_options(
     if polarity not in ("auto", "dark", "bright"):
         raise ValueError(f"required polarity to be 'auto', 'dark' or 'bright', got {polarity!r}")
     if valid is not None:
-        check_mask(valid, shape)
+        check_mask(valid, shape, "valid")
 
 
 def _reading_order(centers: Floats, radius: float) -> NDArray[np.int64]:
