@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from pydantic import Field
+
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Frame
 from tactflow.ports import ContactMask, MarkerMask, Slipping, Touching, Unmarked, Untouched
+from tactflow.vision.arrays import ColorImage
 from tactflow.vision.flow import DisplacementField, SlipTracker
 from tactflow.vision.flow.registration import cells, light_change
 from tactflow.vision.types import Slip
 
 
 class SlipPorts(NamedTuple):
-    """slipping : whether the contact slides over the gel. slip : that, how far, and the part that sticks."""
+    """slipping : whether slip is reported. slip : that, how far the object has slid, and the part that
+    sticks."""
 
     slipping: Slipping
     slip: Slip | None
@@ -22,7 +26,9 @@ class SlipPorts(NamedTuple):
 class SlipStage(Stage):
     """Motion of the object relative to the gel: its picture on the gel against the markers.
 
-    `when: slipping` gates other stages. This stage needs no gate: it returns at once without a contact.
+    A slip is reported once two of three frames clearly show it, so that a gripper may act on `slipping`,
+    which also gates other stages (`when: slipping`). This stage needs no gate: it returns at once without a
+    contact.
 
     >>> import numpy as np
     >>> import tactflow
@@ -33,8 +39,16 @@ class SlipStage(Stage):
 
     memory = "stateful"
 
-    def __init__(self, params: StageParams) -> None:
+    class Params(StageParams):
+        """How steady the light is."""
+
+        repeatability: float = Field(
+            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
+        )
+
+    def __init__(self, params: Params) -> None:
         super().__init__(params)
+        self._repeatability = params.repeatability
         self._tracker = SlipTracker()
 
     def reset(self) -> None:
@@ -56,5 +70,11 @@ class SlipStage(Stage):
             self._tracker.reset()
             return SlipPorts(False, None)
         change = light_change(unmarked, self.once(cells, untouched), marker_mask)
-        slip = self._tracker(frame.seq, frame.t, change, field, contact_mask)
+        unsteadiness = self._repeatability * self.once(_brightness, untouched)
+        slip = self._tracker(frame.seq, frame.t, change, field, contact_mask, unsteadiness)
         return SlipPorts(slip is not None and slip.slipping, slip)
+
+
+def _brightness(untouched: ColorImage) -> float:
+    """Mean light of the untouched gel, grey levels."""
+    return float(untouched.mean())

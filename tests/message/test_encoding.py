@@ -124,6 +124,7 @@ OPTIONAL = {
     "float | None": 0.5,
     "int | None": 3,
     "tuple[float, float] | None": (0.5, 0.25),
+    "SlipKind | None": "creeping",
     "NDArray[np.float64] | None": np.array([0.999, 0.7, math.nan]),
 }
 """A value for each type of optional attributes."""

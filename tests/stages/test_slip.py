@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import Frame
 from tactflow.engine.ports import read_ports
 from tactflow.stages.slip import SlipPorts, SlipStage
@@ -29,15 +28,17 @@ def step(stage: SlipStage, left: int, seq: int = 0) -> SlipPorts:
 def test_it_gives_a_signal_for_gates_and_how_far_the_object_has_slid() -> None:
     ports = read_ports(SlipStage, "process")
     assert [(port.name, port.optional) for port in ports.outputs] == [("slipping", False), ("slip", True)]
-    stage = SlipStage(StageParams())
-    first, second = step(stage, 60), step(stage, 70, 1)
+    stage = SlipStage(SlipStage.Params())
+    first, second, third = step(stage, 60), step(stage, 70, 1), step(stage, 80, 2)
     assert (first.slipping, first.slip.stick_ratio, first.slip.speed) == (False, 1.0, None)
-    assert (second.slipping, second.slip.stick_ratio, second.slip.since) == (True, 0.0, 0)
-    assert second.slip.translation == pytest.approx((10, 0), abs=0.5)
+    assert (second.slipping, second.slip.kind, second.slip.onset) == (False, None, None)
+    assert (third.slipping, third.slip.stick_ratio, third.slip.since) == (True, 0.0, 0)
+    assert (third.slip.kind, third.slip.onset) == ("sliding", 1 / 60)
+    assert third.slip.translation == pytest.approx((20, 0), abs=0.5)
 
 
 def test_without_a_contact_or_a_field_nothing_slips_and_the_last_contact_is_forgotten() -> None:
-    stage, frame = SlipStage(StageParams()), Frame("main", 0, 0.0, REST)
+    stage, frame = SlipStage(SlipStage.Params()), Frame("main", 0, 0.0, REST)
     step(stage, 60)
     assert stage.process(frame, False, NOTHING, REST, REST) == SlipPorts(False, None)
     assert not step(stage, 70).slipping

@@ -391,9 +391,13 @@ class Slip(Part):
     """Motion of the object relative to the gel."""
 
     of = types.Slip
-    slipping: bool = sent("whether it slides over the gel")
+    slipping: bool = sent("whether it slips: two of three frames have clearly shown it")
     stick_ratio: Share = sent("share of the contact on which the gel moves with it; 0 while it slides")
-    probability: Share | None = sent("that it slides", null="when unknown")
+    probability: Share | None = sent("that it slips, from all frames up to now", null="when unknown")
+    kind: types.SlipKind | None = sent(
+        "of the slip: slow; fast; too fast to be followed", null="while it does not slip"
+    )
+    onset: Finite | None = sent("when it began", "s", null="while it does not slip")
     translation: Point | None = sent("(x, y), how far the middle of the contact has moved over the gel", "px")
     rotation: Finite | None = sent("how far it has turned on the gel, counter-clockwise as seen", "degrees")
     speed: NotNegative | None = sent("RMS over the contact", "px/s", null="in the first frame")

@@ -163,16 +163,21 @@ class Flow:
     shear_stderr: float | None = None
 
 
+SlipKind = Literal["creeping", "sliding", "lost"]
+"""How an object slips: slowly; fast; so fast that its picture cannot be followed."""
+
+
 @dataclass(frozen=True, slots=True)
 class Slip:
     """Motion of the object relative to the gel.
 
     Attributes
     ----------
-    slipping : whether it slides over the gel: whether `probability` is above a half.
+    slipping : whether slip is reported: two of three frames have clearly shown it. A gripper may act on it.
     stick_ratio : share of the contact on which the gel still moves with it, 0 to 1; 0 while it slides.
-    probability : that it has moved farther over the gel in the last 0.1 s than a contact that sticks, and
-        in the direction in which it drags the gel, 0 to 1.
+    probability : that it slips, from all frames up to now, 0 to 1: that it moves farther over the gel in
+        0.1 s than a contact that sticks, and in the direction in which it drags the gel; or that its picture
+        was lost while it dragged the gel.
     translation : (x, y), px: how far the middle of the contact has moved over the gel since frame `since`.
     rotation : how far it has turned on the gel since then, degrees, counter-clockwise as seen on the
         screen.
@@ -181,6 +186,9 @@ class Slip:
     translation_stderr : (x, y), px.
     rotation_stderr : degrees.
     speed_stderr : px/s. Standard errors; None where unknown.
+    kind : of the slip that is reported: creeping; sliding, which is faster; lost, where the picture changes
+        within a frame so much that no motion explains it. None without a report.
+    onset : time of the first frame of the slip that is reported, s, as the time of a frame.
 
     Examples
     --------
@@ -198,6 +206,8 @@ class Slip:
     translation_stderr: tuple[float, float] | None = None
     rotation_stderr: float | None = None
     speed_stderr: float | None = None
+    kind: SlipKind | None = None
+    onset: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

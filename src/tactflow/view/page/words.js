@@ -45,10 +45,10 @@ export function force({ force }) {
 
 export function slip({ slip }) {
   if (!slip) return NONE;
-  const { slipping, stick_ratio, translation, translation_mm, rotation } = slip;
+  const { slipping, kind, stick_ratio, translation, translation_mm, rotation } = slip;
   const way = translation_mm ? `${fixed(Math.hypot(...translation_mm), 2)} mm` : `${fixed(Math.hypot(...(translation ?? [0])), 1)} px`;
   const moved = translation ? `, slid ${way}, turned ${fixed(rotation, 1)}°` : "";
-  return [slipping ? "slips" : "holds", `${Math.round(100 * stick_ratio)}\u202f% of the contact sticks${moved}`];
+  return [slipping ? (kind === "creeping" ? "creeps" : "slips") : "holds", `${Math.round(100 * stick_ratio)}\u202f% of the contact sticks${moved}`];
 }
 
 // Its length and largest error along the gel and out of it, and its turn.

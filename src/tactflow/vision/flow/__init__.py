@@ -2,7 +2,7 @@
 
 `motion` tests whether markers move as a contact moves them. `displacement_field` interpolates their motion;
 `in_mask` summarises it for the contact, or else the motion of the markers `inside`. `slip` measures how the
-object moves against the gel, by `registration` of its picture.
+object moves against the gel, by `registration` of its picture, and `slip_event` when to report that.
 """
 
 from tactflow.vision.flow.displacement_field import DisplacementField, FieldModel

@@ -21,9 +21,12 @@ from tactflow.vision.flow.displacement_field import (
 from tactflow.vision.flow.in_mask import MAX_UNKNOWN_SHARE
 from tactflow.vision.flow.registration import CELL_PX as PX
 from tactflow.vision.flow.registration import MAX_RESIDUAL, Registration, Template, register, template_of
+from tactflow.vision.flow.slip_event import EventTest
 from tactflow.vision.geometry.similarity import Complexes, as_complex, fit_similarity
-from tactflow.vision.types import Slip
+from tactflow.vision.types import Slip, SlipKind
 
+ONSET_WINDOW_S: Final = 0.05
+"""Time within which an object that slides moves beyond the threshold, s; one that creeps takes longer."""
 SPEED_WINDOW_S: Final = 0.1
 """Time over which the speed is measured, s, at least one frame: the largest acceptable delay."""
 SLIP_THRESHOLD_RADII: Final = 0.04
@@ -55,6 +58,25 @@ MIN_LAG_STDERRS: Final = 6.0
 MIN_LAG_TO_SIDEWAYS_RATIO: Final = 2.0
 """The same, relative to the RMS of how far the gel departs sideways: a press that spreads the gel does both
 alike, slip only the first. Chosen on the simulator."""
+MAX_EARLIER_KEYFRAMES: Final = 10
+"""Number of replaced keyframes that are remembered: half a period of an object shaken at 1 Hz, at 25 fps."""
+MAX_RETURN_RESIDUAL: Final = 0.5
+"""Largest residual of a picture that is again that of an earlier keyframe: half of its contrast."""
+RETURN_RADII: Final = 0.1
+"""Largest distance of an object from its place in an earlier keyframe to which it has returned, relative to
+the RMS radius of the contact: a few times the threshold of slip."""
+MIN_SPRING_RADII: Final = 0.02
+"""Smallest motion of the gel in contact, in the frame in which its picture changes abruptly, relative to the
+RMS radius: half of the threshold of slip. A fast slip relaxes or strains the gel; a keyframe of a compressed
+video, or a lamp that is switched, changes the picture alone."""
+ROCKING_S: Final = 1.5
+"""Time after the return of a picture during which the object is taken for rocking, s: some periods of
+shaking."""
+ROCKED_PROBABILITY: Final = 0.65
+"""Largest probability of slip from one frame of a rocking object, whose picture moves in one frame of three
+without a slip: seven such frames in a row are needed for a report."""
+UNKNOWN_TURN: Final = math.pi / math.sqrt(3)
+"""Standard deviation of a turn of which nothing is known, radians."""
 _normal: Final = NormalDist().cdf
 _STICK_FITS: Final = 2
 """Fits of a rigid motion, each to the gel that sticks by the one before. Chosen by hand."""
@@ -66,7 +88,8 @@ class _Key(NamedTuple):
     grid : of the field. cells : (rows, columns), which of its cells. rest, before : (M,) complex, their
     places at rest, and their displacements in this frame, px. share : (M,), their weights, with the sum 1.
     number : sum of their shares in contact. slid, covariance : (3,), (3, 3), slip from the start to this
-    frame, px and radians. grown : natural logarithm of the growth of the contact until then.
+    frame, px and radians. grown : natural logarithm of the growth of the contact until then. since : seq of
+    the start.
     """
 
     template: Template
@@ -79,6 +102,22 @@ class _Key(NamedTuple):
     slid: Floats
     covariance: Floats
     grown: float
+    since: int
+
+    @property
+    def lever(self) -> Floats:
+        """(3,): how far a shift by 1 px, and a turn by 1 radian, move the object at the RMS radius, px."""
+        return np.array([1.0, 1.0, self.template.radius * PX])
+
+
+class _Tear(NamedTuple):
+    """An abrupt change of the picture, which no motion of the contact explains.
+
+    time : of the first frame after it, s. probability : that the gel was dragged then.
+    """
+
+    time: float
+    probability: float
 
 
 class _Moment(NamedTuple):
@@ -109,6 +148,12 @@ class SlipTracker:
     An object that slides drags the gel along, by friction. One that rolls over the gel, or is pressed or
     lifted, also moves, but not in the direction of the gel's displacement.
 
+    An object may move so far within a frame that its picture cannot be registered. That is evidence of slip
+    if the object is neither just being pressed nor released, and the gel was dragged and moved at that
+    moment. It is withdrawn if the picture of an earlier keyframe returns: the object rocks, or the picture
+    was disturbed.
+    `EventTest` adds up the evidence of frames.
+
     Examples
     --------
     >>> from tactflow.vision.flow import FieldModel
@@ -118,7 +163,7 @@ class SlipTracker:
     >>> origin = np.column_stack([x.ravel(), y.ravel()])
     >>> still = Markers(origin, origin + [3.0, 0.0], np.zeros(100, np.uint8), np.full(100, 0.02))
     >>> field, tracker = FieldModel(origin, (200, 200))(still), SlipTracker()
-    >>> for seq, left in enumerate((60, 60, 68)):
+    >>> for seq, left in enumerate((60, 60, 68, 76)):
     ...     mask = np.zeros((200, 200), np.uint8)
     ...     mask[70:130, left : left + 60] = 255
     ...     picture = np.repeat(mask[..., None] // 5, 3, axis=2)
@@ -127,27 +172,40 @@ class SlipTracker:
     ...     print(slip.slipping, round(abs(slip.translation[0]), 1))
     False 0.0
     False 0.0
-    True 8.0
+    False 8.0
+    True 16.0
     """
 
     def __init__(self) -> None:
+        self._test = EventTest()
         self.reset()
 
     def reset(self) -> None:
         """Nothing touches the gel: the next contact is a new one."""
         self._key: _Key | None = None
-        self._since, self._began = 0, 0.0
+        self._began = 0.0
         self._last = np.zeros(5)
         self._grip: tuple[Floats, Floats] | None = None
         self._recent: deque[_Moment] = deque()
+        self._gel: tuple[Floats, Floats] | None = None
+        self._earlier: list[_Key] = []
+        self._tear: _Tear | None = None
+        self._rocked = -math.inf
+        self._test.reset()
 
     def __call__(
-        self, seq: int, time: float, change: Floats32, field: DisplacementField, mask: Mask
+        self,
+        seq: int,
+        time: float,
+        change: Floats32,
+        field: DisplacementField,
+        mask: Mask,
+        unsteadiness: float = 3.0,
     ) -> Slip | None:
         """Slip in the next frame; None where the contact is too small or too far from markers to tell.
 
         seq : of the frame. time : s. change : of `light_change`. field : of this frame. mask : (H, W) uint8,
-        255 in contact.
+        255 in contact. unsteadiness : standard deviation of the light on the untouched gel, grey levels.
         """
         gel = field.motion(mask)
         if gel is None or gel.unknown > MAX_UNKNOWN_SHARE:
@@ -156,22 +214,26 @@ class SlipTracker:
         if self._key is not None and self._key.grid != field.grid:
             # Markers have been added: the grid of the field has changed.
             self.reset()
-        share, key, torn = field.share(mask), self._key, False
-        found = None if key is None else self._registered(key, change, field)
-        if key is None or found is None:
+        share = field.share(mask)
+        drag_stderr = math.hypot(gel.stderr, *gel.outline_stderr) + MIN_MOTION_PX
+        found = None if self._key is None else self._registered(self._key, self._last, change, field)
+        if (found is None or self._tear is not None) and self._returned(change, field, time):
+            found = self._registered(self._key, self._last, change, field)
+        if found is None:
             template = template_of(change, mask)
-            torn = template is not None and self._torn(key, template, time)
-            self.reset()
             if template is None:
+                self.reset()
                 return None
-            key = _keyframe(template, field, share, np.zeros(3), np.zeros((3, 3)), 0.0)
-            self._since, self._began, at_rest = seq, time, np.zeros(5)
-            found = Registration(at_rest, np.zeros((5, 5)), 0 * template.light, 0.0, 1.0)
+            self._start(seq, time, template, field, share, drag_stderr, unsteadiness)
+            found = Registration(np.zeros(5), np.zeros((5, 5)), 0 * template.light, 0.0, 1.0)
+        key = self._key
+        assert key is not None
+        self._last, self._gel = found.motion, (field.displacement, share)
         now = _slid(key, found, field, time)
         self._recent.append(now)
         while len(self._recent) > 2 and time - self._recent[1].time > SPEED_WINDOW_S - 1e-6:
             self._recent.popleft()
-        slip = self._slip(gel.stderr, math.hypot(*gel.outline_stderr), torn)
+        slip = self._slip(gel.stderr, drag_stderr)
         if slip.slipping:
             self._grip = None
         else:
@@ -180,32 +242,88 @@ class SlipTracker:
         aged = found.seen < MIN_OVERLAP or found.residual > MAX_KEYFRAME_RESIDUAL or pressed
         if aged and (template := template_of(change, mask)) is not None:
             covariance = now.covariance + _of_growth(key, now.grown - key.grown)
-            key = _keyframe(template, field, share, now.slid, covariance, now.grown)
-        if key is not self._key:
-            self._key, self._last = key, np.zeros(5)
+            self._replace(_keyframe(template, field, share, now.slid, covariance, now.grown, key.since))
         return slip
 
-    def _registered(self, key: _Key, change: Floats32, field: DisplacementField) -> Registration | None:
-        """How the picture has moved since the keyframe, starting from the last motion, or that of the gel."""
+    def _replace(self, key: _Key) -> None:
+        """Compare later frames with another keyframe, and remember the present one."""
+        if self._key is not None:
+            self._earlier = [self._key, *self._earlier][:MAX_EARLIER_KEYFRAMES]
+        self._key, self._last = key, np.zeros(5)
+
+    def _registered(
+        self, key: _Key, last: Floats, change: Floats32, field: DisplacementField
+    ) -> Registration | None:
+        """How the picture has moved since a keyframe, starting from the last motion, or that of the gel."""
         moved = as_complex(field.displacement[key.cells]) - key.before
         x, y, turn = _rigid(key.rest + key.before - key.template.place, moved, key.share)[0].tolist()
         expected = np.array([x / PX, y / PX, turn * key.template.radius, 0.0, 0.0])
         best: Registration | None = None
-        for start in (self._last, expected):
+        for start in (last, expected):
             found = register(key.template, change, start, expected, MOTION_PRIOR_STDDEV)
             if found is not None and (best is None or found.residual < best.residual):
                 best = found
             if best is not None and best.residual < MAX_KEYFRAME_RESIDUAL:
                 break
-        if best is not None:
-            self._last = best.motion
         return best
 
-    def _torn(self, key: _Key | None, template: Template, time: float) -> bool:
-        """Whether the picture changed abruptly, after `SPEED_WINDOW_S`, while the object presses on."""
-        if key is None or time - self._began < SPEED_WINDOW_S:
-            return False
-        return template.contrast > MAX_RESIDUAL * key.template.contrast
+    def _returned(self, change: Floats32, field: DisplacementField, time: float) -> bool:
+        """Whether the picture is again that of an earlier keyframe, on the same gel, which then is the
+        present one: the object was rocked, or the picture disturbed."""
+        for key in self._earlier:
+            found = self._registered(key, np.zeros(5), change, field)
+            if found is None or found.residual > MAX_RETURN_RESIDUAL:
+                continue
+            moved = (_slid(key, found, field, time).slid - key.slid) * key.lever
+            if float(np.linalg.norm(moved)) < RETURN_RADII * key.lever[2]:
+                self._earlier = [other for other in self._earlier if other is not key]
+                self._replace(key)
+                self._recent.clear()
+                self._tear, self._rocked = None, time
+                self._test.reset()
+                return True
+        return False
+
+    def _sprung(self, field: DisplacementField, share: Floats) -> float:
+        """RMS motion since the last frame of the gel that was or is in contact, px."""
+        displacement, before = self._gel or (field.displacement, share)
+        part = np.maximum(share, before)
+        moved = np.square(field.displacement - displacement).sum(axis=-1)
+        return math.sqrt(float((part * moved).sum()) / max(float(part.sum()), 1e-9))
+
+    def _start(
+        self,
+        seq: int,
+        time: float,
+        template: Template,
+        field: DisplacementField,
+        share: Floats,
+        drag_stderr: float,
+        unsteadiness: float,
+    ) -> None:
+        """Begin with a keyframe that cannot be compared with those before.
+
+        drag_stderr : standard error of the drag, px. unsteadiness : see `__call__`.
+        """
+        before, last = self._key, self._recent[-1] if self._recent else None
+        key = _keyframe(template, field, share, np.zeros(3), np.zeros((3, 3)), 0.0, seq)
+        if before is None or last is None:
+            self._began = time
+        else:
+            radius, contrast = template.radius * PX, before.template.contrast
+            jump = key.share @ key.rest - before.share @ before.rest
+            low, high = sorted((template.contrast, contrast))
+            held = low > MAX_RESIDUAL * high or abs(jump) > radius
+            sprung = self._sprung(field, share) > MIN_SPRING_RADII * radius
+            if held and low > unsteadiness and sprung and time - self._began >= SPEED_WINDOW_S:
+                drag = max(math.hypot(*last.gel[:2]), abs(key.share @ key.before))
+                self._tear = _Tear(time, _normal((drag - SLIP_THRESHOLD_RADII * radius) / drag_stderr))
+                # The middle of the contact shows coarsely how far the object has moved.
+                slid = np.array([before.slid[0] + jump.real, before.slid[1] + jump.imag, last.slid[2]])
+                covariance = last.covariance + np.diag([radius**2, radius**2, UNKNOWN_TURN**2])
+                key = key._replace(slid=slid, covariance=covariance, since=before.since)
+        self._replace(key)
+        self._recent.clear()
 
     def _sticking(self, field: DisplacementField, share: Floats) -> float:
         """The stick ratio of the gel that was touched first, or that the contact has moved on to."""
@@ -216,50 +334,85 @@ class SlipTracker:
             return 1.0
         return stick_ratio(before, share, field.grid.points, field.displacement - displacement, field.noise)
 
-    def _slip(self, gel_stderr: float, outline_stderr: float, torn: bool) -> Slip:
-        """The slip up to now. gel_stderr, outline_stderr : standard errors of the mean displacement of the
-        gel, from the markers and from the outline, px. torn : whether the picture has changed abruptly."""
-        then, now = self._recent[0], self._recent[-1]
-        key, radius = now.key, now.key.template.radius * PX
-        gel_variance = gel_stderr**2 * np.array([1.0, 1.0, 2 / radius**2])
-        covariance = now.covariance + _of_growth(key, now.grown - key.grown) + np.diag(gel_variance)
-        slid, stderr = now.slid.tolist(), np.sqrt(np.diag(covariance)).tolist()
-        probability, speed, speed_stderr = 0.0, None, None
-        drag_stderr = math.hypot(gel_stderr, outline_stderr) + MIN_MOTION_PX
-        if torn:
-            probability = _normal((math.hypot(*now.gel[:2]) - SLIP_THRESHOLD_RADII * radius) / drag_stderr)
-        if now.time > then.time:
-            # At the RMS radius, where a turn moves the object as much as a shift.
-            lever, time = np.array([1.0, 1.0, radius]), now.time - then.time
-            covariance = now.covariance + then.covariance - 2 * then.key.covariance
-            if key is then.key:
-                covariance *= 1 - _correlation(now.error, then.error)
-            covariance += _of_growth(key, now.grown - then.grown) + np.diag(gel_variance)
-            covariance *= np.outer(lever, lever)
-            # Uncertain components count less: a smooth ball does not show how it turns.
-            shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLIP_THRESHOLD_RADII * radius) ** 2)
-            moved = shrink @ ((now.slid - then.slid) * lever)
-            length = float(np.linalg.norm(moved))
-            way = moved / max(length, MIN_MOTION_PX)
-            error = math.sqrt(float(way @ shrink @ covariance @ way)) + MIN_MOTION_PX
+    def _before(self, seconds: float) -> _Moment:
+        """The last moment at least some seconds ago, or the first one."""
+        now = self._recent[-1].time
+        old = [moment for moment in self._recent if now - moment.time > seconds - 1e-6]
+        return old[-1] if old else self._recent[0]
+
+    def _slides(
+        self, now: _Moment, gel_variance: Floats, drag_stderr: float
+    ) -> tuple[float, SlipKind, float | None, float | None]:
+        """Probability that the object slides, and how; its speed and the standard error, px/s; None in the
+        first frame."""
+        if len(self._recent) < 2:
+            return 0.0, "sliding", None, None
+        shares = []
+        for seconds in (ONSET_WINDOW_S, SPEED_WINDOW_S):
+            then = self._before(seconds)
             # Gel outside the contact that counts as inside stays behind gel that sticks.
-            strained = OUTLINE_STDERR_RADII * float(np.linalg.norm((now.gel - then.gel) * lever))
-            slides = _normal((length - strained - SLIP_THRESHOLD_RADII * radius) / error)
-            dragged = float(way @ (now.gel * lever)) - SLIP_THRESHOLD_RADII * radius
-            probability = slides * _normal(dragged / drag_stderr)
-            speed, speed_stderr = length / time, error / time
+            strain = OUTLINE_STDERR_RADII * float(np.linalg.norm((now.gel - then.gel) * now.key.lever))
+            share, length, error = _slid_between(then, now, strain, gel_variance, drag_stderr)
+            shares.append(share)
+        time = now.time - then.time
+        kind: SlipKind = "sliding" if shares[0] > 0.5 else "creeping"
+        return max(shares), kind, length / time, error / time
+
+    def _slip(self, gel_stderr: float, drag_stderr: float) -> Slip:
+        """The slip up to now. gel_stderr, drag_stderr : standard errors of the mean displacement of the gel,
+        by the markers alone, and by the outline as well, px."""
+        now = self._recent[-1]
+        key, lever = now.key, now.key.lever
+        gel_variance = np.diag(gel_stderr**2 * np.array([1.0, 1.0, 2.0]) / lever**2)
+        covariance = now.covariance + _of_growth(key, now.grown - key.grown) + gel_variance
+        slid, stderr = now.slid.tolist(), np.sqrt(np.diag(covariance)).tolist()
+        probability, kind, speed, speed_stderr = self._slides(now, gel_variance, drag_stderr)
+        if self._tear is not None:
+            if now.time - self._tear.time > SPEED_WINDOW_S + 1e-6:
+                self._tear = None
+            elif self._tear.probability > probability:
+                probability, kind = self._tear.probability, "lost"
+        if now.time - self._rocked < ROCKING_S:
+            probability = min(probability, ROCKED_PROBABILITY)
+        event = self._test(now.time, probability, kind)
         return Slip(
-            slipping=probability > 0.5,
+            slipping=event.slipping,
             stick_ratio=0.0,
-            probability=probability,
+            probability=event.probability,
             translation=(slid[0], slid[1]),
             rotation=-math.degrees(slid[2]) + 0.0,
             speed=speed,
-            since=self._since,
+            since=key.since,
             translation_stderr=(stderr[0], stderr[1]),
             rotation_stderr=math.degrees(stderr[2]),
             speed_stderr=speed_stderr,
+            kind=event.kind,
+            onset=event.onset,
         )
+
+
+def _slid_between(
+    then: _Moment, now: _Moment, strained: float, gel_variance: Floats, drag_stderr: float
+) -> tuple[float, float, float]:
+    """Probability that the object slid between two moments; its motion over the gel and the standard error,
+    px, at the RMS radius, where a turn moves the object as much as a shift."""
+    key, lever = now.key, now.key.lever
+    radius = lever[2]
+    common = min(key.covariance, then.key.covariance, key=np.trace)
+    covariance = now.covariance + then.covariance - 2 * common
+    if key is then.key:
+        covariance *= 1 - _correlation(now.error, then.error)
+    covariance += _of_growth(key, now.grown - then.grown) + gel_variance
+    covariance *= np.outer(lever, lever)
+    # Uncertain components count less: a smooth ball does not show how it turns.
+    shrink = np.linalg.inv(np.eye(3) + covariance / (2 * SLIP_THRESHOLD_RADII * radius) ** 2)
+    moved = shrink @ ((now.slid - then.slid) * lever)
+    length = float(np.linalg.norm(moved))
+    way = moved / max(length, MIN_MOTION_PX)
+    error = math.sqrt(float(way @ shrink @ covariance @ way)) + MIN_MOTION_PX
+    slides = _normal((length - strained - SLIP_THRESHOLD_RADII * radius) / error)
+    dragged = float(way @ (now.gel * lever)) - SLIP_THRESHOLD_RADII * radius
+    return slides * _normal(dragged / drag_stderr), length, error
 
 
 def _keyframe(
@@ -269,15 +422,15 @@ def _keyframe(
     slid: Floats,
     covariance: Floats,
     grown: float,
+    since: int,
 ) -> _Key:
     """The frame that others are compared with. share : (rows, columns), of each cell in contact."""
     inside = share > 0
     inside[inside] = _core(field.grid.points[inside], share[inside])
     rest, before = as_complex(field.grid.points[inside]), as_complex(field.displacement[inside])
     count = float(share[inside].sum())
-    return _Key(
-        template, field.grid, inside, rest, before, share[inside] / count, count, slid, covariance, grown
-    )
+    weights = share[inside] / count
+    return _Key(template, field.grid, inside, rest, before, weights, count, slid, covariance, grown, since)
 
 
 def _slid(key: _Key, found: Registration, field: DisplacementField, time: float) -> _Moment:
