@@ -242,6 +242,19 @@ def register(
     return Registration(motion, covariance, error, residual, count / len(error))
 
 
+def shows(template: Template, change: Floats32) -> bool:
+    """Whether a picture shows enough of a template's cells, where they are, to be compared: markers that have
+    moved may cover them.
+
+    change : of `light_change`.
+    """
+    free = change[..., 3] >= 1
+    free[:-1, :-1] &= free[1:, :-1] & free[:-1, 1:] & free[1:, 1:]
+    columns, rows = np.rint(template.away + template.center).astype(np.int64).T
+    count = np.count_nonzero(free[rows, columns])
+    return bool(count >= max(MIN_VISIBLE_SHARE * len(rows), MIN_CELLS))
+
+
 @kernel
 def compare_light(
     change: Floats32,

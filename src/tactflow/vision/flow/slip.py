@@ -20,7 +20,14 @@ from tactflow.vision.flow.displacement_field import (
 )
 from tactflow.vision.flow.in_mask import MAX_UNKNOWN_SHARE
 from tactflow.vision.flow.registration import CELL_PX as PX
-from tactflow.vision.flow.registration import MAX_RESIDUAL, Registration, Template, register, template_of
+from tactflow.vision.flow.registration import (
+    MAX_RESIDUAL,
+    Registration,
+    Template,
+    register,
+    shows,
+    template_of,
+)
 from tactflow.vision.flow.slip_event import EventTest
 from tactflow.vision.geometry.similarity import Complexes, as_complex, fit_similarity
 from tactflow.vision.types import Slip, SlipKind
@@ -224,7 +231,8 @@ class SlipTracker:
             if template is None:
                 self.reset()
                 return None
-            self._start(seq, time, template, field, share, drag_stderr, unsteadiness)
+            shown = self._key is not None and shows(self._key.template, change)
+            self._start(seq, time, template, field, share, drag_stderr, unsteadiness if shown else math.inf)
             found = Registration(np.zeros(5), np.zeros((5, 5)), 0 * template.light, 0.0, 1.0)
         key = self._key
         assert key is not None
@@ -303,7 +311,8 @@ class SlipTracker:
     ) -> None:
         """Begin with a keyframe that cannot be compared with those before.
 
-        drag_stderr : standard error of the drag, px. unsteadiness : see `__call__`.
+        drag_stderr : standard error of the drag, px. unsteadiness : see `__call__`; infinite where markers
+        hide the picture of the present keyframe.
         """
         before, last = self._key, self._recent[-1] if self._recent else None
         key = _keyframe(template, field, share, np.zeros(3), np.zeros((3, 3)), 0.0, seq)
