@@ -225,6 +225,7 @@ class SlipTracker:
         drag_stderr = math.hypot(gel.stderr, *gel.outline_stderr) + MIN_MOTION_PX
         found = None if self._key is None else self._registered(self._key, self._last, change, field)
         if (found is None or self._tear is not None) and self._returned(change, field, time):
+            assert self._key is not None
             found = self._registered(self._key, self._last, change, field)
         if found is None:
             template = template_of(change, mask)
@@ -321,7 +322,7 @@ class SlipTracker:
         else:
             radius, contrast = template.radius * PX, before.template.contrast
             jump = key.share @ key.rest - before.share @ before.rest
-            low, high = sorted((template.contrast, contrast))
+            low, high = min(template.contrast, contrast), max(template.contrast, contrast)
             held = low > MAX_RESIDUAL * high or abs(jump) > radius
             sprung = self._sprung(field, share) > MIN_SPRING_RADII * radius
             if held and low > unsteadiness and sprung and time - self._began >= SPEED_WINDOW_S:
