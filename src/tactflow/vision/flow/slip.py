@@ -326,7 +326,7 @@ class SlipTracker:
             held = low > MAX_RESIDUAL * high or abs(jump) > radius
             sprung = self._sprung(field, share) > MIN_SPRING_RADII * radius
             if held and low > unsteadiness and sprung and time - self._began >= SPEED_WINDOW_S:
-                drag = max(math.hypot(*last.gel[:2]), abs(key.share @ key.before))
+                drag = max(math.hypot(*last.gel[:2]), float(np.abs(key.share @ key.before)))
                 self._tear = _Tear(time, _normal((drag - SLIP_THRESHOLD_RADII * radius) / drag_stderr))
                 # The middle of the contact shows coarsely how far the object has moved.
                 slid = np.array([before.slid[0] + jump.real, before.slid[1] + jump.imag, last.slid[2]])
