@@ -17,16 +17,16 @@ import signal
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tactflow.system.children import starting_children
-from tactflow.system.signals import ENDING
+from tactflow.system.signals import ENDING_SIGNALS
 
 def blocked(process):
     status = Path(f"/proc/{process}/status").read_text()
     mask = int(re.search("SigBlk:\\t(.*)", status)[1], 16)
-    return all(mask >> (number - 1) & 1 for number in ENDING)
+    return all(mask >> (number - 1) & 1 for number in ENDING_SIGNALS)
 
 if __name__ == "__main__":
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    with starting_children(ENDING):
+    with starting_children(ENDING_SIGNALS):
         child = multiprocessing.get_context("spawn").Process(target=print, args=("child",))
         child.start()
     assert blocked(child.pid)
