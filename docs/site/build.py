@@ -27,6 +27,8 @@ NAMES: Final = {
 """Page -> its name on the site; a page `docs/NAME.md` is `NAME.md`."""
 BESIDE_THE_GUIDE: Final = {"guide", "index", "changes", "accuracy", "peers"}
 """Pages that have their own place in the navigation, not within the guide."""
+COPIED: Final = (".jpg", ".png", ".h")
+"""Files of docs/ that pages show or link to."""
 LINKED: Final = ("examples", "pipelines", "plugins")
 """Folders with files that pages link to."""
 MEASURED: Final = {"bench": "accuracy.md", "stress": "stability.md"}
@@ -51,10 +53,11 @@ def stage(source: Path) -> None:
         path = page.relative_to(REPOSITORY).as_posix()
         text = page.read_text(encoding="utf-8")
         (source / site_name(path)).write_text(with_links(text, page.parent), encoding="utf-8")
-    for picture in [*REPOSITORY.glob("docs/**/*.jpg"), *REPOSITORY.glob("docs/**/*.png")]:
-        copy = source / picture.relative_to(REPOSITORY / "docs")
-        copy.parent.mkdir(exist_ok=True)
-        shutil.copyfile(picture, copy)
+    for kind in COPIED:
+        for file in REPOSITORY.glob(f"docs/**/*{kind}"):
+            copy = source / file.relative_to(REPOSITORY / "docs")
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copyfile(file, copy)
     for folder in LINKED:
         shutil.copytree(REPOSITORY / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
     with (source / "index.md").open("a", encoding="utf-8") as index:
