@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from pydantic import Field
-
-from tactflow.engine.contract import Stage, StageParams
+from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Frame
+from tactflow.parameters import LightParams
 from tactflow.ports import ContactMask, MarkerMask, Slipping, Touching, Unmarked, Untouched
 from tactflow.vision.arrays import ColorImage
 from tactflow.vision.flow import DisplacementField, SlipTracker
@@ -39,12 +38,8 @@ class SlipStage(Stage):
 
     memory = "stateful"
 
-    class Params(StageParams):
+    class Params(LightParams):
         """How steady the light is."""
-
-        repeatability: float = Field(
-            0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
-        )
 
     def __init__(self, params: Params) -> None:
         super().__init__(params)

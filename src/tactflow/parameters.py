@@ -9,16 +9,25 @@ from pydantic import Field
 from tactflow.engine.contract import StageParams
 
 
-class GelParams(StageParams):
+class LightParams(StageParams):
     """How much the light on the untouched gel varies; `gel` of a pipeline file sets it for all stages.
 
-    >>> GelParams(tint=0.02)
-    GelParams(repeatability=0.025, tint=0.02)
+    >>> LightParams()
+    LightParams(repeatability=0.025)
     """
 
     repeatability: float = Field(
         0.025, ge=0, le=1, description="variation of the light on the untouched gel, relative; see gel"
     )
+
+
+class GelParams(LightParams):
+    """How much its light and its colour vary.
+
+    >>> GelParams(tint=0.02)
+    GelParams(repeatability=0.025, tint=0.02)
+    """
+
     tint: float = Field(
         0.01,
         ge=0,

@@ -22,8 +22,8 @@ far away: what lies beyond adds a hundredth to the depth."""
 
 
 MIN_LIT_LEVEL: Final = 0.5
-"""Least `level` of a cell that shows how much the light has changed: its light at rest is then at least `DIM`
-of `surface`, so that grey levels of noise are a small part of it."""
+"""Least `level` of a cell that shows how much the light has changed: its light at rest is then at least
+`LIGHT_OFFSET_GREY` of `surface`, so that grey levels of noise are a small part of it."""
 MIN_GAIN: Final = 0.1
 """Smallest gain that is divided by: a picture that is darker shows no gel."""
 
