@@ -6,9 +6,11 @@ import logging
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Final
 
 import orjson
 
@@ -109,16 +111,21 @@ class _Notes(logging.Handler):
         say(f"tactflow: {record.levelname}: {record.getMessage()}")
 
 
+LINE_PERIOD_S: Final = 10.0
+"""Least time between two lines of progress, s: a log of an hour stays short, and nobody thinks it hangs."""
+
+
 @contextmanager
 def progress_bar(
-    description: str, total: float | None = None, *, shown: bool = True
+    description: str, total: float | None = None, *, shown: bool = True, lines: bool = False
 ) -> Iterator[Callable[..., None]]:
     """A progress bar on standard error, on a terminal only, removed when the block ends.
 
-    Gives a function that updates it: `update(completed=3, total=10, description="rendering")`.
+    Gives a function that updates it: `update(completed=3, total=10, description="rendering")`. lines : print
+    the description every ten seconds where there is no terminal.
     """
     if not shown or not sys.stderr.isatty():
-        yield lambda **_: None
+        yield _lines_of_progress() if shown and lines else lambda **_: None
         return
     # Imported here because rich takes a while, and many commands run without a terminal.
     from rich.console import Console
@@ -128,3 +135,20 @@ def progress_bar(
     times = (TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, *times, console=Console(stderr=True), transient=True) as display:
         yield partial(display.update, display.add_task(printable(description), total=total))
+
+
+def _lines_of_progress() -> Callable[..., None]:
+    """A function that takes what updates a bar, and prints a line now and then."""
+    began = last = time.monotonic()
+    share = ""
+
+    def update(description: str = "", completed: float = 0.0, total: float | None = None) -> None:
+        nonlocal last, share
+        if total:
+            share = f", {completed:g} of {total:g} done"
+        now = time.monotonic()
+        if now - last >= LINE_PERIOD_S:
+            last = now
+            say(f"tactflow: {now - began:.0f} s{share}: {description}")
+
+    return update

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--recording {args.recording}: there is no such file")
     scenes = frozenset(args.scene) if args.scene else None
     files = pipeline_files(args.pipelines)
-    with notes("ERROR"), progress_bar("rendering") as update:
+    with notes("ERROR"), progress_bar("rendering", lines=True) as update:
         result = run_bench(
             files,
             quick=args.quick,

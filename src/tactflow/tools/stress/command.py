@@ -93,10 +93,12 @@ def run(args: argparse.Namespace) -> int:
             refuse_output(option, path, overwrite=True)
     report = Report(quick=args.quick, machine=machine())
     began = time.perf_counter()
-    parts = _parts(args, report, stored)
-    with notes("CRITICAL"), progress_bar("stress", total=len(parts)) as update:
+    with notes("CRITICAL"), progress_bar("stress", lines=True) as update:
+        at = ""
+        parts = _parts(args, report, stored, lambda subject: update(description=f"{at}: {subject}"))
         for number, (name, measure) in enumerate(parts.items()):
-            update(description=name, completed=number)
+            at = name
+            update(description=name, completed=number, total=len(parts))
             start = time.perf_counter()
             part = measure()
             part.seconds = time.perf_counter() - start
@@ -118,10 +120,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _parts(
-    args: argparse.Namespace, report: Report, stored: Answers | None
+    args: argparse.Namespace, report: Report, stored: Answers | None, tell: Callable[[str], None]
 ) -> Mapping[str, Callable[[], Part]]:
-    """Name -> function that measures it, of the parts that were asked for."""
-    who = subjects(pipeline_files(args.pipelines))
+    """Name -> function that measures it, of the parts that were asked for. tell : as for `Subject`."""
+    who = subjects(pipeline_files(args.pipelines), tell)
     if args.quick:
         # The script takes as long as all the others together.
         who = [subject for subject in who if not subject.reference]

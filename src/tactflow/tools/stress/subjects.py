@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -42,12 +42,14 @@ class Subject:
     file : of the pipeline.
     dots : whether it tracks dots.
     settings : values of the file that are replaced, as for `tactflow.load`.
+    tell : called with the name whenever the pipeline is loaded for a run.
     """
 
     name: str
     file: Path
     dots: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    tell: Callable[[str], None] = field(default=lambda _: None, compare=False)
 
     @property
     def reference(self) -> bool:
@@ -64,6 +66,7 @@ class Subject:
 
         settings : keys of the file, `a__b` for a.b.
         """
+        self.tell(self.name)
         values = dict(self.settings) | {key.replace("__", "."): value for key, value in settings.items()}
         pipeline = tactflow.load(self.file, source=frames, settings=values)
         for id_, node in pipeline.nodes.items():
@@ -77,9 +80,9 @@ class Subject:
         return results(self.load(frames, **settings))
 
 
-def subjects(files: Mapping[str, Path]) -> list[Subject]:
-    """The pipelines of these files. files : name -> file."""
-    return [Subject(name, file, _tracks(file)) for name, file in files.items()]
+def subjects(files: Mapping[str, Path], tell: Callable[[str], None] = lambda _: None) -> list[Subject]:
+    """The pipelines of these files. files : name -> file. tell : as for `Subject`."""
+    return [Subject(name, file, _tracks(file), tell=tell) for name, file in files.items()]
 
 
 def _tracks(file: Path) -> bool:
