@@ -12,6 +12,7 @@ from tactflow.engine.once import KEPT_RESULTS, MAX_COMPARED_BYTES, Once
 
 BIG = np.zeros(MAX_COMPARED_BYTES + 1, np.uint8)
 SMALL = np.array([[1.0, np.nan]])
+MANY_DOTS = np.zeros((5000, 2))
 
 
 class Counting:
@@ -32,6 +33,7 @@ class Counting:
         (BIG, BIG.copy(), False),
         (BIG, BIG[:], False),
         (SMALL, SMALL.copy(), True),
+        (MANY_DOTS, MANY_DOTS.copy(), True),
         (SMALL, SMALL.ravel(), False),
         (SMALL, SMALL.astype(np.float32), False),
         (SMALL, SMALL + 1, False),

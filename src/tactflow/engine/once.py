@@ -13,8 +13,8 @@ T = TypeVar("T")
 
 KEPT_RESULTS = 4
 """Number of results kept of each function: of stages with different settings, and of the last reference."""
-MAX_COMPARED_BYTES = 1 << 14
-"""Size up to which arrays are compared by value, bytes: the positions of a thousand dots, 2 us."""
+MAX_COMPARED_BYTES = 1 << 17
+"""Size up to which arrays are compared by value, bytes: the positions of eight thousand dots."""
 
 
 class Once:
