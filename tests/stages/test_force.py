@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,24 @@ def test_the_force_is_linear_in_what_is_seen_with_its_error(tmp_path: Path) -> N
     assert found.in_range
     still = stage(tmp_path, BY_DEPTH, DRAG).process(CONTACT, SCALE, GEL, GEL, DEPTH, Flow(None, 0))
     assert still.value[:2] == still.stderr[:2] == (None, None)
+
+
+def test_a_twist_is_resisted_by_the_stiffness_to_shear(tmp_path: Path) -> None:
+    twisted = Flow((0.0, 0.0), 4, rotation=-6.0)
+    radius = math.sqrt(4 / math.pi)
+    # Springs on 4 mm^2, of 0.5 N/mm^3, each times its motion and its lever.
+    thin = stage(tmp_path, BY_DEPTH, DRAG).process(CONTACT, SCALE, GEL, GEL, DEPTH, twisted)
+    rings = (np.arange(1000) + 0.5) / 1000 * radius
+    springs = 0.5 * 2 * np.pi * rings * radius / 1000
+    assert thin.torque == pytest.approx(np.sum(springs * rings * np.radians(6) * rings), rel=1e-5)
+    # A deep gel of shear modulus G under a disc: 16/3 G a to shear, 16/3 G a^3 to twist.
+    modulus = 0.05
+    by_width = DRAG.model_copy(update={"stiffness": {"shear_by_width": 16 / 3 * modulus * radius / 2}})
+    deep = stage(tmp_path, BY_DEPTH, by_width).process(CONTACT, SCALE, GEL, GEL, DEPTH, twisted)
+    assert deep.torque == pytest.approx(16 / 3 * modulus * radius**3 * np.radians(6))
+    unknown = stage(tmp_path, BY_DEPTH, DRAG).process(CONTACT, SCALE, GEL, GEL, DEPTH, Flow((1.0, 0.0), 2))
+    assert unknown.torque is None
+    assert stage(tmp_path, BY_DEPTH).process(CONTACT, SCALE, GEL, GEL, DEPTH, twisted).torque is None
 
 
 def test_without_heights_the_change_of_the_light_stands_for_them(tmp_path: Path) -> None:

@@ -424,6 +424,9 @@ class Force(Part):
     )
     stderr: tuple[Error, Error, Error] = sent("standard errors", "N", null="when unknown")
     in_range: bool = sent("whether the calibration was fitted to such contacts; stderr only holds there")
+    torque: Finite | None = sent(
+        "about z through the center of the contact, from x to y (absent if not known)", "N mm", if_known=True
+    )
 
 
 class Pose(Part):

@@ -11,11 +11,13 @@ are few slopes, and the force follows the changed area. The integral of the squa
 between the two, and steep slopes, whose light saturates, do not outweigh all others.
 
 Sideways it is the same: the force on a thin layer is the integral of the shear over the contact, that on a
-deep one shear times width (Mindlin).
+deep one shear times width (Mindlin). The same stiffness resists a twist: for a round contact of radius a, the
+torque per rad is the stiffness to shear times a^2 / 2 on a thin layer, whose springs each resist their own
+motion, and times a^2 on a deep gel, if that is incompressible and sticks to the object (Reissner and Sagoci).
 
 References
 ----------
-K. L. Johnson, Contact Mechanics (1985): ch. 3.4, 4.2 and 4.3, 7.2.
+K. L. Johnson, Contact Mechanics (1985): ch. 3.4, 3.7 and 3.9, 4.2 and 4.3, 7.2.
 """
 
 from __future__ import annotations
@@ -54,11 +56,13 @@ class Seen(NamedTuple):
     """Features of a contact that determine its force.
 
     press : name -> value, those of `BY_DEPTH` and `BY_CHANGE` that are known. drag : name -> (x, y), those of
-    `BY_SHEAR`; empty where the flow is not known.
+    `BY_SHEAR`; empty where the flow is not known. twist : the same for the torque about z, times mm rad;
+    empty where the rotation is not known.
     """
 
     press: dict[str, float]
     drag: dict[str, tuple[float, float]]
+    twist: Mapping[str, float] = {}
 
 
 class LightChange:
@@ -128,7 +132,13 @@ def seen(contact: Contact, scale: Scale, depth: Depth | None, change: float, flo
     if flow is None or flow.mean is None:
         return Seen(press, {})
     x, y = scale.vector(flow.mean)
-    return Seen(press, {"shear_by_area": (x * area, y * area), "shear_by_width": (x * width, y * width)})
+    drag = {"shear_by_area": (x * area, y * area), "shear_by_width": (x * width, y * width)}
+    if flow.rotation is None:
+        return Seen(press, drag)
+    # Counter-clockwise as seen is against z, which points away from the camera.
+    turned, radius2 = -math.radians(flow.rotation), area / math.pi
+    twist = {"shear_by_area": turned * radius2 / 2 * area, "shear_by_width": turned * radius2 * width}
+    return Seen(press, drag, twist)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,4 +200,5 @@ class ForceModel:
         x, y = (self.drag.value(features) for features in along)
         in_range = in_range and all(self.drag.knows(features) for features in along)
         stderr = (self.drag.stderr(x), self.drag.stderr(y), self.press.stderr(pressed))
-        return Force((x, y, pressed), stderr, in_range)
+        torque = self.drag.value(contact.twist) if contact.twist else None
+        return Force((x, y, pressed), stderr, in_range, torque)

@@ -304,6 +304,9 @@ class Force:
         it drags the gel. None for a component that the calibration does not know.
     stderr : standard error of each component, N; None where `value` is, NaN where it is not known.
     in_range : whether the contact is like those the calibration was fitted to; `stderr` only holds there.
+    torque : on the gel about z, through the middle of the contact, N mm, positive from x to y: what the
+        elasticity of a round contact gives for the twist of the gel. None where that, or `value` of x and y,
+        is not known.
 
     Examples
     --------
@@ -314,6 +317,7 @@ class Force:
     value: tuple[float | None, float | None, float]
     stderr: tuple[float | None, float | None, float]
     in_range: bool
+    torque: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
