@@ -15,6 +15,8 @@ from tactflow.sources.base import FrameReader, check_pixel_count, damaged, requi
 from tactflow.sources.files import decode_image
 from tactflow.sources.paths import find_path, listed, split_query
 
+from .video import DEFINITION, decode_video
+
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
@@ -48,6 +50,10 @@ PLANAR = {
 IMAGE_FILES = ("jpeg", "jpg", "png", "webp", "tif", "bmp", "jp2")
 """Parts of the `format` of a compressed picture that OpenCV can decode."""
 
+Messages = Iterator[tuple[int, Any]]
+"""Times, ns, and messages, or pictures."""
+Decoder = Callable[[Messages, str], Messages]
+"""From the messages of a topic to its pictures; the text names the source."""
 Topics = Mapping[str, tuple[str, int | None]]
 """Topic -> type and number of its messages; None if that is unknown."""
 
@@ -92,12 +98,12 @@ class Bag(FrameReader):
         return [f"{name}?topic={topic}" for topic in topics] if len(topics) > 1 else []
 
     def _frames(self) -> Iterator[tuple[NDArray[Any], float]]:
-        to_image = _decoder(self._type)
-        assert to_image is not None
+        written = self._store.messages(self._topic)
+        messages = ((_stamp(message) or time, message) for time, message in written)
+        decode = _decoder(self._type)
+        assert decode is not None
         first: int | None = None
-        for written, message in self._store.messages(self._topic):
-            image = to_image(message, self.name)
-            taken = _stamp(message) or written
+        for taken, image in decode(messages, self.name):
             first = taken if first is None else first
             self.begins = first / 1e9
             yield image, (taken - first) / 1e9
@@ -150,11 +156,13 @@ class RosBag:
     def __init__(self, path: Path) -> None:
         require(path, "ROS bags", "bags", "rosbags")
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+        # Bags from before 2023 do not contain their types; those of pictures have never changed.
+        types = get_typestore(Stores.LATEST)
+        types.register(get_types_from_msg(DEFINITION, "foxglove_msgs/msg/CompressedVideo"))
         try:
-            # Bags from before 2023 do not contain their types; those of pictures have never changed.
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+            self._reader = AnyReader([path], default_typestore=types)
             self._reader.open()
         except Exception as error:
             raise damaged(str(path), error) from error
@@ -264,12 +272,19 @@ def _stamp(message: Any) -> int:
     return int(getattr(time, seconds)) * 1_000_000_000 + int(getattr(time, rest))
 
 
-def _decoder(kind: str) -> Callable[[Any, str], NDArray[Any]] | None:
-    """The function that extracts the picture from a message of this type; None for other types."""
+def _decoder(kind: str) -> Decoder | None:
+    """The function that extracts the pictures from messages of this type; None for other types."""
     package, _, name = kind.replace(".", "/").rpartition("/")
-    if package not in PACKAGES:
-        return None
-    return {"Image": raw_image, "RawImage": raw_image, "CompressedImage": compressed_image}.get(name)
+    return DECODERS_OF_TYPES.get(name) if package in PACKAGES else None
+
+
+def _each(to_image: Callable[[Any, str], NDArray[Any]]) -> Decoder:
+    """The decoder for messages that each hold a whole picture."""
+
+    def decode(messages: Messages, name: str) -> Messages:
+        return ((taken, to_image(message, name)) for taken, message in messages)
+
+    return decode
 
 
 def raw_image(message: Any, name: str) -> NDArray[Any]:
@@ -340,3 +355,12 @@ def compressed_image(message: Any, name: str) -> NDArray[Any]:
             f"{name}: the format of its pictures is {stated!r}; required JPEG, PNG or another image file in "
             "each message: decode the topic to sensor_msgs/Image, and record that"
         ) from None
+
+
+DECODERS_OF_TYPES: dict[str, Decoder] = {
+    "Image": _each(raw_image),
+    "RawImage": _each(raw_image),
+    "CompressedImage": _each(compressed_image),
+    "CompressedVideo": decode_video,
+}
+"""Type of messages, without its package -> how pictures are extracted."""

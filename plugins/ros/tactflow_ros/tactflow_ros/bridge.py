@@ -6,13 +6,11 @@ connects. The receiving thread publishes the messages; the executor handles only
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PolygonStamped, PoseStamped, Vector3Stamped, WrenchStamped
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock as Steady
@@ -27,16 +25,22 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from tactflow_ros import messages
+from tactflow_ros.health import Health, diagnostics
 from tactflow_ros.link import Link, LinkError, send_command
+from tactflow_ros.surface import surface
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ModuleNotFoundError:
+    # Part of geometry2, which the smallest installations of ROS 2 lack.
+    TFMessage = None
 
 QUEUE_DEPTH = 10
 """Queue length of a topic."""
 ANSWER_SECONDS = 2.0
 """Timeout of the service, s. Chosen by hand."""
-MIN_UNIX_TIME_S = 1e9
-"""Times above this are Unix times of a live source; those of a recording start at 0, s."""
-MAX_LOST_SHARE = 0.5
-"""Share of lost markers above which /diagnostics warns. Chosen by hand."""
+TF_QOS = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
+"""Quality of service of /tf, as of tf2's own broadcaster."""
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
     "endpoint": ("tcp://127.0.0.1:5556", "address of results: sinks.zmq.endpoint"),
@@ -44,6 +48,8 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "control": ("", "sinks.zmq.control, for the service ~/take_reference; empty disables it"),
     "keys": ("", "folder of the subscriber, from tactflow keys new; empty for no keys"),
     "frame_id": ("tactile_optical_frame", "frame of the picture: x right, y down, z out of the gel"),
+    "object_frame_id": ("tactile_object", "frame of the object on /tf while its pose is tracked; empty: none"),
+    "surface_step": (2, "every how many pixels the topic surface has a point"),
     "reliability": ("best_effort", "of the topics: best_effort or reliable"),
     "timeout": (2.0, "time without a message before /diagnostics reports it, s"),
     "publish_clock": (False, "also publish /clock, from the capture times of a recording"),
@@ -67,52 +73,16 @@ UNITLESS = {
     "wrench": WrenchStamped,
     "object_pose": PoseStamped,
     "depth": Image,
+    "surface": PointCloud2,
     "image/compressed": CompressedImage,
 }
 """Topic -> type, for topics in a single unit."""
-ON_DEMAND = {"tactflow_picture": "image/compressed", "tactflow_depth": "depth"}
-"""Message sent by tactflow only on subscription -> topic."""
-
-
-class Counts:
-    """Statistics of the messages, for /diagnostics.
-
-    Attributes
-    ----------
-    frames, missing : numbers so far.
-    last : `time.monotonic` of the last message, or of the start.
-    latency_s : of the last message since its capture; NaN for a recording.
-    lost_markers : share of all.
-    """
-
-    def __init__(self) -> None:
-        self.frames = self.missing = 0
-        self.last = time.monotonic()
-        self.latency_s = self.lost_markers = math.nan
-        self._seq: int | None = None
-        self._reported = (self.last, 0, 0)
-
-    def note(self, message: messages.Message) -> None:
-        """Count a message."""
-        status = (message["markers"] or {}).get("status") or []
-        seq, t = message["seq"], message["t"]
-        self.missing += 0 if self._seq is None else max(0, seq - self._seq - 1)
-        self._seq = seq
-        self.latency_s = time.time() - t if t > MIN_UNIX_TIME_S else math.nan
-        self.lost_markers = status.count("lost") / len(status) if status else math.nan
-        self.frames += 1
-        self.last = time.monotonic()
-
-    def report(self) -> dict[str, float]:
-        """Statistics since the last report."""
-        since, frames, missing = self._reported
-        self._reported = (time.monotonic(), self.frames, self.missing)
-        return {
-            "rate, Hz": (self._reported[1] - frames) / max(self._reported[0] - since, 1e-9),
-            "frames missing": self._reported[2] - missing,
-            "latency since capture, ms": self.latency_s * 1e3,
-            "lost markers, share": self.lost_markers,
-        }
+ON_DEMAND = {
+    "image/compressed": "tactflow_picture",
+    "depth": "tactflow_depth",
+    "surface": "tactflow_depth",
+}
+"""Topic -> message that tactflow sends only on subscription."""
 
 
 class Bridge(LifecycleNode):
@@ -124,7 +94,8 @@ class Bridge(LifecycleNode):
             self.declare_parameter(name, default, ParameterDescriptor(description=meaning))
         self._topics: dict[str, Any] = {}
         self._link: Link | None = None
-        self._counts = Counts()
+        self._health = Health()
+        self._unit = messages.PIXELS
         self._run: dict[str, Any] = {}
         self._warned_replay = False
         self.create_service(Trigger, "~/take_reference", self._take_reference)
@@ -151,7 +122,7 @@ class Bridge(LifecycleNode):
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Connect to tactflow, which may start before or after."""
         endpoint, sensor = self.value("endpoint"), self.value("sensor")
-        self._counts, self._run = Counts(), {}
+        self._health, self._run = Health(), {}
         # Publishers first: a message may arrive immediately.
         result = super().on_activate(state)
         try:
@@ -194,6 +165,8 @@ class Bridge(LifecycleNode):
         word = self.value("reliability")
         if word not in ("best_effort", "reliable"):
             raise ValueError(f"reliability: required best_effort or reliable, got {word!r}")
+        if self.value("surface_step") < 1:
+            raise ValueError(f"surface_step: required 1 or more, got {self.value('surface_step')}")
         reliability = QoSReliabilityPolicy[word.upper()]
         qos = QoSProfile(depth=QUEUE_DEPTH, reliability=reliability, durability=QoSDurabilityPolicy.VOLATILE)
         kinds = dict(UNITLESS)
@@ -203,6 +176,10 @@ class Bridge(LifecycleNode):
             self._topics[name] = self.create_lifecycle_publisher(kind, f"~/{name}", qos)
         if self.value("publish_clock"):
             self._topics["/clock"] = self.create_lifecycle_publisher(Clock, "/clock", qos)
+        if self.value("object_frame_id") and TFMessage is None:
+            self.get_logger().warning("no /tf: tf2_msgs is missing; apt install ros-$ROS_DISTRO-tf2-msgs")
+        elif self.value("object_frame_id"):
+            self._topics["/tf"] = self.create_lifecycle_publisher(TFMessage, "/tf", TF_QOS)
         self._topics["/diagnostics"] = self.create_publisher(DiagnosticArray, "/diagnostics", QUEUE_DEPTH)
 
     # -- messages -----------------------------------------------------------------------------------------
@@ -215,10 +192,17 @@ class Bridge(LifecycleNode):
         elif name == "tactflow_picture":
             self._topics["image/compressed"].publish(messages.picture(message, data, frame_id))
         elif name == "tactflow_depth":
-            self._topics["depth"].publish(messages.depth(message, data, frame_id))
+            self._offer("depth", lambda: messages.depth(message, data, frame_id))
+            self._offer("surface", lambda: self._surface(message, data, messages.header(message, frame_id)))
         else:
-            self._counts.note(message)
+            self._health.note(message)
             self._publish(message, messages.header(message, frame_id))
+
+    def _surface(self, message: messages.Message, data: bytes, head: Any) -> PointCloud2 | None:
+        """None until a result has told the scale."""
+        if self._unit is messages.PIXELS:
+            return None
+        return surface(message, data, head, self._unit, self.value("surface_step"))
 
     def _publish(self, message: messages.Message, head: Any) -> None:
         self._warn_replay(message["t"])
@@ -226,11 +210,17 @@ class Bridge(LifecycleNode):
         self._offer("touching", lambda: Bool(data=message["contact"] is not None))
         slip = message.get("slip")
         self._offer("slipping", lambda: None if slip is None else Bool(data=slip["slipping"]))
-        for unit in messages.units(message):
+        units = messages.units(message)
+        self._unit = units[-1]
+        for unit in units:
             for name, (_, make) in GEOMETRY.items():
                 self._offer(name + unit.suffix, lambda make=make, unit=unit: make(message, head, unit))
         self._offer("wrench", lambda: messages.wrench(message, head))
-        self._offer("object_pose", lambda: messages.object_pose(message, head))
+        pose = messages.object_pose(message, head)
+        self._offer("object_pose", lambda: pose)
+        if pose is not None:
+            frame = messages.transform(pose, self.value("object_frame_id"))
+            self._offer("/tf", lambda: TFMessage(transforms=[frame]))
 
     def _offer(self, topic: str, make: Callable[[], Any]) -> None:
         """Create and publish a message, unless the topic has no subscribers or there is nothing to
@@ -242,7 +232,7 @@ class Bridge(LifecycleNode):
                 publisher.publish(message)
 
     def _warn_replay(self, t: float) -> None:
-        if t > MIN_UNIX_TIME_S or self._warned_replay or self.value("use_sim_time"):
+        if t > messages.MIN_UNIX_TIME_S or self._warned_replay or self.value("use_sim_time"):
             return
         self._warned_replay = True
         self.get_logger().warning(
@@ -269,38 +259,26 @@ class Bridge(LifecycleNode):
         link = self._link
         if link is None:
             return
-        link.want(name for name, topic in ON_DEMAND.items() if self._topics[topic].get_subscription_count())
-        level, words = self._condition(link)
-        numbers = self._counts.report() | {"damaged messages": link.damaged}
-        latency = self._run.get("latency_ms") or {}
-        numbers |= {
-            "frames dropped by the run": self._run.get("dropped", math.nan),
-            "latency of the run, p99, ms": latency.get("p99") or math.nan,
-        }
-        if level == DiagnosticStatus.OK and self._counts.lost_markers > MAX_LOST_SHARE:
-            level, words = DiagnosticStatus.WARN, "most markers are lost: take a new reference"
-        status = DiagnosticStatus(
-            level=level,
-            name=f"tactflow: {self.value('sensor')}",
-            message=words,
-            hardware_id=self.value("endpoint"),
-            values=[KeyValue(key=key, value=f"{value:.6g}") for key, value in numbers.items()],
-        )
-        report = DiagnosticArray(status=[status])
+        link.want(sent for topic, sent in ON_DEMAND.items() if self._topics[topic].get_subscription_count())
+        level, words, numbers = self._health.report(self._run)
+        condition = self._condition(link) or (level, words)
+        numbers["damaged messages"] = link.damaged
+        report = diagnostics((*condition, numbers), self.value("sensor"), self.value("endpoint"))
         report.header.stamp = self.get_clock().now().to_msg()
         self._topics["/diagnostics"].publish(report)
 
-    def _condition(self, link: Link) -> tuple[bytes, str]:
+    def _condition(self, link: Link) -> tuple[bytes, str] | None:
+        """Why nothing is received; None if something is."""
         if link.refused is not None:
             return DiagnosticStatus.ERROR, link.refused
-        silent = time.monotonic() - self._counts.last
+        silent = self._health.age
         if silent > self.value("timeout"):
-            since = f"for {silent:.0f} s" if self._counts.frames else "since the start"
+            since = f"for {silent:.0f} s" if self._health.frames else "since the start"
             return DiagnosticStatus.STALE, (
                 f"no message {since}; is tactflow running and publishing there, and is its sensor called "
                 f"{self.value('sensor')}?"
             )
-        return DiagnosticStatus.OK, "receiving"
+        return None
 
 
 def main() -> int:

@@ -17,6 +17,7 @@ from geometry_msgs.msg import (
     Point32,
     PolygonStamped,
     PoseStamped,
+    TransformStamped,
     Vector3Stamped,
     WrenchStamped,
 )
@@ -29,6 +30,8 @@ METRES_PER_MM = 1e-3
 """Metres per millimetre."""
 NANOSECONDS_PER_SECOND = 1_000_000_000
 """Nanoseconds per second."""
+MIN_UNIX_TIME_S = 1e9
+"""Times above this are Unix times of a live source; those of a recording start at 0, s."""
 
 STATUS = {"tracked": 0, "inferred": 1, "lost": 2}
 """Status of a marker -> its number in the cloud."""
@@ -136,6 +139,15 @@ def object_pose(message: Message, head: Header) -> PoseStamped | None:
     return result
 
 
+def transform(pose: PoseStamped, child_frame_id: str) -> TransformStamped:
+    """The same pose as a transform from the frame of the sensor to that of the object."""
+    result = TransformStamped(header=pose.header, child_frame_id=child_frame_id)
+    place, shift = pose.pose.position, result.transform.translation
+    shift.x, shift.y, shift.z = place.x, place.y, place.z
+    result.transform.rotation = pose.pose.orientation
+    return result
+
+
 def flow(message: Message, head: Header, unit: Unit) -> Vector3Stamped | None:
     """Mean displacement of the gel in contact."""
     mean = message["flow"] and message["flow"]["mean"]
@@ -191,14 +203,26 @@ def markers(message: Message, head: Header, unit: Unit) -> PointCloud2 | None:
 
 
 def wrench(message: Message, head: Header) -> WrenchStamped | None:
-    """Force on the gel; components unknown to the calibration are NaN."""
+    """Force on the gel, acting at the centre of the contact, and its torque about the origin of the frame.
+
+    Components that are not known are NaN: shear and twist without a calibration of the shear, every torque
+    if no contact is found.
+    """
     force = message.get("force")
     if force is None:
         return None
     result = WrenchStamped(header=head)
-    x, y, pressed = (math.nan if part is None else float(part) for part in force["value"])
+    x, y, pressed, twist = (
+        math.nan if part is None else float(part) for part in (*force["value"], force.get("torque"))
+    )
     # Pressing is negative because z points out of the gel.
     result.wrench.force.x, result.wrench.force.y, result.wrench.force.z = x, y, -pressed
+    contact, metres = message["contact"], units(message)[-1]
+    known = contact is not None and metres is not PIXELS
+    ((at_x, at_y),) = metres.places(contact["center"] if known else (math.nan, math.nan)).tolist()
+    torque = result.wrench.torque
+    torque.x, torque.y = -at_y * pressed, at_x * pressed
+    torque.z = at_x * y - at_y * x + twist * METRES_PER_MM
     return result
 
 
