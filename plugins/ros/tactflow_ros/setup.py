@@ -15,8 +15,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/launch", ["launch/tactflow.launch.py"]),
-        (f"share/{NAME}/config", ["config/tactflow.yaml"]),
+        (f"share/{NAME}/launch", ["launch/tactflow.launch.py", "launch/two_sensors.launch.py"]),
+        (f"share/{NAME}/config", ["config/tactflow.yaml", "config/two_sensors.rviz"]),
     ],
     install_requires=["setuptools", "numpy", "pyzmq"],
     extras_require={"test": ["pytest"]},

@@ -22,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
 
 NODE = "/left/tactflow"
 TELLING = threading.Lock()
@@ -41,7 +42,9 @@ TOPICS = {
     "wrench": WrenchStamped,
     "object_pose": PoseStamped,
     "depth": Image,
+    "surface": PointCloud2,
     "image/compressed": CompressedImage,
+    "/tf": TFMessage,
     "/diagnostics": DiagnosticArray,
     "/clock": Clock,
     "/hold/width": Float64,
@@ -73,8 +76,9 @@ def configure(overrides: dict[str, Any]) -> None:
     activated = node.trigger_activate() if configured.name == "SUCCESS" else None
     condition = service = None
     if activated is not None and activated.name == "SUCCESS":
-        while (condition := node._condition(node._link)[1]) == "receiving":
+        while (reason := node._condition(node._link)) is None:
             time.sleep(0.02)
+        condition = reason[1]
         service = node._take_reference(Trigger.Request(), Trigger.Response()).message
     node.disconnect()
     node.destroy_node()
@@ -89,7 +93,7 @@ def main() -> None:
     for topic, kind in TOPICS.items():
         name = topic if topic.startswith("/") else f"{NODE}/{topic}"
         # What is sent to be received in full is asked for in full.
-        qos = 10 if topic in ("/diagnostics", "/hold/width") else qos_profile_sensor_data
+        qos = 10 if topic in ("/diagnostics", "/hold/width", "/tf") else qos_profile_sensor_data
 
         def receive(message: Any, topic: str = topic) -> None:
             tell(topic=topic, at=time.monotonic_ns(), message=plain(message))

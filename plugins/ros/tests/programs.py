@@ -27,7 +27,8 @@ needs_rclpy = pytest.mark.skipif(not PYTHON.exists(), reason="rclpy is not here:
 def environment() -> dict[str, str]:
     """For programs that shall find each other and nobody else."""
     return os.environ | {
-        "PYTHONPATH": str(PACKAGE),
+        # The stand-in for tf2_msgs is here.
+        "PYTHONPATH": os.pathsep.join([str(PACKAGE), str(Path(__file__).parent)]),
         "ROS_DOMAIN_ID": str(os.getpid() % 100),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }

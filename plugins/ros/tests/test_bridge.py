@@ -6,6 +6,7 @@ import json
 import math
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ import numpy as np
 import pytest
 
 from plugins.ros.tests.programs import Program, needs_rclpy
-from tactflow.engine.frame import Frame, Tick
+from tactflow.engine.frame import Frame
+from tactflow.message.result import Result
 from tactflow.network.keys import make_keys
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Contact, Depth, Flow, Force, Markers, Pose, Scale, Slip
 from tests.clock import until
-from tests.messages import Results, result_of
+from tests.messages import Results
 from tests.paths import REPOSITORY
 from tests.sinks.test_view import fake_run
 
@@ -67,6 +69,7 @@ class Pair:
         self.bridge = Program("-m", "tactflow_ros", *NODE, *options)
         self.listener.told(lambda told: "ready" in told)
         self._results = RESULTS
+        self.reasons: dict[str, str] = {}
         self._seq = 0
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._publish)
@@ -89,7 +92,7 @@ class Pair:
         """A frame every 20 ms, as a camera would."""
         while not self._end.wait(0.02):
             frame = Frame("left", self._seq, T + self._seq / 50, IMAGE)
-            self.sink.write(result_of(Tick(frame), self._results))
+            self.sink.write(Result(frame, self._results._asdict(), self.reasons))
             self._seq += 1
 
     def receive(self, topic: str, results: Results = RESULTS) -> dict[str, Any]:
@@ -177,6 +180,9 @@ def test_touch_slip_force_depth_and_picture_arrive(pair: Pair) -> None:
     force = pair.receive("wrench")["wrench"]["force"]
     assert math.isnan(force["x"])
     assert force["z"] == -2.5
+    torque = pair.receive("wrench")["wrench"]["torque"]
+    assert (torque["x"], torque["y"]) == pytest.approx((0.003 * -2.5, -0.002 * -2.5))
+    assert math.isnan(torque["z"])
     pose = pair.receive("object_pose")["pose"]
     assert list(pose["position"].values()) == pytest.approx([1.5e-3, 2e-3, -0.25e-3])
     assert list(pose["orientation"].values()) == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
@@ -187,6 +193,54 @@ def test_touch_slip_force_depth_and_picture_arrive(pair: Pair) -> None:
     picture = pair.receive("image/compressed")
     assert picture["format"] == "jpeg"
     assert bytes(picture["data"][:2]) == b"\xff\xd8"
+
+
+@needs_rclpy
+def test_a_wrench_has_the_torque_about_the_origin_of_the_frame(pair: Pair) -> None:
+    force = Force((0.5, -0.25, 2.5), (0.1, 0.1, 0.1), True, torque=4.0)
+    wrench = pair.receive("wrench", RESULTS._replace(force=force))["wrench"]
+    at, along, twist = np.array([0.002, 0.003, 0]), np.array([0.5, -0.25, -2.5]), np.array([0, 0, 0.004])
+    assert list(wrench["force"].values()) == pytest.approx(along)
+    assert list(wrench["torque"].values()) == pytest.approx(np.cross(at, along) + twist)
+    # A soft object that covers all of the gel has no outline.
+    torque = pair.receive("wrench", RESULTS._replace(contact=None, flow=None))["wrench"]["torque"]
+    assert np.isnan(list(torque.values())).all()
+
+
+@needs_rclpy
+def test_the_surface_is_a_cloud_with_normals(pair: Pair) -> None:
+    cloud = pair.receive("surface")
+    assert (cloud["width"], cloud["height"], cloud["header"]["frame_id"]) == (30, 20, "gel")
+    assert [field["name"] for field in cloud["fields"]] == ["x", "y", "z", "normal_x", "normal_y", "normal_z"]
+    x, y, z, *normal = np.frombuffer(bytes(cloud["data"]), np.float32).reshape(20, 30, 6).transpose(2, 0, 1)
+    rows, columns = np.mgrid[:40:2, :60:2]
+    assert x == pytest.approx((columns - 10) * 1e-4)
+    assert y == pytest.approx((rows - 5) * 2e-4)
+    assert z == pytest.approx(HEIGHTS[::2, ::2] * -1e-3)
+    # The depth grows by as much from pixel to pixel everywhere; pixels are 0.1 mm wide and 0.2 mm high.
+    step = 1 / (40 * 60 - 1)
+    slopes = np.array([step / 0.1, 60 * step / 0.2, 1])
+    expected = slopes / np.linalg.norm(slopes)
+    assert np.dstack(normal) == pytest.approx(np.broadcast_to(expected, (20, 30, 3)), abs=1e-4)
+    flat = np.frombuffer(bytes(pair.receive("surface", without_contact(RESULTS))["data"]), np.float32)
+    assert (flat.reshape(-1, 6)[:, 2:] == [0, 0, 0, 1]).all()
+
+
+@needs_rclpy
+def test_the_pose_of_the_object_is_a_transform_while_it_is_tracked(pair: Pair) -> None:
+    told = pair.receive("/tf")
+    assert (told["header"]["frame_id"], told["child_frame_id"]) == ("gel", "tactile_object")
+    assert list(told["transform"]["translation"].values()) == pytest.approx([1.5e-3, 2e-3, -0.25e-3])
+    assert list(told["transform"]["rotation"].values()) == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
+
+
+@needs_rclpy
+def test_without_the_messages_of_tf_the_bridge_runs_and_says_what_to_install() -> None:
+    program = "import sys; sys.modules['tf2_msgs'] = None; from tactflow_ros.__main__ import main; main()"
+    bridge = Program("-c", program)
+    until(lambda: any("sensor main from" in line for line in bridge.complaints))
+    bridge.end()
+    assert any("no /tf: tf2_msgs is missing; apt install" in line for line in bridge.complaints)
 
 
 @needs_rclpy
@@ -230,7 +284,25 @@ def test_the_diagnostics_tell_rate_drops_and_lost_markers(pair: Pair) -> None:
     (status,), values = report["status"], numbers(report)
     assert (status["name"], status["message"]) == ("tactflow: left", "receiving")
     assert values["lost markers, share"] == 0.5
+    assert 0 <= values["age of the last message, s"] < 0.5
     assert {"latency of the run, p99, ms", "frames dropped by the run", "damaged messages"} <= values.keys()
+
+
+@needs_rclpy
+def test_the_diagnostics_warn_of_damaged_pictures_and_of_lost_markers(pair: Pair) -> None:
+    def warned(told: dict[str, Any], words: str) -> bool:
+        return told.get("topic") == "/diagnostics" and words in told["message"]["status"][0]["message"]
+
+    before = numbers(pair.receive("/diagnostics"))["new references so far"]
+    pair.reasons = {"contact": "damaged", "reference": "light_changed"}
+    report = pair.listener.told(lambda told: warned(told, "most pictures are damaged: check the camera"))
+    pair.reasons = {}
+    found = numbers(report["message"])
+    assert 0.5 < found["damaged pictures, share"] <= 1
+    assert found["new references so far"] > before
+    pair.receive("touching", RESULTS._replace(markers=replace(MARKERS, status=np.full(2, 2, np.uint8))))
+    pair.listener.told(lambda told: warned(told, "most markers are lost: take a new reference"))
+    pair.receive("touching")
 
 
 def numbers(report: dict[str, Any]) -> dict[str, float]:
@@ -277,6 +349,7 @@ def test_the_service_takes_a_new_reference_in_the_run(pair: Pair) -> None:
     ("parameters", "state", "words"),
     [
         ({"reliability": "perhaps"}, "configured", "required best_effort or reliable, got 'perhaps'"),
+        ({"surface_step": 0}, "configured", "surface_step: required 1 or more, got 0"),
         ({"endpoint": "nowhere"}, "activated", "required an address such as tcp://127.0.0.1:5556"),
         ({"keys": "/nowhere"}, "activated", "tactflow keys new creates such a folder"),
     ],

@@ -18,13 +18,28 @@ def sources() -> list[str]:
     return [line.strip() for file in PACKAGE.glob("*/*.py") for line in file.read_text().splitlines()]
 
 
-def parameters() -> dict[str, tuple[Any, str]]:
-    """`PARAMETERS` of the bridge, without the rclpy that its module imports."""
+def assigned(name: str) -> ast.expr:
+    """The value of a constant of the bridge, without the rclpy that its module imports."""
     for statement in ast.parse((PACKAGE / "tactflow_ros" / "bridge.py").read_text()).body:
-        if isinstance(statement, ast.AnnAssign) and ast.unparse(statement.target) == "PARAMETERS":
+        if isinstance(statement, ast.AnnAssign) and ast.unparse(statement.target) == name:
             assert statement.value is not None
-            return cast(dict[str, tuple[Any, str]], ast.literal_eval(statement.value))
-    raise AssertionError("the bridge has no PARAMETERS")
+            return statement.value
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == name:
+            return statement.value
+    raise AssertionError(f"the bridge has no {name}")
+
+
+def parameters() -> dict[str, tuple[Any, str]]:
+    """`PARAMETERS` of the bridge."""
+    return cast(dict[str, tuple[Any, str]], ast.literal_eval(assigned("PARAMETERS")))
+
+
+def declared(name: str) -> dict[str, str]:
+    """Topic -> name of its type."""
+    value = assigned(name)
+    assert isinstance(value, ast.Dict)
+    keys = [ast.literal_eval(key) for key in value.keys if key is not None]
+    return dict(zip(keys, map(ast.unparse, value.values), strict=True))
 
 
 def test_the_package_names_what_is_there_and_all_that_it_needs() -> None:
@@ -33,7 +48,11 @@ def test_the_package_names_what_is_there_and_all_that_it_needs() -> None:
     assert package.findtext("export/build_type") == "ament_python"
     setup = (PACKAGE / "setup.py").read_text()
     assert f'version="{package.findtext("version")}"' in setup
-    for file in ("config/tactflow.yaml", "launch/tactflow.launch.py", "package.xml"):
+    files = [
+        f"{folder}/{file.name}" for folder in ("config", "launch") for file in PACKAGE.glob(f"{folder}/*.*")
+    ]
+    assert len(files) == 4
+    for file in (*files, "package.xml"):
         assert file in setup
         assert (PACKAGE / file).exists()
     assert (PACKAGE / "resource" / "tactflow_ros").exists()

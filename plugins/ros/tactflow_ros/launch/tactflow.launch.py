@@ -13,6 +13,8 @@ ARGUMENTS = {
     "control": "address for tactflow's commands",
     "keys": "folder of the subscriber, from tactflow keys new",
     "frame_id": "frame of the picture",
+    "object_frame_id": "frame of the object on /tf",
+    "surface_step": "every how many pixels the topic surface has a point",
     "reliability": "best_effort or reliable",
     "use_sim_time": "true for recordings",
     "publish_clock": "true to publish /clock",
@@ -23,10 +25,12 @@ ARGUMENTS = {
 def start(context: LaunchContext) -> list[LifecycleNode]:
     """Create the node with the parameters of the file, overridden by the arguments."""
     arguments = context.launch_configurations
-    overrides: dict[str, str | bool] = {name: arguments[name] for name in ARGUMENTS if arguments[name]}
+    overrides: dict[str, str | bool | int] = {name: arguments[name] for name in ARGUMENTS if arguments[name]}
     for name in ("use_sim_time", "publish_clock"):
         if name in overrides:
             overrides[name] = overrides[name] == "true"
+    if "surface_step" in overrides:
+        overrides["surface_step"] = int(overrides["surface_step"])
     sensor = arguments["sensor"]
     node = LifecycleNode(
         package="tactflow_ros",

@@ -48,7 +48,10 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "control": ("", "sinks.zmq.control, for the service ~/take_reference; empty disables it"),
     "keys": ("", "folder of the subscriber, from tactflow keys new; empty for no keys"),
     "frame_id": ("tactile_optical_frame", "frame of the picture: x right, y down, z out of the gel"),
-    "object_frame_id": ("tactile_object", "frame of the object on /tf while its pose is tracked; empty: none"),
+    "object_frame_id": (
+        "tactile_object",
+        "frame of the object on /tf while it is tracked; empty: none",
+    ),
     "surface_step": (2, "every how many pixels the topic surface has a point"),
     "reliability": ("best_effort", "of the topics: best_effort or reliable"),
     "timeout": (2.0, "time without a message before /diagnostics reports it, s"),
