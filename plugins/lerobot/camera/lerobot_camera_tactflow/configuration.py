@@ -46,7 +46,7 @@ class TactflowCameraConfig(CameraConfig):
     depth_mm : depth that becomes 255, mm; a smaller one gives finer steps.
     realtime : play a recording at its own pace, like a camera. Otherwise the next frame waits until all
         cameras have read the last one, and no frame is dropped.
-    timeout_s : longest wait for the first frame, s; the very first run compiles for a minute.
+    timeout_s : longest wait for the first frame, s; a camera needs some seconds, a loaded computer more.
     """
 
     source: str
