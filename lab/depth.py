@@ -91,7 +91,8 @@ def read(balls: Balls, data: Path) -> tuple[Session, list[str]]:
         hidden = result.get("marker_mask", np.zeros_like(mask)) > 0
         radius = float(np.sqrt(np.count_nonzero(mask) / np.pi))
         image = result.get("unmarked", result.image)
-        presses.append(Press(result.seq, image, mask, hidden, contact.center, radius))
+        core_radius = float(np.sqrt((contact.core_area or np.nan) / np.pi))
+        presses.append(Press(result.seq, image, mask, hidden, contact.center, radius, core_radius))
         names.append(pictures[result.seq].name)
     mapping = first["mapping"]
     return Session(untouched, mapping, presses, np.zeros((0, 2)), len(pictures)), names

@@ -10,7 +10,7 @@ from pydantic import Field
 from tactflow.engine.contract import Stage
 from tactflow.engine.frame import Frame
 from tactflow.parameters import GelParams
-from tactflow.ports import ContactMask, Deviations, Touching, Unmarked, Valid
+from tactflow.ports import ContactMask, CoreMask, Deviations, Touching, Unmarked, Valid
 from tactflow.vision.contact import ContactDetector
 from tactflow.vision.contact.reference import ReferenceCheck
 
@@ -23,11 +23,13 @@ class ContactPorts(NamedTuple):
     contact_mask : 255 in contact.
     touching : whether anything is.
     deviations : the changes behind the mask; None without contact.
+    core_mask : 255 where the gel clings to the object; None without contact.
     """
 
     contact_mask: ContactMask
     touching: Touching
     deviations: Deviations | None = None
+    core_mask: CoreMask | None = None
 
 
 class Difference(Stage):
@@ -66,7 +68,7 @@ class Difference(Stage):
             gt=0,
             lt=1,
             description="slope of the gel at the outline, as a fraction of the steepest nearby: 0.55 is the "
-            "outer edge of the imprint, 0.85 about where the gel clings to the object",
+            "outer edge of the imprint, 0.85 about where the gel clings to the object, as for core_area",
         )
         patience: int = Field(
             30,
@@ -107,7 +109,7 @@ class Difference(Stage):
         result = self._detector.detect(unmarked)
         if not result.touching or self._check is None or not self._check.was_touched(unmarked, result.mask):
             self._doubted = 0
-            return ContactPorts(result.mask, result.touching, result.deviations)
+            return ContactPorts(result.mask, result.touching, result.deviations, result.core)
         self._doubted += 1
         if self._doubted == self.params.patience > 0:
             self.wants_reference = "reference_touched"

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
-from tactflow.ports import ContactMask, Deviations
+from tactflow.ports import ContactMask, CoreMask, Deviations
 from tactflow.vision.contact.certainty import with_probability, without_doubtful
 from tactflow.vision.geometry.hull import contact_geometry, contact_parts
 from tactflow.vision.types import Contact, Evidence
@@ -54,14 +54,18 @@ class Hull(Stage):
         contact_mask: ContactMask,
         evidence: Evidence | None = None,
         deviations: Deviations | None = None,
+        core_mask: CoreMask | None = None,
     ) -> Contact | Absent:
         """Geometry of the contact, or Absent("no_contact") where the mask holds none."""
         params = self.params
+        # The dots show no edge of the imprint, and so no core.
+        core = None if evidence == "dots" else core_mask
         parts = contact_parts(
             contact_mask,
             min_area=params.min_area,
             min_confidence=params.min_confidence,
             evidence=evidence or "light",
+            core=core,
         )
         if not parts:
             return Absent("no_contact")
@@ -73,7 +77,9 @@ class Hull(Stage):
         if params.merge == "all":
             probable, mask = without_doubtful(parts, contact_mask)
             contact = probable[0]
-            whole = contact_geometry(mask, min_area=params.min_area, min_confidence=params.min_confidence)
+            whole = contact_geometry(
+                mask, min_area=params.min_area, min_confidence=params.min_confidence, core=core
+            )
             if whole is not None:
                 contact = replace(whole, evidence=contact.evidence, probability=contact.probability)
         return replace(contact, separate=tuple(parts))

@@ -29,7 +29,10 @@ Untouched = Annotated[NDArray[np.uint8], ArrayPort("untouched", ("H", "W", 3), "
 """The untouched gel without its markers; the same array for a whole epoch."""
 
 ContactMask = Annotated[NDArray[np.uint8], ArrayPort("contact_mask", ("H", "W"), "uint8", "0 or 255")]
-"""255 where something touches the gel."""
+"""255 where something touches the gel: within the outer edge of its imprint."""
+
+CoreMask = Annotated[NDArray[np.uint8], ArrayPort("core_mask", ("H", "W"), "uint8", "0 or 255")]
+"""255 where the gel clings to what touches it, inside the contact mask; 0 where that is not known."""
 
 Deviations = Annotated[NDArray[np.float32], ArrayPort("deviations", (2, "h", "w"), "float32", "variances")]
 """Squared change of each cell of 4 x 4 px, of its light and of its colour alone, in variances of noise."""

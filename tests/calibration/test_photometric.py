@@ -11,6 +11,7 @@ import pytest
 from tactflow.calibration.photometric import Photometry, fit_photometry
 from tactflow.calibration.presses import Session
 from tactflow.calibration.samples import press_errors, summary
+from tactflow.calibration.words import photometric_words
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 from tactflow.vision.depth.surface import Rest, Surface
@@ -54,6 +55,22 @@ def test_errors_on_presses_that_were_not_learned_from_are_part_of_the_result(lea
     found = learned.found
     assert 0 < found.normal_error < 2
     assert 0 < found.depth_stderr < 0.1
+
+
+def test_the_radius_at_which_the_gel_leaves_the_ball_is_found(session: Session) -> None:
+    scene = open_scene("ball?frames=500")
+    clings = [replace(p, core_radius=scene.presses(p.seq)[0].radius / 2) for p in session.presses]
+    known = replace(session, presses=clings)
+    ratio = fit_photometry(known, SCALE, BALL).found.core_ratio
+    assert ratio == pytest.approx(1.0, abs=0.05)
+    assert "1.50 times the radius" in photometric_words(
+        {"normal_error": 1, "depth_stderr": 0, "core_ratio": 1.5}
+    )
+
+
+def test_without_a_core_nothing_is_said_of_it(learned: Photometry) -> None:
+    assert learned.found.core_ratio is None
+    assert "core" not in photometric_words(learned.found.model_dump())
 
 
 @pytest.mark.parametrize(("scene", "worst"), [("press?seed=11", 0.03), ("cable?seed=11", 0.04)])

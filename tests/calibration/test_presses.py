@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -41,6 +44,19 @@ def test_pictures_of_presses_at_one_place_are_presses_of_their_own_and_frames_of
     for seq, (x, radius) in enumerate(CONTACTS, 1):
         finder.add(result(seq, x, radius))
     assert [press.seq for press in finder.presses] == expected
+
+
+def test_a_press_has_the_radius_of_its_core_where_that_is_known() -> None:
+    finder = PressFinder()
+    finder.add(result(0))
+    for seq, area in enumerate((100 * math.pi, None), 1):
+        touched = result(seq, 40 * seq)
+        assert touched.contact is not None
+        ports = {name: touched[name] for name in ("image", "contact_mask")} | {
+            "contact": replace(touched.contact, core_area=area)
+        }
+        finder.add(Result(touched.frame, ports))
+    assert [press.core_radius for press in finder.presses] == pytest.approx([10, math.nan], nan_ok=True)
 
 
 @pytest.mark.parametrize(("brighter", "presses"), [(2, 2), (20, 1)])

@@ -283,11 +283,22 @@ def test_a_calibrated_message_has_millimetres_and_with_detail_their_errors() -> 
     )
 
 
+def test_the_area_of_the_core_is_sent_where_it_is_known() -> None:
+    known = replace(CONTACT, core_area=4000.0)
+    results = Results(PROCESSED, known, scale=Scale(0.1, 0.2, (0.0, 0.0), (0.0, 0.0)))
+    message = build_message(TICK, results)
+    VALIDATOR.validate(message)
+    assert (message["contact"]["core_area"], message["contact"]["core_area_mm2"]) == (4000, 80)
+    unknown = build_message(TICK, results._replace(contact=CONTACT))
+    VALIDATOR.validate(unknown)
+    assert {"core_area", "core_area_mm2"}.isdisjoint(unknown["contact"])
+
+
 def test_a_message_is_read_back_as_the_result_it_was_made_of() -> None:
     depth = Depth(np.zeros((400, 300), np.float32), 0.75, 0.03, 4.5, None)
     results = Results(
         PROCESSED,
-        replace(CONTACT, separate=(CONTACT, replace(CONTACT, ellipse=None))),
+        replace(CONTACT, core_area=4000.0, separate=(CONTACT, replace(CONTACT, ellipse=None))),
         *(FLOW, MARKERS, Scale(0.1, 0.2, (0.0, 0.0), (5.0, 9.0)), depth),
         force=FORCE,
     )

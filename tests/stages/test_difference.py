@@ -33,10 +33,10 @@ def _touched() -> tuple[Image, Image]:
 def test_a_touched_gel_is_told_from_the_reference_or_else_from_the_first_frame(marked: bool) -> None:
     untouched, touched = _touched()
     stage = _stage()
-    mask, touching, _ = stage.process(untouched, _frame(untouched, 0, reference=marked))
+    mask, touching, *_ = stage.process(untouched, _frame(untouched, 0, reference=marked))
     assert not touching
     assert not mask.any()
-    mask, touching, _ = stage.process(touched, _frame(touched, 1))
+    mask, touching, *_ = stage.process(touched, _frame(touched, 1))
     assert touching
     assert mask.shape == touched.shape[:2]
     assert set(np.unique(mask)) == {0, 255}

@@ -45,6 +45,20 @@ def two() -> NDArray[np.uint8]:
     return mask
 
 
+def test_the_core_has_an_area_of_its_own_where_it_is_known() -> None:
+    stage, core = Hull(Hull.Params()), two()
+    core[:25] = 0
+    contact = stage.process(two(), "light", None, core)
+    assert isinstance(contact, Contact)
+    assert [part.core_area for part in contact.separate] == [250, 25]
+    # From the left end of one to the right end of the other.
+    assert contact.core_area == 5 * 75
+    for evidence, known in (("dots", core), ("light", None), ("light", np.zeros_like(core))):
+        unknown = stage.process(bar(), evidence, None, known)
+        assert isinstance(unknown, Contact)
+        assert unknown.core_area is None
+
+
 @pytest.mark.parametrize(("params", "right"), [({}, 84), ({"merge": "largest"}, 59)], ids=str)
 def test_separate_contacts_are_told_whatever_the_contact_is(params: Any, right: int) -> None:
     contact = run(two(), **params)

@@ -79,6 +79,7 @@ class PhotometricEntry(_Entry):
     balls, relative; for people, since the errors of a height map are those of `SurfaceErrors`. between : the
     part of it that is the difference of sensors of the kind. steepest : see `SurfaceErrors`. explained :
     share of the slopes of a ball that the fit explains, see `Misfit`; None in files of earlier versions.
+    core_ratio : radius of a contact's core over that at which the gel leaves the ball; None where unknown.
     """
 
     ball_radius: float = Field(gt=0)
@@ -89,6 +90,7 @@ class PhotometricEntry(_Entry):
     between: float = 0.0
     steepest: float | None = None
     explained: float | None = None
+    core_ratio: float | None = None
 
     def errors(self) -> SurfaceErrors:
         """The basis of the standard errors of heights."""

@@ -34,7 +34,7 @@ from tactflow.calibration.judgement import (
     check_presses,
 )
 from tactflow.calibration.presses import Session
-from tactflow.calibration.samples import TURNS, Sample, errors_on, prepared, shaped, summary
+from tactflow.calibration.samples import TURNS, Sample, core_ratio, errors_on, prepared, shaped, summary
 from tactflow.vision.arrays import Floats
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel
 from tactflow.vision.types import Scale
@@ -139,6 +139,7 @@ def fit_photometry(session: Session, scale: Scale, ball_radius: float | Sequence
         steepest=max(samples[i].reach / samples[i].ball_radius for i in good),
         # What few presses leave open is nearly the same in all frames.
         between=errors["depth_stderr"] if len(good) < FEWEST_PRESSES else 0.0,
+        core_ratio=core_ratio(session, samples, good.tolist(), weights, scale),
         **errors,
     )
     check_error(found)

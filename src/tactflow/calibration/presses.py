@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -42,6 +43,7 @@ class Press:
     hidden : (H, W) bool, where a marker was.
     center : (x, y) of the contact, px.
     radius : of a disc of its area, px.
+    core_radius : of a disc of the area of its core, px; NaN where that is not known.
     """
 
     seq: int
@@ -50,6 +52,7 @@ class Press:
     hidden: NDArray[np.bool_]
     center: tuple[float, float]
     radius: float
+    core_radius: float = math.nan
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -124,7 +127,8 @@ class PressFinder:
         mask = result.contact_mask
         hidden: Picture = result.get("marker_mask", np.zeros_like(mask))
         radius = float(np.sqrt(np.count_nonzero(mask) / np.pi))
-        self._add(Press(frame.seq, unmarked, mask, hidden > 0, result.contact.center, radius))
+        core_radius = math.sqrt((result.contact.core_area or math.nan) / math.pi)
+        self._add(Press(frame.seq, unmarked, mask, hidden > 0, result.contact.center, radius, core_radius))
 
     def _drop_presses_of_another_look(self, before: Picture) -> None:
         """Drop the presses so far if the gel looked different `before` the new reference."""

@@ -14,7 +14,17 @@ from tactflow.calibration.file import Calibration, PhotometricEntry
 from tactflow.calibration.judgement import LEAST_EXPLAINED, check_error, check_explained, check_presses
 from tactflow.calibration.photometric import RIDGE, Photometry, fit_photometry, left_out
 from tactflow.calibration.presses import Session
-from tactflow.calibration.samples import TURNS, Misfit, Sample, errors_on, flat, prepared, shaped, summary
+from tactflow.calibration.samples import (
+    TURNS,
+    Misfit,
+    Sample,
+    core_ratio,
+    errors_on,
+    flat,
+    prepared,
+    shaped,
+    summary,
+)
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.arrays import Floats
 from tactflow.vision.depth.slopes import SlopeModel
@@ -97,6 +107,7 @@ def _refinement(
             before.steepest or 0.0, *(samples[i].reach / samples[i].ball_radius for i in good.tolist())
         ),
         between=before.between * SHARE_AFTER_ONE_PRESS / math.sqrt(len(good)),
+        core_ratio=core_ratio(session, samples, good.tolist(), weights, scale),
         **errors,
     )
     pixels = centers / (scale.x, scale.y) + scale.origin

@@ -35,6 +35,11 @@ TURNS: Final = 3
 RINGS: Final = (0.25, 0.5, 0.75, 1.0)
 """Inner and outer limit of two rings around the middle of a press, in parts of `reach`: how the slope grows
 from one to the other tells the shape."""
+EDGE_SLOPE_RATIO: Final = 0.7
+"""Slope over that of the ball at the edge where the gel leaves it: on a half-space it is 0.7 at 1.05 radii of
+the contact (Hertz); a thin layer is flat outside, and the blurred step has half of it at the edge."""
+EDGE_RINGS: Final = 16
+"""Rings within `reach` on which the slope is averaged to find the edge: about a pixel at half resolution."""
 FEWEST_PIXELS: Final = 12
 """Least number of pixels at half resolution inside a contact to judge its depth. Chosen by hand."""
 RIM: Final = 6
@@ -142,6 +147,34 @@ class Sample:
         if min(slopes) <= 0:
             return math.nan
         return math.log(slopes[1] / slopes[0]) / math.log(places[1] / places[0])
+
+    def profile(self, center: Floats, weights: Floats) -> tuple[Floats, Floats]:
+        """Mean distance from the middle, mm, and median fitted slope of rings around it, (k,) each.
+
+        The slope is the horizontal part of the normals, outwards. The rings reach up to the border of the
+        window.
+        """
+        shown = ~self.hidden
+        away = np.stack([self.x[shown], self.y[shown]], axis=1) - center
+        distance = np.hypot(away[:, 0], away[:, 1])
+        outward = np.sum(self.normals(weights, shown) * away, axis=1) / np.maximum(distance, 1e-9)
+        ring = (distance / self.reach * EDGE_RINGS).astype(np.int64)
+        rings = [ring == number for number in np.flatnonzero(np.bincount(ring) >= FEWEST_PIXELS)]
+        slopes = np.array([np.median(outward[members]) for members in rings])
+        return np.array([distance[members].mean() for members in rings]), slopes
+
+    def edge(self, center: Floats, weights: Floats) -> float:
+        """Distance from the middle at which the gel leaves the ball, mm; see `EDGE_SLOPE_RATIO`.
+
+        NaN where the slope does not fall so far in the window of the press.
+        """
+        places, slopes = self.profile(center, weights)
+        ratios = slopes / np.minimum(places / self.ball_radius, 1.0)
+        past = np.flatnonzero((ratios < EDGE_SLOPE_RATIO) & (places > self.reach / 2))
+        if not past.size:
+            return math.nan
+        last = slice(max(past[0] - 1, 0), past[0] + 1)
+        return float(np.interp(-EDGE_SLOPE_RATIO, -ratios[last], places[last]))
 
     def misfit(self, center: Floats, weights: Floats) -> Misfit:
         """Compare the fitted normals with those of the ball."""
@@ -251,6 +284,21 @@ def summary(errors: Sequence[Sequence[float]]) -> dict[str, float]:
         "depth_stderr": float(np.sqrt(np.nanmean(depth**2))),
         "explained": float(np.median(explained)),
     }
+
+
+def core_ratio(
+    session: Session, samples: Sequence[Sample], chosen: Iterable[int], weights: Floats, scale: Scale
+) -> float | None:
+    """Radius of the core over that at which the gel leaves the ball, median of the chosen presses.
+
+    None where no press shows both. The other parameters are those of `errors_on`.
+    """
+    ratios = []
+    for number in chosen:
+        sample, core = samples[number], session.presses[number].core_radius * math.sqrt(scale.x * scale.y)
+        ratios.append(core / sample.edge(sample.center(sample.start, weights), weights))
+    known = [ratio for ratio in ratios if math.isfinite(ratio)]
+    return float(np.median(known)) if known else None
 
 
 def upright(flat: Floats) -> Floats:

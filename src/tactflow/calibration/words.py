@@ -23,10 +23,13 @@ def photometric_words(errors: Mapping[str, float]) -> str:
     >>> photometric_words({"normal_error": 3.21, "depth_stderr": 0.1})
     'normals 3.2 degrees off in the mean, standard error of the depth 10 %'
     """
-    return (
+    words = (
         f"normals {errors['normal_error']:.1f} degrees off in the mean, "
         f"standard error of the depth {100 * errors['depth_stderr']:.0f} %"
     )
+    if ratio := errors.get("core_ratio"):
+        words += f"; core_area has {ratio:.2f} times the radius of the disc where the gel clings to the ball"
+    return words
 
 
 def force_words(fit: Fit, readings: Mapping[str, Reference]) -> list[str]:

@@ -205,7 +205,7 @@ class SeparateContact(Part):
     """Geometry of a contact."""
 
     of = types.Contact
-    area: NotNegative = sent("of the convex hull", "px^2")
+    area: NotNegative = sent("of the convex hull of the imprint, up to its outer edge", "px^2")
     center: Point = sent("centroid of the contact region", "px")
     angle: Angle | None = sent(
         "principal axis, counter-clockwise as seen", "degrees", null="without a direction"
@@ -221,6 +221,11 @@ class SeparateContact(Part):
     probability: Share | None = sent(
         "of being a contact; below 0.5 it is unsure (absent if not known)", if_known=True
     )
+    core_area: NotNegative | None = sent(
+        "of the convex hull of the core, where the gel clings to the object (absent if not known)",
+        "px^2",
+        if_known=True,
+    )
     center_mm: Point | None = sent(
         "center from the scale's origin",
         "mm",
@@ -229,6 +234,15 @@ class SeparateContact(Part):
     )
     area_mm2: NotNegative | None = sent(
         "area", "mm^2", needs=("scale",), value=lambda contact, result: result.scale.area(contact.area)
+    )
+    core_area_mm2: NotNegative | None = sent(
+        "core_area",
+        "mm^2",
+        needs=("scale",),
+        if_known=True,
+        value=lambda contact, result: (
+            None if contact.core_area is None else result.scale.area(contact.core_area)
+        ),
     )
     confidence: Share = sent("of the direction: 0 a disc, towards 1 a line", needs=("detail",))
     center_mm_stderr: Point | None = sent(

@@ -55,7 +55,7 @@ class Contact:
 
     Attributes
     ----------
-    area : of the convex hull, px^2, >= 0.
+    area : of the convex hull of the imprint up to its outer edge, px^2, >= 0.
     center : centroid (x, y) of the contact region itself, px.
     angle : principal axis of the region, degrees in (-90, 90]; None where the region has no direction.
     slope : dy/dx of that axis in image coordinates (y down), -tan(angle); None where vertical or
@@ -68,6 +68,8 @@ class Contact:
     probability : of being a contact, 0 to 1; None where that is not known.
     separate : every separate contact of the frame, that with the most pixels first; empty where there is
         only this one.
+    core_area : of the convex hull of the core, where the gel clings to the object, px^2: `area` is of the
+        whole imprint. None where that is not known.
 
     Examples
     --------
@@ -87,6 +89,7 @@ class Contact:
     evidence: Evidence = "light"
     probability: float | None = None
     separate: tuple[Contact, ...] = ()
+    core_area: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

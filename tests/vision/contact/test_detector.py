@@ -125,6 +125,24 @@ def test_the_contact_of_a_ball_is_found_with_its_middle(noise: float) -> None:
     assert math.hypot(x.mean() - center[0], y.mean() - center[1]) < 1  # measured 0.1 to 0.3
 
 
+def test_the_core_of_a_contact_lies_inside_its_outline_unless_the_border_is_as_far_in() -> None:
+    gel = _gel()
+    pressed = _noisy(_pressed(gel, (61.0, 83.0), 24.0), 2)
+    assert _detector(_noisy(gel, 1)).detect(_noisy(gel, 3)).core is None
+    masks = []
+    for border in (0.55, 0.9):
+        detector = ContactDetector(border=border)
+        detector.add_reference(_noisy(gel, 1))
+        result = detector.detect(pressed)
+        assert result.core is not None
+        masks += [result.mask > 0, result.core > 0]
+    outline, core, inner_outline, inner_core = masks
+    assert core.any()
+    assert not (core & ~outline).any()
+    assert core.sum() < 0.95 * outline.sum()
+    assert np.array_equal(inner_outline, inner_core)
+
+
 @pytest.mark.parametrize("change", [40, -40], ids=["brighter", "darker"])
 def test_a_brighter_or_darker_area_is_contact(change: float) -> None:
     gel = _gel()

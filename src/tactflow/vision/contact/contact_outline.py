@@ -6,12 +6,14 @@ unchanged, and the change is largest in a ring around it, where the gel leaves t
 out (Hertz; K. L. Johnson, "Contact Mechanics", 1985, ch. 4). White light through a coating responds to the
 depth of the surface: the touched area brightens or darkens as a whole, most in the middle. In both cases the
 contact ends where the change has fallen to a fixed fraction of its local maximum; a global maximum would not
-do, because the light is uneven.
+do, because the light is uneven. There are two such ends: the outer edge of the imprint, and farther in the
+core, where the gel clings to the object.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import Final
 
@@ -24,28 +26,33 @@ BORDER_SLOPE_FRACTION: Final = 0.55
 """Slope at the border of a contact, as a fraction of its local maximum. Lower includes more of the
 surroundings and of wrinkled gel; higher opens the ring where the light is faint. On outlines of fifteen labs,
 values from 0.5 to 0.6 overlap equally well within 0.02 (`lab.judges.judge`)."""
+CORE_SLOPE_FRACTION: Final = 0.85
+"""The same where the gel leaves the object. Pressed by balls of known size, cores on four Minis have 0.99 to
+1.02 of the radius at which the gel leaves the ball, on two DIGITs 1.08 and 1.15, and on a thick Wedge 1.37
+(`lab.judges.radius`), where the slope has a plateau and higher fractions change little."""
 BORDER_DEPTH_FRACTION: Final = 0.2
 """Depth at the border of a contact, as a fraction of its local maximum. Under a ball it is 0.32 on a
 half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap equally well with
 real outlines within 0.02."""
 
 
-def contact_level(
-    change: Floats32, core: Mask, mixtures: Floats32, border: float = BORDER_SLOPE_FRACTION
-) -> Floats32:
-    """Level set of one contact's outline.
+def contact_levels(
+    change: Floats32, core: Mask, mixtures: Floats32, borders: Sequence[float] = (BORDER_SLOPE_FRACTION,)
+) -> list[Floats32]:
+    """Level sets of one contact's outlines.
 
     Parameters
     ----------
     change : (h, w, 3) float32, in the window of the contact, standard deviations; 0 outside its region.
-    core : (h, w) uint8, 1 where the contact certainly is, else 0.
+    core : (h, w) uint8, 1 where the contact certainly is, else 0; connected.
     mixtures : (k, 3) float32, weights of the channels; one mixture gives depth, several give slopes.
-    border : slope at the outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
+    borders : slope at each outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
         fraction of the local depth is in proportion.
 
     Returns
     -------
-    level : (h, w) float32, positive inside the contact, negative outside; to be interpolated.
+    levels : for each border (h, w) float32, positive inside the outline, negative outside; to be
+        interpolated.
 
     Examples
     --------
@@ -54,17 +61,24 @@ def contact_level(
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> disc = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
     >>> core = (disc == 1).astype(np.uint8)
-    >>> level = contact_level(np.stack([disc] * 3, axis=2), core, np.ones((1, 3), np.float32))
+    >>> (level,) = contact_levels(np.stack([disc] * 3, axis=2), core, np.ones((1, 3), np.float32))
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
     shows, usual = _what_shows(change, mixtures)
-    fraction = min(usual * border / BORDER_SLOPE_FRACTION, 1.0)
-    level = np.asarray(shows / largest_nearby(shows) - np.float32(fraction), np.float32)
+    relative = np.asarray(shows / largest_nearby(shows), np.float32)
+    fractions = [min(usual * border / BORDER_SLOPE_FRACTION, 1.0) for border in borders]
+    return [_level(relative, core, fraction) for fraction in fractions]
+
+
+def _level(relative: Floats32, core: Mask, fraction: float) -> Floats32:
+    """Level set (h, w) of one outline; relative : (h, w), slope or depth over its local maximum."""
+    level = np.asarray(relative - np.float32(fraction), np.float32)
     inside = _around(np.asarray((level > 0) | (core > 0)), core)
     # Pixels that are filled in or removed get the extreme values of the level.
     np.clip(level, -0.5, 0.5, out=level)
-    return np.where((level > 0) == inside, level, np.where(inside, np.float32(0.5), np.float32(-0.5)))
+    np.copyto(level, inside - np.float32(0.5), where=(level > 0) != inside)
+    return level
 
 
 def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
@@ -101,14 +115,14 @@ def largest_nearby(values: Floats32) -> Floats32:
 
 
 def _around(changed: Flags, core: Mask) -> Flags:
-    """(h, w): changed components that overlap the core, with their holes filled."""
+    """(h, w): the changed component around the core, with its holes filled."""
     inside = np.zeros(core.shape, np.uint8)
     outlines, _ = cv2.findContours(changed.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    y, x = divmod(int(core.argmax()), core.shape[1])
     for outline in outlines:
-        part = np.zeros_like(inside)
-        cv2.drawContours(part, [outline], -1, 1.0, cv2.FILLED)
-        if (part & core).any():
-            inside |= part
+        if cv2.pointPolygonTest(outline, (x, y), False) >= 0:
+            cv2.drawContours(inside, [outline], -1, 1.0, cv2.FILLED)
+            break
     return inside.view(np.bool_)
 
 

@@ -35,7 +35,12 @@ from scipy import special
 from tactflow.vision.arrays import Flags, Floats32, check_color_image, check_mask
 from tactflow.vision.contact.background import CELL_PX, BackgroundModel, Change
 from tactflow.vision.contact.components import contact_cells, wide_change
-from tactflow.vision.contact.contact_outline import BORDER_SLOPE_FRACTION, contact_level, draw_level
+from tactflow.vision.contact.contact_outline import (
+    BORDER_SLOPE_FRACTION,
+    CORE_SLOPE_FRACTION,
+    contact_levels,
+    draw_level,
+)
 from tactflow.vision.contact.heights import HeightModel
 from tactflow.vision.contact.level_lines import ContactFinder
 
@@ -63,18 +68,21 @@ class ContactResult:
 
     Attributes
     ----------
-    mask : (H, W) uint8, 255 in contact, else 0.
+    mask : (H, W) uint8, 255 in contact, else 0: within the outer edge of the imprint.
     touching : whether any pixel is in contact.
     strength : largest change anywhere, in standard deviations of the untouched gel.
     deviations : (2, h, w) float32, squared changes of each cell that belongs to a contact, of its light and
         of its colour alone, in variances of the untouched gel; 0 elsewhere. Where all channels change alike
         both are the same. None without contact.
+    core : (H, W) uint8, 255 where the gel clings to the object, inside the mask; 0 where that is not known.
+        None without contact.
     """
 
     mask: NDArray[np.uint8]
     touching: bool
     strength: float
     deviations: Floats32 | None = None
+    core: NDArray[np.uint8] | None = None
 
 
 @lru_cache(maxsize=16)
@@ -110,7 +118,8 @@ class ContactDetector:
     creep : largest fraction of its change that a released gel loses from one frame to the next, 0..1. A
         change that fades faster, but not to `relaxation` at once, is a contact being lifted. Higher ends a
         contact earlier.
-    border : slope at the outline as a fraction of its largest nearby, in (0, 1). Higher draws it further in.
+    border : slope at the outline as a fraction of its largest nearby, in (0, 1). Higher draws it further in;
+        from 0.85 on, the core is the same.
 
     Raises
     ------
@@ -171,7 +180,7 @@ class ContactDetector:
         self._strongest = self._strongest_wide = 0.0
         self._evidence: Floats32 | None = None
         self._suspected: Flags | None = None
-        self._mask: NDArray[np.uint8] | None = None
+        self._masks: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
         self._heights, self._contacts = HeightModel(), ContactFinder()
 
     @property
@@ -221,40 +230,44 @@ class ContactDetector:
         self._strongest = max(self._strongest * DECAY_PER_FRAME, largest)
         self._strongest_wide = max(self._strongest_wide * DECAY_PER_FRAME, widest)
         if found is None:
-            self._mask = None
+            self._masks = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
         self._before = found
-        fading = faint and change.remaining < 1 - self._creep and self._mask is not None
-        if not fading:
-            self._mask = self._outlined(change, image.shape[:2])
-        assert self._mask is not None
-        mask = self._mask.copy() if fading else self._mask
+        if self._masks is not None and faint and change.remaining < 1 - self._creep:
+            mask, core = (kept.copy() for kept in self._masks)
+        else:
+            mask, core = self._masks = self._outlined(change, image.shape[:2])
         # A gray camera records no colours: what would be a change of colour is a change of light there.
         colour = change.squared if self._heights.alike else change.colour
         deviations = np.stack([change.squared, colour]) * self._before
-        return ContactResult(mask, True, strength, deviations)
+        return ContactResult(mask, True, strength, deviations, core)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
         check_color_image(image)
         if self._background is not None and image.shape != self._shape:
             raise ValueError(f"required the reference's shape {self._shape}, got {image.shape}")
 
-    def _outlined(self, change: Change, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        """Contact mask (H, W) of a change: the outlined regions, or the changed cells if none is found."""
+    def _outlined(
+        self, change: Change, shape: tuple[int, ...]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Contact mask (H, W) of a change, and its core: the outlined regions, or the changed cells without a
+        core if none is found."""
         assert self._background is not None
         assert self._before is not None
         heights = self._heights(self._background.signed_change(change))
-        mask = np.zeros(shape, np.uint8)
+        mask, inner = np.zeros((2, *shape), np.uint8)
+        borders = self._border, max(self._border, CORE_SLOPE_FRACTION)
         regions = self._contacts(heights, self._before)
         for rows, columns, inside, core in regions:
             window = self._background.window_change(change, rows, columns, inside)
             surely = core.repeat(2, axis=0).repeat(2, axis=1)
-            level = contact_level(window, surely, heights.mixtures, self._border)
-            draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, mask)
+            levels = contact_levels(window, surely, heights.mixtures, borders)
+            for level, drawn in zip(levels, (mask, inner), strict=True):
+                draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, drawn)
         if not regions:
             draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL_PX)
         # Cells reach beyond the gel.
-        return mask if self._gel is None else mask & self._gel
+        return (mask, inner) if self._gel is None else (mask & self._gel, inner & self._gel)
 
     def _clear(self, change: Change, before: Flags | None) -> Flags | None:
         """Cells (h, w) in contact by the size of their change, or None.

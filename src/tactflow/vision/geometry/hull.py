@@ -21,7 +21,9 @@ _MAX_LINE_VARIANCE_PX2: Final = 1 / 12 + 1e-9
 is at most 1/12; the rest is for rounding."""
 
 
-def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float = 0.0) -> Contact | None:
+def contact_geometry(
+    mask: Mask, *, min_area: float = 1.0, min_confidence: float = 0.0, core: Mask | None = None
+) -> Contact | None:
     """Describe the contact region of a mask, all its components as one contact.
 
     Parameters
@@ -32,6 +34,7 @@ def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float
     min_confidence : 0 to 1; a region whose confidence is not above it gets no direction: 0.3 is an axis ratio
         of 1.36. Light from one side lengthens a mask in a way that its outline cannot distinguish from shape.
         Higher withholds the direction of stubby shapes.
+    core : (H, W) uint8, not 0 where the gel clings to the object; None where that is not known.
 
     Returns
     -------
@@ -44,7 +47,7 @@ def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float
 
     Raises
     ------
-    ValueError : mask is not (H, W) uint8, or a parameter is out of its range.
+    ValueError : a mask is not (H, W) uint8, or a parameter is out of its range.
 
     Examples
     --------
@@ -54,12 +57,17 @@ def contact_geometry(mask: Mask, *, min_area: float = 1.0, min_confidence: float
     >>> contact.center, contact.area, contact.angle
     ((29.5, 24.5), 400.0, 0.0)
     """
-    region, contours = _large_regions(mask, min_area, min_confidence)
-    return _describe(region, contours, min_confidence) if contours else None
+    region, contours = _large_regions(mask, min_area, min_confidence, core)
+    return _describe(region, contours, min_confidence, core=core) if contours else None
 
 
 def contact_parts(
-    mask: Mask, *, min_area: float = 1.0, min_confidence: float = 0.0, evidence: Evidence = "light"
+    mask: Mask,
+    *,
+    min_area: float = 1.0,
+    min_confidence: float = 0.0,
+    evidence: Evidence = "light",
+    core: Mask | None = None,
 ) -> list[Contact]:
     """Describe each separate contact region of a mask, the one with the most pixels first.
 
@@ -71,11 +79,11 @@ def contact_parts(
     >>> [contact.region_area for contact in contact_parts(mask)]
     [400.0, 50.0]
     """
-    region, contours = _large_regions(mask, min_area, min_confidence)
+    region, contours = _large_regions(mask, min_area, min_confidence, core)
     parts = []
     for contour in sorted(contours, key=_filled_area, reverse=True):
         part = region if len(contours) == 1 else _only(mask, [contour])
-        parts.append(_describe(part, [contour], min_confidence, evidence))
+        parts.append(_describe(part, [contour], min_confidence, evidence, core))
     return parts
 
 
@@ -115,7 +123,9 @@ def contact_of_outline(
     return Contact(area, center, angle, slope, polygon, None, confidence, region_area)
 
 
-def _large_regions(mask: Mask, min_area: float, min_confidence: float) -> tuple[Region, Contours]:
+def _large_regions(
+    mask: Mask, min_area: float, min_confidence: float, core: Mask | None
+) -> tuple[Region, Contours]:
     """The components of a mask that are large enough, and their outlines.
 
     Raises ValueError if anything is out of its range.
@@ -125,6 +135,8 @@ def _large_regions(mask: Mask, min_area: float, min_confidence: float) -> tuple[
     if not 0 <= min_confidence <= 1:
         raise ValueError(f"required min_confidence in [0, 1], got {min_confidence}")
     check_mask(mask)
+    if core is not None:
+        check_mask(core, mask.shape, "core")
     region = measure_region(mask)
     contours = region.contours()
     large = [contour for contour in contours if _filled_area(contour) >= min_area]
@@ -139,7 +151,11 @@ def _only(mask: Mask, contours: Contours) -> Region:
 
 
 def _describe(
-    region: Region, contours: Contours, min_confidence: float, evidence: Evidence = "light"
+    region: Region,
+    contours: Contours,
+    min_confidence: float,
+    evidence: Evidence = "light",
+    core: Mask | None = None,
 ) -> Contact:
     """The contact that a region is."""
     moments = region.moments()
@@ -155,7 +171,25 @@ def _describe(
     if region.pixels >= _MIN_ELLIPSE_PIXELS and minor > _MAX_LINE_VARIANCE_PX2:
         ellipse = Ellipse(center, (4 * math.sqrt(major), 4 * math.sqrt(minor)), angle)
     polygon, area = _hull(contours)
-    return Contact(area, center, angle, slope, polygon, ellipse, confidence, float(region.pixels), evidence)
+    return Contact(
+        area,
+        center,
+        angle,
+        slope,
+        polygon,
+        ellipse,
+        confidence,
+        region_area=float(region.pixels),
+        evidence=evidence,
+        core_area=None if core is None else _core_area(core, region),
+    )
+
+
+def _core_area(core: Mask, region: Region) -> float | None:
+    """Area of the convex hull of the core inside a region, px^2; None if there is none."""
+    window = core[region.top : region.top + region.height, region.left : region.left + region.width]
+    contours = measure_region(np.asarray(cv2.bitwise_and(window, region.window), np.uint8)).contours()
+    return _hull(contours)[1] if contours else None
 
 
 def _hull(contours: Contours) -> tuple[Points, float]:
