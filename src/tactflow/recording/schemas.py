@@ -60,17 +60,18 @@ class ChannelType(NamedTuple):
 @functools.cache
 def channel_types() -> dict[str, ChannelType]:
     """The channels of a recording."""
-    raw, results = _protobuf(RawFrame), json.dumps(plain_schema(message_schema())).encode()
+    raw, results = channel_type(RawFrame), json.dumps(plain_schema(message_schema())).encode()
     return {
         "frames": raw,
         "references": raw,
-        "image": _protobuf(CompressedImage),
-        "annotations": _protobuf(ImageAnnotations),
+        "image": channel_type(CompressedImage),
+        "annotations": channel_type(ImageAnnotations),
         "results": ChannelType("tactflow.frame", ("jsonschema", results), "json"),
     }
 
 
-def _protobuf(message: type[Message]) -> ChannelType:
+def channel_type(message: type[Message]) -> ChannelType:
+    """The type of a channel with such messages."""
     schema = build_file_descriptor_set(message).SerializeToString()
     return ChannelType(message.DESCRIPTOR.full_name, ("protobuf", schema), "protobuf")
 

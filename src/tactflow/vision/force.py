@@ -177,7 +177,7 @@ class ForceModel:
 
     >>> model = ForceModel(LinearForce({"volume": 2.0}, {"volume": 1.0}, (0.1, 0.0)), None, 0.0)
     >>> model.force(Seen({"volume": 0.5, "area": 3.0}, {}))
-    Force(value=(None, None, 1.0), stderr=(None, None, 0.1), in_range=True)
+    Force(value=(None, None, 1.0), stderr=(None, None, 0.1), in_range=True, torque=None)
     """
 
     press: LinearForce
