@@ -75,6 +75,9 @@ def test_all_else_works_without_a_plug_in(
     for name in lost["tactflow.exports"]:
         assert main(["export", name, str(tmp_path / "gel.npy"), "--out", str(tmp_path / "out")]) == 2
         assert f"there is no format {name}" in capsys.readouterr().err
+    for name in lost["tactflow.commands"]:
+        assert main([name]) == 2
+        assert f"there is no command {name}" in capsys.readouterr().err
 
 
 class Opened(FrameReader):

@@ -63,8 +63,8 @@ class Press:
     stick : for a ball, radius of the stick region relative to `radius`, 0 to 1, with slip around it
         (Mindlin). None: no slip.
     sliding : whether the indenter moves relative to the gel under it.
-    tilt : rotation vector (x, y) about the indenter's centre before it was turned by `angle`, radians;
-        `shape` is the one after that.
+    tilt : rotation vector about the indenter's centre before it was turned by `angle`, radians; `shape` is
+        the one after that.
     """
 
     shape: Shape
@@ -79,7 +79,7 @@ class Press:
     rim: float = RIM_SLOPE_RATIO
     stick: float | None = None
     sliding: bool = False
-    tilt: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def radius(self) -> float:

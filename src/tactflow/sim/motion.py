@@ -5,7 +5,7 @@ The gel is untouched in the first tenth of a recording (one frame to two seconds
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -50,6 +50,8 @@ class Programme:
     travel : distance the indenter slides during a hold, px.
     partial : whether a ball slips at the edge of the contact first.
     rolls : whether a ball turns as it travels, without slip.
+    path : places, px from the start, to which the contact moves over the object one after the other during a
+        hold. With `rolls` it moves over the gel alike; without, the object slides round in place.
     jumps : whether the gel is dragged to a new position every third frame.
     creep : its drag, px per frame.
     tilts : rotation about the direction of motion and across it, from 0 to this and back during a hold,
@@ -74,6 +76,7 @@ class Programme:
     contacts: int = 0
     partial: bool = False
     rolls: bool = False
+    path: tuple[tuple[float, float], ...] = ()
     tilts: tuple[float, float] = (0.0, 0.0)
     holds: float | None = None
 
@@ -156,6 +159,9 @@ def _dragged(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float | None, bool]:
     """Displacements (2,), px, of the gel and of the indenter; `stick` and `sliding` of `Press`."""
     farthest = settings.shear * pitch
+    if programme.path:
+        place, _ = _rolled(programme.path, timing.progress, 1.0)
+        return np.zeros(2), place * programme.rolls, None, not programme.rolls and 0 < timing.progress < 1
     if programme.jumps:
         draw = np.random.default_rng([settings.seed, timing.cycle, int(timing.phase // 3), 0x6A75])
         angle, radius = draw.uniform(0, 2 * np.pi), _MAX_JUMP_PITCHES * pitch * np.sqrt(draw.uniform(0.3, 1))
@@ -179,6 +185,39 @@ def _dragged(
         return min(distance, farthest) * ahead, distance * ahead, None, sliding
     drag = farthest * timing.swing * ahead
     return drag, drag, None, False
+
+
+def _rolled(
+    path: Sequence[tuple[float, float]], progress: float, radius: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Place (2,), px, after a share of a path, and the rotation (3, 3) of a ball that has rolled so far."""
+    place, rotation = np.zeros(2), np.eye(3)
+    steps = np.diff([(0.0, 0.0), *path], axis=0)
+    left = progress * float(np.hypot(*steps.T).sum())
+    for step in steps:
+        length = float(np.hypot(*step))
+        part = step * (min(left, length) / max(length, 1e-9))
+        rotation = cv2.Rodrigues(np.array([-part[1], part[0], 0.0]) / radius)[0] @ rotation
+        place, left = place + part, left - min(left, length)
+    return place, rotation
+
+
+def _turned(
+    programme: Programme,
+    timing: _Timing,
+    ahead: NDArray[np.float64],
+    travelled: NDArray[np.float64],
+    arm: float,
+) -> NDArray[np.float64]:
+    """Rotation vector (3,) of an indenter about its centre. arm : radius with which it rolls, px."""
+    if programme.path:
+        rotation = _rolled(programme.path, timing.progress, arm)[1]
+    elif programme.rolls:
+        rotation = _rolled(((float(travelled[0]), float(travelled[1])),), 1.0, arm)[1]
+    else:
+        axes = np.stack([ahead, np.array([-ahead[1], ahead[0]])])
+        return np.append(np.radians(programme.tilts) @ axes * timing.swing, 0.0)
+    return np.asarray(cv2.Rodrigues(rotation)[0].ravel(), np.float64)
 
 
 def presses(
@@ -209,19 +248,15 @@ def presses(
     full = programme.depths[timing.cycle % len(programme.depths)] * settings.depth
     depth = timing.envelope * full
     angle += turn
-    cos, sin = np.cos(angle), np.sin(angle)
-    across = np.array([-ahead[1], ahead[0]])
+    cos, sin = float(np.cos(angle)), float(np.sin(angle))
 
     def indenter(shape: Shape, offset_x: float, offset_y: float) -> Press:
-        if programme.rolls:
-            # Rolling without slip: the mean of the surface in contact does not move.
-            arm = shape.center - full * shape.depth * (1 - settings.sink) / 2
-            about = across * float(travelled @ ahead) / arm
-        else:
-            about = np.radians(programme.tilts) @ np.stack([ahead, across]) * timing.swing
-        tilt = float(about[0] * cos + about[1] * sin), float(about[1] * cos - about[0] * sin)
+        # Rolling without slip: the mean of the surface in contact does not move.
+        arm = shape.center - full * shape.depth * (1 - settings.sink) / 2
+        about = _turned(programme, timing, ahead, travelled, arm).tolist()
+        tilt = about[0] * cos + about[1] * sin, about[1] * cos - about[0] * sin, about[2]
         if any(tilt):
-            shape = shape.rotated(np.asarray(cv2.Rodrigues(np.array([*tilt, 0.0]))[0], np.float64))
+            shape = shape.rotated(np.asarray(cv2.Rodrigues(np.array(tilt))[0], np.float64))
         return Press(
             shape,
             x + offset_x + float(travelled[0]),

@@ -60,6 +60,32 @@ SCENES: dict[str, Recipe] = {
         ),
         {"shear": 0.0},
     ),
+    "orbit": Recipe(
+        "a ball with bumps rolls over the gel, all around",
+        Programme(
+            (shapes.bumpy_ball,), place=(0.14, 0.5), wander=(0.0, 0.0), contacts=1, period=280, rise=20,
+            hold=240, depths=(1.0,), rolls=True, path=((576.0, 0.0),), dilation=0.01,
+        ),
+        {"shear": 0.0},
+    ),
+    "thread": Recipe(
+        "a threaded rod rolls over the gel, all around",
+        Programme(
+            (shapes.rod,), place=(0.5, 0.1), wander=(0.0, 0.0), contacts=1, period=280, rise=20,
+            hold=240, depths=(1.0,), rolls=True, path=((0.0, 480.0),), dilation=0.01,
+        ),
+        {"shear": 0.0},
+    ),
+    "medal": Recipe(
+        "a medal larger than the gel slides round over it, and back to where it began",
+        Programme(
+            (shapes.medal,), wander=(0.0, 0.0), contacts=1, period=280, rise=20, hold=240, depths=(1.0,),
+            path=((300.0, 0.0), (300.0, 200.0), (-300.0, 200.0), (-300.0, 0.0), (300.0, 0.0),
+                  (300.0, -200.0), (-300.0, -200.0), (-300.0, 0.0), (0.0, 0.0)),
+            dilation=0.01,
+        ),
+        {"shear": 0.0, "markers": (0, 0)},
+    ),
     "rock": Recipe(
         "a coin is pressed, dragged, turned and tilted to either side",
         Programme(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Floats32
 
+_Relief = Callable[[Floats32, Floats32, Floats32], Floats32]
 _FIXED_POINT_ITERATIONS = 4
 """Fixed-point steps to the surface of a rotated shape: to 0.01 px."""
 _BUMPS_PER_CIRCUMFERENCE = 25.0
@@ -71,6 +72,17 @@ class Shape:
         return self._push(points) * (1.0 / self._largest_push)
 
 
+def _sampled(values: Floats32, x: Floats32, y: Floats32) -> Floats32:
+    """Values of a map (h, w), 0 outside, at x and y from its middle, px, arrays of any shape."""
+    if not x.size:  # `remap` takes no empty maps: a gel without markers
+        return np.empty(x.shape, np.float32)
+    middle_x, middle_y = (np.float32((side - 1) / 2) for side in values.shape[::-1])
+    map_x = np.ascontiguousarray(x + middle_x).reshape(len(x), -1)
+    map_y = np.ascontiguousarray(y + middle_y).reshape(len(y), -1)
+    found = cv2.remap(values, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(found, dtype=np.float32).reshape(x.shape)
+
+
 def _segment(half_length: float, count: int) -> NDArray[np.float64]:
     return np.stack([np.linspace(-half_length, half_length, count), np.zeros(count)], axis=1)
 
@@ -101,27 +113,73 @@ def ball(radius: float = 95.0, depth: float = 26.0) -> Shape:
     return _rotation_invariant(gap, radius, depth)
 
 
-def bumpy_ball(radius: float = 95.0, depth: float = 26.0, relief: float = 2.5) -> Shape:
-    """A ball of `radius` px with bumps of up to `relief` px, 14 degrees apart, all over it."""
-    smooth = ball(radius, depth)
+def _with_relief(
+    smooth: Shape, radius: float, relief: float, raised: _Relief, bends: tuple[float, float] = (1.0, 1.0)
+) -> Shape:
+    """A round shape with a relief, which may be rotated by any angle.
+
+    smooth : without the relief, its centre `radius` px above its lowest point. raised : height of the relief,
+    px, at most `relief`, at points given by x, y, z from the centre in axes that rotate with the shape.
+    bends : whether it curves along x and y, as a ball does, 1 or 0.
+    """
 
     def rolled(rotation: NDArray[np.float64]) -> Shape:
         axes = rotation.astype(np.float32)
 
         def gap(x: Floats32, y: Floats32) -> Floats32:
-            squared = x * x + y * y
+            squared = np.float32(bends[0]) * x * x + np.float32(bends[1]) * y * y
             below = np.float32(radius) - smooth.gap(x, y)
             inside = squared < np.float32((0.9 * radius) ** 2)
             for _ in range(_FIXED_POINT_ITERATIONS):
-                scale = np.float32(_BUMPS_PER_CIRCUMFERENCE) / np.sqrt(squared + below * below)
-                waves = [np.sin((x * axis[0] + y * axis[1] - below * axis[2]) * scale) for axis in axes.T]
-                outer = np.float32(radius) + np.float32(relief / 3) * sum(waves)
+                own = [x * axis[0] + y * axis[1] - below * axis[2] for axis in axes.T]
+                outer = np.float32(radius) + raised(*own)
                 below = np.where(inside, np.sqrt(np.maximum(outer * outer - squared, 1)), below)
             return np.asarray(np.float32(radius + relief) - below, np.float32)
 
         return replace(smooth, gap=gap, center=radius + relief, tilted=rolled)
 
     return rolled(np.eye(3))
+
+
+def bumpy_ball(radius: float = 95.0, depth: float = 26.0, relief: float = 2.5) -> Shape:
+    """A ball of `radius` px with bumps of up to `relief` px, 14 degrees apart, all over it."""
+
+    def raised(x: Floats32, y: Floats32, z: Floats32) -> Floats32:
+        scale = np.float32(_BUMPS_PER_CIRCUMFERENCE) / np.sqrt(x * x + y * y + z * z)
+        return np.asarray(np.float32(relief / 3) * sum(np.sin(part * scale) for part in (x, y, z)))
+
+    return _with_relief(ball(radius, depth), radius, relief, raised)
+
+
+def medal(radius: float = 1200.0, depth: float = 14.0, relief: float = 4.0) -> Shape:
+    """A domed disc of 25 mm with letters `relief` px high; `radius` px is that of its curvature."""
+    letters = np.zeros((1000, 1000), np.uint8)
+    for row, (text, scale) in enumerate((("TOUCH", 6.4), ("25 mm", 6.0), ("MEDAL", 6.4))):
+        (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 18)
+        place = (500 - width // 2, 335 + 230 * row)
+        cv2.putText(letters, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (255.0,), 18, cv2.LINE_8)
+    cv2.circle(letters, (500, 500), 480, (255.0,), 30, cv2.LINE_8)
+    relief_map = np.asarray(cv2.GaussianBlur(letters, (0, 0), 4.0), np.float32) * np.float32(relief / 255)
+
+    def raised(x: Floats32, y: Floats32, _: Floats32) -> Floats32:
+        return _sampled(relief_map, x, y)
+
+    return _with_relief(ball(radius, depth), radius, relief, raised)
+
+
+def rod(radius: float = 80.0, depth: float = 20.0, thread: float = 34.0, ridges: float = 2.4) -> Shape:
+    """A threaded rod along x, longer than the gel, that may be rotated about its axis; see `screw`."""
+
+    def around(x: Floats32, y: Floats32) -> Floats32:
+        return ball(radius, depth).gap(x * np.float32(0), y)
+
+    def raised(x: Floats32, y: Floats32, z: Floats32) -> Floats32:
+        turns = np.arctan2(y, -z) * np.float32(0.5 / np.pi)
+        wave = np.cos((x * np.float32(1 / thread) + turns) * np.float32(2 * np.pi))
+        return np.asarray(np.float32(ridges) * (wave - 1), np.float32)
+
+    smooth = cable(radius, depth=depth)
+    return _with_relief(replace(smooth, gap=around), radius, 0.0, raised, bends=(0.0, 1.0))
 
 
 def tilt_surface(shape: Shape, rotation: NDArray[np.float64]) -> Shape:
@@ -210,20 +268,11 @@ def coin(radius: float = 150.0, relief: float = 4.0, depth: float = 12.0) -> Sha
     cv2.putText(letters, text, (margin, margin + height), font, scale, (255.0,), thickness, cv2.LINE_8)
     smooth = np.asarray(cv2.GaussianBlur(letters, (0, 0), 2.5), dtype=np.float32)
     relief_map = smooth / np.float32(255.0)
-    middle_x, middle_y = (np.float32((side - 1) / 2) for side in relief_map.shape[::-1])
-
-    def raised(x: Floats32, y: Floats32) -> Floats32:
-        if not x.size:  # `remap` takes no empty maps: a gel without markers
-            return np.empty(x.shape, np.float32)
-        map_x = np.ascontiguousarray(x + middle_x).reshape(len(x), -1)
-        map_y = np.ascontiguousarray(y + middle_y).reshape(len(y), -1)
-        values = cv2.remap(relief_map, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return np.asarray(values, dtype=np.float32).reshape(x.shape)
 
     def gap(x: Floats32, y: Floats32) -> Floats32:
         from_center = np.hypot(x, y)
         rim = np.exp(-((from_center - np.float32(radius - 10.0)) ** 2) / np.float32(2 * 6.0**2))
-        lower = np.float32(relief) * (1 - np.maximum(rim, raised(x, y)))
+        lower = np.float32(relief) * (1 - np.maximum(rim, _sampled(relief_map, x, y)))
         beyond = _flank(np.maximum(from_center - np.float32(radius - 10.0), 0))
         return np.asarray(np.where(from_center > radius - 10.0, 0, lower) + beyond, dtype=np.float32)
 

@@ -140,7 +140,7 @@ class Truth:
         scale = float(np.sqrt(np.linalg.det(axes)))
         axes[:2, :2] /= scale
         turn, _ = cv2.Rodrigues(np.array([0.0, 0.0, press.angle]))
-        tilt, _ = cv2.Rodrigues(np.array([*press.tilt, 0.0]))
+        tilt, _ = cv2.Rodrigues(np.array(press.tilt))
         across = (center - (np.array(self._mapping.size) - 1) / 2) * MM_PER_PX / scale
         return axes @ turn @ tilt @ axes.T, np.array(
             [*across, (press.shape.center - press.depth) * MM_PER_PX]
