@@ -17,6 +17,7 @@ from tactflow.engine.frame import Frame, Tick
 from tactflow.message import encoding
 from tactflow.message import fields as fields_module
 from tactflow.message import result as result_module
+from tactflow.message.fields import STATUS_NAMES
 from tactflow.message.result import Result, encode_message
 from tactflow.message.schema import message_schema
 from tactflow.vision.flow import FieldModel
@@ -352,3 +353,12 @@ def test_keys_of_a_later_version_are_ignored_and_an_error_names_the_place() -> N
 def test_what_is_no_message_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"required a message tactflow\.frame/1"):
         Result.from_message(build_message(TICK, Results(PROCESSED)) | change)
+
+
+def test_markers_that_repeat_are_encoded_as_they_are() -> None:
+    """Their text is kept for the next frame; that of others is not taken for it."""
+    moved = replace(MARKERS, position=MARKERS.position + 1.0)
+    for markers in (MARKERS, MARKERS, moved, MARKERS, replace(moved, status=MARKERS.status[::-1])):
+        message = build_message(TICK, Results(PROCESSED, None, None, markers))
+        assert message["markers"]["position"] == markers.position.tolist()
+        assert message["markers"]["status"] == [STATUS_NAMES[value] for value in markers.status]

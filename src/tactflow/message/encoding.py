@@ -11,6 +11,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import orjson
 
 from tactflow.message.fields import CONDITIONS, Message, Part
 
@@ -20,16 +21,20 @@ if TYPE_CHECKING:
 _Step = tuple[str, str, Callable[[Any, "Result"], Any] | None, bool, "_Plan | None"]
 """How a key is encoded: its name, its place in the message, the function for its value, whether it is left
 out if unknown, and how the object in it is encoded."""
-_Plan = tuple[Callable[[Any, str], Any], Sequence[_Step]]
-"""How a part is encoded: the function for values without one of their own, and its keys."""
+_Plan = tuple[Callable[[Any, str], Any], Sequence[_Step], "list[tuple[Any, orjson.Fragment | None]] | None"]
+"""How a part is encoded: the function for values without one of their own, and its keys; for a part that
+often repeats, also its last value with the text for it."""
 
 
 def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
-    """The message of a result. Raises ValueError with the name of the field for a number that is not
-    finite."""
+    """The message of a result, for `to_json`.
+
+    Raises ValueError with the name of the field for a number that is not finite.
+    """
     options = {"detail": detail, "field": field}
     given = [need for need in CONDITIONS if options.get(need, result.value(need) is not None)]
-    return _encoded(result, _plan(Message, frozenset(given), ""), result)
+    message: dict[str, Any] = _encoded(result, _plan(Message, frozenset(given), ""), result)
+    return message
 
 
 @cache
@@ -40,11 +45,18 @@ def _plan(part: type[Part], given: frozenset[str], path: str) -> _Plan:
         if given.issuperset(sending.needs):
             plan = None if inner is None else _plan(inner, given, f"{path}{name}.")
             steps.append((name, path + name, sending.value, sending.if_known, plan))
-    return part.source, steps
+    return part.source, steps, [(None, None)] if part.repeats else None
 
 
-def _encoded(value: Any, plan: _Plan, result: Result) -> dict[str, Any]:
-    source, steps = plan
+def to_json(message: dict[str, Any]) -> bytes:
+    """A message of `encode`, or a part of it, as JSON in UTF-8."""
+    return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def _encoded(value: Any, plan: _Plan, result: Result) -> Any:
+    source, steps, kept = plan
+    if kept is not None and kept[0][0] is value:
+        return kept[0][1]
     message: dict[str, Any] = {}
     for name, path, value_of, if_known, inner in steps:
         found = source(value, name) if value_of is None else value_of(value, result)
@@ -57,18 +69,25 @@ def _encoded(value: Any, plan: _Plan, result: Result) -> dict[str, Any]:
             message[name] = [_encoded(part, inner, result) for part in found]
         else:
             message[name] = _encoded(found, inner, result)
-    return message
+    if kept is None:
+        return message
+    text = orjson.Fragment(to_json(message))
+    # Replaced as a whole: sinks of several threads encode the same value.
+    kept[0] = value, text
+    return text
 
 
 def _finite(value: Any, path: str) -> Any:
     """Check and convert for the encoder. NaN is allowed in standard errors and probabilities (null)."""
-    if isinstance(value, tuple):
+    if isinstance(value, float):
+        total = value
+    elif isinstance(value, tuple):
         return [_finite(part, path) for part in value]
-    if isinstance(value, np.ndarray):
+    elif isinstance(value, np.ndarray):
         value = np.ascontiguousarray(value, np.float64)
         # The sum of squares is finite only if all numbers are; this needs no temporary array.
         total = float(np.vdot(value, value))
-    elif isinstance(value, float | np.floating):
+    elif isinstance(value, np.floating):
         value = total = float(value)
     else:
         return value

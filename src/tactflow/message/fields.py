@@ -151,6 +151,7 @@ class Part(BaseModel):
     Attributes
     ----------
     of : the class of its value in Python; None if it is not decoded.
+    repeats : whether its value is often that of the frame before. Its keys must not depend on other values.
     """
 
     # Keys of a later version are ignored when read, but are errors for the schema.
@@ -161,6 +162,7 @@ class Part(BaseModel):
         json_schema_extra={"additionalProperties": False},
     )
     of: ClassVar[type | None] = None
+    repeats: ClassVar[bool] = False
 
     @classmethod
     def all_keys(cls) -> Iterator[Key]:
@@ -361,6 +363,7 @@ class Markers(Part):
     """The markers; index i is the same physical marker for the whole run. Ones found later come last."""
 
     of = types.Markers
+    repeats = True
     origin: Points = sent("positions in the reference frame", "px")
     position: Points = sent("positions now; repeated while none can have moved by more than 0.05 px", "px")
     status: Statuses = sent(

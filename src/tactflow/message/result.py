@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import NO_PICTURE, Absent, Frame, Tick, read_only
-from tactflow.message.encoding import encode
+from tactflow.message.encoding import encode, to_json
 from tactflow.message.fields import SCHEMA, Message
 from tactflow.ports import ContactMask, Image, Normals
 from tactflow.vision.types import Contact, Depth, Features, Flow, Force, Markers, Pose, Scale, Slip
@@ -220,5 +220,4 @@ def encode_message(result: Result, *, detail: bool = False, field: bool = False)
     ValueError
         If a number is infinite, or NaN (except in standard errors, where NaN means unknown).
     """
-    message = encode(result, detail, field) if result._message is None else result._message
-    return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)
+    return to_json(encode(result, detail, field) if result._message is None else result._message)

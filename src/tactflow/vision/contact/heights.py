@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from scipy import linalg
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import Floats, Floats32
 
 PADDING_SHARE: Final = 0.15
 """Padding with gel at rest at both ends of a side, as a fraction of it: the integrated surface is
@@ -119,7 +119,7 @@ class HeightModel:
         both = np.asarray(climbs.reshape(6, -1), np.float64)
         power = np.asarray(flat @ flat.T, np.float64)
         self._power += power
-        self._missing += np.kron(np.eye(2), power) - both @ both.T
+        self._missing += _twice(power) - both @ both.T
         sizes = np.linalg.norm(flat, axis=0)
         clear = sizes > MIN_CHANGE_STDDEVS
         self._one_way += float(np.linalg.norm(flat[:, clear].sum(axis=1)))
@@ -133,15 +133,23 @@ class HeightModel:
     def _showing(self) -> Floats32:
         """Mixtures (k, 3) of the channels that show the shape, as in `Heights`."""
         powers, directions = np.linalg.eigh(self._power)
-        basis = np.kron(np.eye(2), directions[:, powers >= MIN_MIXTURE_POWER * powers[-1]])
+        basis = _twice(directions[:, powers >= MIN_MIXTURE_POWER * powers[-1]])
         self.alike = basis.shape[1] == 2
-        power = basis.T @ np.kron(np.eye(2), self._power) @ basis
+        power = basis.T @ _twice(self._power) @ basis
         missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
         one_way = self.alike and self._one_way >= MIN_DARKNESS_COHERENCE * self._size
         if missing[0] <= (MAX_CURL_SHARE_GREY if self.alike else MAX_CURL_SHARE) and not one_way:
             slopes = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
             return slopes / np.linalg.norm(slopes)
         return np.asarray(directions[:, -1:].T if self.alike else np.eye(3), np.float32)
+
+
+def _twice(block: Floats) -> Floats:
+    """(2 m, 2 n), block diagonal, of a block (m, n): for slopes along x and y."""
+    rows, columns = block.shape
+    whole = np.zeros((2 * rows, 2 * columns))
+    whole[:rows, :columns] = whole[rows:, columns:] = block
+    return whole
 
 
 class _Waves(NamedTuple):

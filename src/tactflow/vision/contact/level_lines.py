@@ -40,6 +40,8 @@ wrong one is flatter by at least a tenth in all outlined frames, by three quarte
 MIN_SALIENCE_RATIO: Final = 0.5
 """Minimum salience of further contacts, relative to the first: less is gel that wrinkles, or light that has
 changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap equally well within 0.01)."""
+LEVELS: Final = np.arange(1, LEVEL_COUNT + 1, dtype=np.float32)
+"""The levels, in units of their distance."""
 
 
 class LevelLines(NamedTuple):
@@ -68,7 +70,7 @@ class LevelLines(NamedTuple):
 
 def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
     """Level lines at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
-    levels = np.linspace(0, heights.max(), LEVEL_COUNT + 2, dtype=np.float32)[1:-1]
+    levels = LEVELS * (heights.max() / np.float32(LEVEL_COUNT + 1))
     high, wide = heights.shape
     # All lines lie in a window, and touch its border only where it is the picture's.
     left, top, across, down = cv2.boundingRect((heights > levels[0]).view(np.uint8))
