@@ -7,6 +7,7 @@ are found by image features; here, by the places that the pose graph predicts, a
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
@@ -50,15 +51,25 @@ def mapped(keyframes: Sequence[Keyframe], edges: Sequence[Edge], *, loops: bool 
     slope_stderr = float(np.sqrt(np.mean([keyframe.imprint.error**2 for keyframe in keyframes])))
     graph = optimised(chained(edges, anchor), edges, anchor, slope_stderr)
     tried: set[tuple[int, int]] = set()
+    accepted: list[Edge] = []
     for _ in range(MAX_ROUNDS if loops else 0):
         pairs = [pair for pair in _overlapping(keyframes, graph) if pair not in tried]
         tried.update(pairs)
         found = [_loop(keyframes, graph, *pair) for pair in pairs]
-        accepted = [edge for edge in found if edge is not None]
-        if not accepted:
+        new = [edge for edge in found if edge is not None]
+        if not new:
             break
-        graph = optimised(graph.poses, [*graph.edges, *accepted], anchor, slope_stderr, graph.slope_error)
+        accepted += new
+        graph = optimised(graph.poses, [*edges, *weakened(accepted)], anchor, slope_stderr, graph.slope_error)
     return graph
+
+
+def weakened(loops: Sequence[Edge]) -> list[Edge]:
+    """Loops without the information that those of the same patch have in common, which is counted once."""
+    uses = Counter(index for loop in loops for index in (loop.before, loop.now))
+    return [
+        loop._replace(covariance=loop.covariance * max(uses[loop.before], uses[loop.now])) for loop in loops
+    ]
 
 
 def _overlapping(keyframes: Sequence[Keyframe], graph: Graph) -> list[tuple[int, int]]:

@@ -167,5 +167,5 @@ def _pipeline(args: argparse.Namespace) -> Pipeline:
     if "depth" not in pipeline.nodes:
         raise ConfigError(f"{file}: a map in mm needs the stages scale and depth, and a calibration")
     if "field" in pipeline.nodes and "slip" not in pipeline.nodes:
-        pipeline = load([*args.overrides, "stages.slip={}"])
+        pipeline = load(["stages.slip={}", *args.overrides])
     return pipeline

@@ -15,6 +15,7 @@ from tactflow.vision.pose.rigid import inverse, skew
 from .graph import Graph
 from .keyframes import Contact
 from .surface import Points
+from .viewer import viewer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,18 +78,27 @@ def views(points: Points, contact: Contact, graph: Graph, cell: float) -> dict[s
 
     cell : distance of points, mm.
     """
-    mean = points.normal.mean(axis=0)
-    if np.linalg.norm(mean) > ONE_SIDED:
-        away = -mean / np.linalg.norm(mean)
-        below = np.cross(away, (1.0, 0.0, 0.0))
-        below /= np.linalg.norm(below)
-        return {"": _view(points, contact, graph, cell, np.array([np.cross(below, away), below, away]))}
+    axes = facing(points)
+    if axes is not None:
+        return {"": _view(points, contact, graph, cell, axes)}
     found = {}
     for name, (right, down) in VIEWS.items():
         axes = np.array([right, down, np.cross(right, down)], np.float64)
         if np.mean(points.normal @ axes[2] < -MIN_FACING) >= MIN_VIEW_SHARE:
             found[name] = _view(points, contact, graph, cell, axes)
     return found
+
+
+def facing(points: Points) -> Floats | None:
+    """(3, 3): axes of a view, see `_view`, that shows the whole surface; None where it goes around an
+    object."""
+    mean = points.normal.mean(axis=0)
+    if np.linalg.norm(mean) < ONE_SIDED:
+        return None
+    away = -mean / np.linalg.norm(mean)
+    down = np.cross(away, (1.0, 0.0, 0.0))
+    down /= np.linalg.norm(down)
+    return np.array([np.cross(down, away), down, away])
 
 
 def _view(points: Points, contact: Contact, graph: Graph, cell: float, axes: Floats) -> View:
@@ -173,7 +183,7 @@ def _labelled(axes: Axes) -> None:
 
 def map_page(name: str, points: Points, contact: Contact, graph: Graph, cell: float) -> str:
     """The page, HTML. name : of the recording. cell : distance of points, mm."""
-    shown = views(points, contact, graph, cell)
+    shown, axes = views(points, contact, graph, cell), facing(points)
 
     def plots(draw: Callable[[Figure, View], None]) -> list[Html]:
         wide, high = LARGE_VIEW if len(shown) == 1 else SMALL_VIEW
@@ -195,6 +205,7 @@ def map_page(name: str, points: Points, contact: Contact, graph: Graph, cell: fl
             "Standard error of the surface along its normal, from heights, calibration and poses.",
             plots(draw_error),
         ),
+        Section("Turn it", body=[viewer(points, cell, np.eye(3) if axes is None else axes)]),
         Section("What was measured", body=[_facts(points, contact, graph)]),
     ]
     lead = "\n\n".join([summary(points, contact), *unseen(contact, graph)])

@@ -18,8 +18,10 @@ FIELDS: Final = (
 )
 """Properties of a point, and their types: places, normals that point out of the object, colours, and the
 standard errors along the normal and along the surface; mm."""
-_RAMP: Final = ((0.13, 0.97, 0.70), (0.40, 0.97, 0.09), (0.67, 0.97, 0.17))
+RAMP: Final = ((0.13, 0.97, 0.70), (0.40, 0.97, 0.09), (0.67, 0.97, 0.17))
 """Red, green and blue of colours of errors: none, half of the largest, the largest."""
+MAX_MEDIANS: Final = 3.0
+"""Largest error that has a colour of its own, in medians of all errors."""
 _PLY_TYPES: Final = {"<f4": "float", "u1": "uchar"}
 
 
@@ -54,8 +56,8 @@ def read_ply(path: Path) -> NDArray[np.void]:
 
 
 def error_colours(points: Points) -> NDArray[np.uint8]:
-    """(N, 3): colours by `error`, from blue (0) through white to red (three medians and more)."""
-    share = np.clip(points.error / (3 * np.median(points.error)), 0, 1)
-    return np.rint(
-        255 * np.column_stack([np.interp(share, (0, 0.5, 1), channel) for channel in _RAMP])
-    ).astype(np.uint8)
+    """(N, 3): colours by `error`, along `RAMP` up to `MAX_MEDIANS` medians."""
+    share = np.clip(points.error / (MAX_MEDIANS * np.median(points.error)), 0, 1)
+    return np.rint(255 * np.column_stack([np.interp(share, (0, 0.5, 1), part) for part in RAMP])).astype(
+        np.uint8
+    )

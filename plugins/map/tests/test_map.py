@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +13,7 @@ import pytest
 
 from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
-from tactflow.plugins.map.closure import mapped, registered
+from tactflow.plugins.map.closure import mapped, registered, weakened
 from tactflow.plugins.map.graph import chained, optimised, twist
 from tactflow.plugins.map.keyframes import Contact, Edge, Touch, contacts_of, keyframe_of
 from tactflow.plugins.map.page import unseen
@@ -87,6 +89,11 @@ def test_a_place_that_is_touched_again_closes_a_loop(plate: Contact) -> None:
     assert any(loop.before < 3 and loop.now > last - 3 for loop in loops)
     ends = [np.trace(one.motion(0, last).covariance[:3, :3]) for one in (plain, graph)]
     assert ends[1] < ends[0] / 2
+
+
+def test_loops_of_the_same_patch_count_as_one() -> None:
+    loops = [Edge(*pair, np.eye(4), np.eye(6), np.zeros(6)) for pair in ((0, 7), (0, 8), (3, 9))]
+    assert [loop.covariance[0, 0] for loop in weakened(loops)] == [2, 2, 1]
 
 
 def test_another_plate_at_the_predicted_place_closes_no_loop(plate: Contact) -> None:
@@ -183,6 +190,9 @@ def test_the_command_writes_points_and_a_page(terminal: Terminal) -> None:
     page = Path("plate.html").read_text(encoding="utf-8")
     assert page.count("<svg") == 2
     assert "loops closed" in page
+    data = re.search(r'atob\("([^"]+)"\)', page)
+    assert data is not None
+    assert len(base64.b64decode(data[1])) == 12 * len(table)
     assert terminal("map", "sim:press", "--out", "plate.ply") == 2
     assert "--overwrite" in terminal.err
     assert terminal("map", "sim:press", "--contact", "2", "--out", "other.ply") == 2
