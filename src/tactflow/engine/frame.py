@@ -153,7 +153,7 @@ class Tick(Mapping[str, Any]):
     def value(self, port: str) -> Any:
         """The value of a port; None if it is absent or there is no such port."""
         value = self._values.get(port)
-        return None if isinstance(value, Absent) else value
+        return None if value.__class__ is Absent else value
 
     def replace(self, **values: Any) -> Self:
         """A copy with changed values of some ports."""

@@ -64,7 +64,10 @@ def _encoded(value: Any, plan: _Plan, result: Result) -> Any:
             if not if_known:
                 message[name] = None
         elif inner is None:
-            message[name] = _finite(found, path)
+            # Most values: comparing costs less than a call.
+            kind = found.__class__
+            simple = kind is str or kind is int or (kind is float and found - found == 0)
+            message[name] = found if simple else _finite(found, path)
         elif isinstance(found, tuple):
             message[name] = [_encoded(part, inner, result) for part in found]
         else:
@@ -79,10 +82,13 @@ def _encoded(value: Any, plan: _Plan, result: Result) -> Any:
 
 def _finite(value: Any, path: str) -> Any:
     """Check and convert for the encoder. NaN is allowed in standard errors and probabilities (null)."""
-    if isinstance(value, float):
+    if isinstance(value, tuple):
+        if not (len(value) == 2 and value[0].__class__ is value[1].__class__ is float):
+            return [_finite(part, path) for part in value]
+        # Points. The differences are 0 or NaN.
+        total = (value[0] - value[0]) + (value[1] - value[1])
+    elif isinstance(value, float):
         total = value
-    elif isinstance(value, tuple):
-        return [_finite(part, path) for part in value]
     elif isinstance(value, np.ndarray):
         value = np.ascontiguousarray(value, np.float64)
         # The sum of squares is finite only if all numbers are; this needs no temporary array.

@@ -16,6 +16,7 @@ import pydantic
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, PlainValidator, SkipValidation
 
+from tactflow.engine.frame import Tick
 from tactflow.vision import types
 from tactflow.vision.types import MarkerStatus
 
@@ -151,6 +152,7 @@ class Part(BaseModel):
     Attributes
     ----------
     of : the class of its value in Python; None if it is not decoded.
+    source : gives the default value of a key, from the value of the part.
     repeats : whether its value is often that of the frame before. Its keys must not depend on other values.
     """
 
@@ -162,6 +164,7 @@ class Part(BaseModel):
         json_schema_extra={"additionalProperties": False},
     )
     of: ClassVar[type | None] = None
+    source: ClassVar[Callable[[Any, str], Any]] = getattr
     repeats: ClassVar[bool] = False
 
     @classmethod
@@ -171,11 +174,6 @@ class Part(BaseModel):
             kinds = (field.annotation, *get_args(field.annotation))
             parts = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Part)]
             yield Key(field.alias or name, field.json_schema_extra, *parts)
-
-    @staticmethod
-    def source(value: Any, name: str) -> Any:
-        """The default value of a key. value : that of the part."""
-        return getattr(value, name)
 
     def decoded(self, **more: Any) -> Any:
         """The value in Python. more : further attributes."""
@@ -499,6 +497,7 @@ class Message(Part):
     """The results of one processed frame."""
 
     model_config = ConfigDict(title=SCHEMA)
+    source = Tick.value
     schema_: Literal["tactflow.frame/1"] = sent(
         "the kind of message", alias="schema", value=lambda *_: SCHEMA
     )
@@ -546,11 +545,6 @@ class Message(Part):
     def ports(cls) -> list[str]:
         """The ports that are keys of a message."""
         return [key.name for key in cls.all_keys() if key.sending.value is None]
-
-    @staticmethod
-    def source(value: Any, name: str) -> Any:
-        """The value of the port `name` of a result."""
-        return value.value(name)
 
     def decoded_ports(self) -> dict[str, Any]:
         """Port -> value, None without."""
