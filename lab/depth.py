@@ -16,10 +16,12 @@ from __future__ import annotations
 import argparse
 import json
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,8 +73,13 @@ SETS = {
 EDGE = Balls("gels/mini_box", "000.png", "mini_plain", MINI, {}, "mini")
 
 
-def read(balls: Balls, data: Path) -> tuple[Session, list[str]]:
-    """Every picture of a set in which a contact is found, as a press, and the names of these."""
+def read(
+    balls: Balls, data: Path, settings: Mapping[str, Any] = MappingProxyType({})
+) -> tuple[Session, list[str]]:
+    """Every picture of a set in which a contact is found, as a press, and the names of these.
+
+    settings : of the pipeline, as for `tactflow.stream`.
+    """
     folder = data / balls.folder
     pictures = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".jpg"))
     pictures.sort(key=lambda path: path.name != balls.untouched)
@@ -80,7 +87,8 @@ def read(balls: Balls, data: Path) -> tuple[Session, list[str]]:
         for number, path in enumerate(pictures):
             (Path(links) / f"{number:04d}{path.suffix}").symlink_to(path.resolve())
         pictures_only = {"calibration": None, "stages.preprocess.crop": balls.crop and [*balls.crop]}
-        results = tactflow.stream(balls.pipeline, source=links, settings=pictures_only, images=True)
+        changed = pictures_only | dict(settings)
+        results = tactflow.stream(balls.pipeline, source=links, settings=changed, images=True)
         first, *others = [r for r in results if r.image is not None]
     untouched = first.get("unmarked", first.image)
     presses, names = [], []

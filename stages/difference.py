@@ -68,7 +68,14 @@ class Difference(Stage):
             gt=0,
             lt=1,
             description="slope of the gel at the outline, as a fraction of the steepest nearby: 0.55 is the "
-            "outer edge of the imprint, 0.85 about where the gel clings to the object, as for core_area",
+            "outer edge of the imprint; higher draws it farther in",
+        )
+        core: float = Field(
+            0.8,
+            gt=0,
+            lt=1,
+            description="the same for the core of a contact, where the gel clings to the object: "
+            "`tactflow calibrate` says which value is right for your sensor; at least `border`",
         )
         patience: int = Field(
             30,
@@ -89,6 +96,7 @@ class Difference(Stage):
             relaxation=params.relaxation,
             creep=params.creep,
             border=params.border,
+            core=params.core,
         )
 
     def reset(self) -> None:

@@ -5,7 +5,9 @@
 Columns: presses; the median radius over that of a labelled circle, of the whole imprint (`area`) and of its
 core (`core_area`); and the same over the radius at which the gel leaves the ball. The latter is where the
 slope, learned from the presses themselves, has fallen to 0.7 of that of a ball of this size, so that it does
-not depend on the eye of a person; the last column is the labelled circle over it.
+not depend on the eye of a person. Then the labelled circle over it; and the setting `core` that `tactflow
+calibrate` proposes for every second press, and what it gives on the others. In brackets: 10 and 90 %
+quantiles.
 """
 
 from __future__ import annotations
@@ -27,10 +29,11 @@ from lab.judges.judge import OUTLINES
 from lab.judges.label_file import load_labels
 from tactflow.calibration.photometric import fit_photometry
 from tactflow.calibration.presses import Session
-from tactflow.calibration.samples import flat, prepared
+from tactflow.calibration.samples import fitting_core, flat, prepared
 from tactflow.engine.errors import TactflowError
 from tactflow.system.terminal import say, table
 from tactflow.tools.page import save_plot, series
+from tactflow.vision.contact.contact_outline import CORE_SLOPE_FRACTION
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,6 +48,11 @@ PROFILE_SETS: Final = {"mini_ball_9mm": "thin gel (Mini)", "wedge_ball": "thick 
 PROFILE_RADII: Final = np.arange(0.05, 2.0, 0.05)
 """Distances from the middle of a ball in the picture, in radii at which the gel leaves the ball."""
 Numbers = NDArray[np.float64]
+HEADING: Final = (
+    *("set", "presses", "area/label", "core/label", "area/ball", "core/ball", "label/ball"),
+    *("core fitted", "core/ball with it"),
+)
+"""Columns of the table."""
 
 
 class Profile(NamedTuple):
@@ -69,6 +77,16 @@ class Radii(NamedTuple):
     ball: Numbers
 
 
+class Fitted(NamedTuple):
+    """The setting `core` that fits every second press, and what it gives on the others.
+
+    ratio : (n,), radius of the core over that at which the gel leaves the ball.
+    """
+
+    core: float
+    ratio: Numbers
+
+
 def labelled_radii(folder: Path, recording: str) -> dict[str, float]:
     """Name of a picture without suffix -> radius of its labelled circle, px: of `labels.csv` or `labels.json`
     in the folder, or of the package's outlines of this recording."""
@@ -89,8 +107,11 @@ def labelled_radii(folder: Path, recording: str) -> dict[str, float]:
     }
 
 
-def judge(balls: Balls, data: Path) -> tuple[Radii, Profile | None]:
-    """Radii of a set, and its profile if its balls are known. Errors are those of `fit_photometry`."""
+def judge(balls: Balls, data: Path) -> tuple[Radii, Profile | None, Fitted | None]:
+    """Radii of a set, and if its balls are known its profile and the setting that fits.
+
+    Errors are those of `fit_photometry`.
+    """
     session, names = read(balls, data)
     labels = labelled_radii(data / balls.folder, balls.folder)
     label = np.array([labels.get(Path(name).stem, np.nan) for name in names])
@@ -98,10 +119,13 @@ def judge(balls: Balls, data: Path) -> tuple[Radii, Profile | None]:
         np.array([getattr(press, key) for press in session.presses]) for key in ("radius", "core_radius")
     )
     if not balls.radii:
-        return Radii(outline, core, label, np.full(len(names), np.nan)), None
+        return Radii(outline, core, label, np.full(len(names), np.nan)), None, None
     edges, profile = _leaving(balls, session, names)
-    radii = Radii(outline, core, label, edges)
-    return radii, Profile(*profile, *(float(np.nanmedian(part / edges)) for part in (outline, core)))
+    medians = (float(np.nanmedian(part / edges)) for part in (outline, core))
+    setting = fitting_core(float(np.nanmedian((core / edges)[::2])), CORE_SLOPE_FRACTION)
+    again, _ = read(balls, data, {"stages.difference.core": setting})
+    fitted = np.array([press.core_radius for press in again.presses]) / edges
+    return Radii(outline, core, label, edges), Profile(*profile, *medians), Fitted(setting, fitted[1::2])
 
 
 def _leaving(balls: Balls, session: Session, names: list[str]) -> tuple[Numbers, tuple[Numbers, Numbers]]:
@@ -126,7 +150,7 @@ def _leaving(balls: Balls, session: Session, names: list[str]) -> tuple[Numbers,
     return edges, (medians, np.median(true, axis=0))
 
 
-def row(name: str, radii: Radii) -> tuple[str, ...]:
+def row(name: str, radii: Radii, fitted: Fitted | None) -> tuple[str, ...]:
     """A row of the table."""
     ratios = (
         radii.outline / radii.label,
@@ -135,7 +159,8 @@ def row(name: str, radii: Radii) -> tuple[str, ...]:
         radii.core / radii.ball,
         radii.label / radii.ball,
     )
-    return name, str(len(radii.outline)), *(_spread(ratio) for ratio in ratios)
+    by_core = ("-", "-") if fitted is None else (f"{fitted.core:.2f}", _spread(fitted.ratio))
+    return name, str(len(radii.outline)), *(_spread(ratio) for ratio in ratios), *by_core
 
 
 def _spread(ratios: Numbers) -> str:
@@ -168,13 +193,13 @@ def rows(names: Sequence[str], data: Path, profiles: dict[str, Profile]) -> Iter
             say(f"{name}: not in {data}, left out")
             continue
         try:
-            radii, profile = judge(JUDGED[name], data)
+            radii, profile, fitted = judge(JUDGED[name], data)
         except TactflowError as error:
             say(f"{name}: {str(error).splitlines()[0]}")
             continue
         if profile is not None:
             profiles[name] = profile
-        yield row(name, radii)
+        yield row(name, radii, fitted)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -189,8 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"unknown set {', '.join(sorted(unknown))}; there are {', '.join(JUDGED)}")
     profiles: dict[str, Profile] = {}
     judged = list(rows(options.sets or list(JUDGED), options.data, profiles))
-    heading = ("set", "presses", "area/label", "core/label", "area/ball", "core/ball", "label/ball")
-    print(*table([heading, *judged]), sep="\n")
+    print(*table([HEADING, *judged]), sep="\n")
     if options.picture is not None:
         drawn = {title: profiles[name] for name, title in PROFILE_SETS.items() if name in profiles}
         if not drawn:

@@ -25,9 +25,9 @@ def test_outlines_of_the_package_are_circles_where_a_folder_has_none(tmp_path: P
 def test_a_row_has_medians_of_the_presses_in_which_both_radii_are_known() -> None:
     radius, unknown = np.array([20.0, 22.0, 24.0]), np.full(3, np.nan)
     radii = Radii(radius, radius / 2, np.array([20, 20, np.nan]), unknown)
-    name, count, area, core, *against_ball = row("gel", radii)
+    name, count, area, core, *against_ball = row("gel", radii, None)
     assert (name, count, area[:4], core[:4]) == ("gel", "3", "1.05", "0.53")
-    assert against_ball == ["-"] * 3
+    assert against_ball == ["-"] * 5
 
 
 def test_unknown_sets_and_missing_recordings_are_told(

@@ -11,7 +11,6 @@ import pytest
 from tactflow.calibration.photometric import Photometry, fit_photometry
 from tactflow.calibration.presses import Session
 from tactflow.calibration.samples import press_errors, summary
-from tactflow.calibration.words import photometric_words
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
 from tactflow.vision.depth.surface import Rest, Surface
@@ -63,14 +62,10 @@ def test_the_radius_at_which_the_gel_leaves_the_ball_is_found(session: Session) 
     known = replace(session, presses=clings)
     ratio = fit_photometry(known, SCALE, BALL).found.core_ratio
     assert ratio == pytest.approx(1.0, abs=0.05)
-    assert "1.50 times the radius" in photometric_words(
-        {"normal_error": 1, "depth_stderr": 0, "core_ratio": 1.5}
-    )
 
 
 def test_without_a_core_nothing_is_said_of_it(learned: Photometry) -> None:
     assert learned.found.core_ratio is None
-    assert "core" not in photometric_words(learned.found.model_dump())
 
 
 @pytest.mark.parametrize(("scene", "worst"), [("press?seed=11", 0.03), ("cable?seed=11", 0.04)])

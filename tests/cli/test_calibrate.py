@@ -24,6 +24,7 @@ def test_a_newcomer_gets_millimetres_and_depth_within_their_stated_errors(termin
     output = terminal.err
     assert "press 8 of 30: good, radius" in output
     assert "calibration/main.yaml is written" in output
+    assert "core_area: 1.0" in output
     stored = yaml.safe_load(Path("calibration/main.yaml").read_text())
     assert stored["made_from"] == "sim:ball?frames=200"
     assert stored["photometric"]["presses"] >= 8

@@ -39,6 +39,7 @@ WRONG: dict[str, list[dict[str, Any]]] = {
             {"tint": 2},
             {"creep": -1},
             {"border": 1},
+            {"core": 0},
         ),
         *({"method": "magic"}, {"edge": 1}),
     ],

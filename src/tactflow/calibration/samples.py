@@ -40,6 +40,11 @@ EDGE_SLOPE_RATIO: Final = 0.7
 the contact (Hertz); a thin layer is flat outside, and the blurred step has half of it at the edge."""
 EDGE_RINGS: Final = 16
 """Rings within `reach` on which the slope is averaged to find the edge: about a pixel at half resolution."""
+CORE_SHRINKAGE: Final = 0.8
+"""Relative decrease of the radius of a core with the fraction of the slope at its border, per unit of the
+fraction: 0.6 to 1.0 for balls on seven sensors."""
+HIGHEST_CORE: Final = 0.95
+"""Highest fraction at the border of a core: above, noise opens the ring of steep slopes."""
 FEWEST_PIXELS: Final = 12
 """Least number of pixels at half resolution inside a contact to judge its depth. Chosen by hand."""
 RIM: Final = 6
@@ -299,6 +304,17 @@ def core_ratio(
         ratios.append(core / sample.edge(sample.center(sample.start, weights), weights))
     known = [ratio for ratio in ratios if math.isfinite(ratio)]
     return float(np.median(known)) if known else None
+
+
+def fitting_core(ratio: float, core: float) -> float:
+    """Fraction of the slope at the border of a core that makes the core fit, see `core` of `difference`.
+
+    ratio : of `core_ratio`, found with the fraction `core`.
+
+    >>> round(fitting_core(1.08, 0.8), 2)
+    0.9
+    """
+    return min(core + (ratio - 1) / CORE_SHRINKAGE, HIGHEST_CORE)
 
 
 def upright(flat: Floats) -> Floats:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 from tactflow.calibration.file import DarknessEntry, LinearForceEntry
 from tactflow.calibration.force import Fit
 from tactflow.calibration.reference import Reference
+from tactflow.calibration.samples import fitting_core
+
+CORE_TOLERANCE: Final = 0.03
+"""Relative difference of two radii that is not worth a setting: the median of presses scatters by as much."""
 
 
 def darkness_words(found: DarknessEntry) -> str:
@@ -23,12 +28,24 @@ def photometric_words(errors: Mapping[str, float]) -> str:
     >>> photometric_words({"normal_error": 3.21, "depth_stderr": 0.1})
     'normals 3.2 degrees off in the mean, standard error of the depth 10 %'
     """
-    words = (
+    return (
         f"normals {errors['normal_error']:.1f} degrees off in the mean, "
         f"standard error of the depth {100 * errors['depth_stderr']:.0f} %"
     )
-    if ratio := errors.get("core_ratio"):
-        words += f"; core_area has {ratio:.2f} times the radius of the disc where the gel clings to the ball"
+
+
+def core_words(ratio: float, core: float) -> str:
+    """How the core of contacts compares with the ball, and which setting fits. Arguments: `fitting_core`.
+
+    >>> core_words(1.08, 0.8)
+    'core_area: 1.08 times the radius where the gel leaves the ball; core: 0.90 below difference fits better'
+    >>> core_words(1.02, 0.8)
+    'core_area: 1.02 times the radius where the gel leaves the ball'
+    """
+    words = f"core_area: {ratio:.2f} times the radius where the gel leaves the ball"
+    better = fitting_core(ratio, core)
+    if abs(ratio - 1) > CORE_TOLERANCE and better != core:
+        words += f"; core: {better:.2f} below difference fits better"
     return words
 
 

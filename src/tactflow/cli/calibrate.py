@@ -27,6 +27,7 @@ from tactflow.calibration.session import (
     learn_force,
     watch,
 )
+from tactflow.calibration.words import core_words
 from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
 from tactflow.engine.collect import with_collector
 from tactflow.engine.contract import Source
@@ -188,12 +189,22 @@ def _make(args: argparse.Namespace) -> int:
     page = _page(args, pipeline, guide) if args.view else {}
     session = find_presses(_player(loaded, page), None if args.ball_radius is None else guide)
     made_from = str(args.source or loaded.source.params.model_dump().get("source", ""))
-    learn(session, wish, base, say, sensor=loaded.sensor, made_from=made_from).save(out)
+    learned = learn(session, wish, base, say, sensor=loaded.sensor, made_from=made_from)
+    learned.save(out)
+    _compare_core(learned, loaded)
     say(
         f"{out} is written. To use it, add to the pipeline file: calibration: {out}\n"
         f"or to the command: {typed('--set', f'calibration={out}')}"
     )
     return 0
+
+
+def _compare_core(learned: Calibration, pipeline: Pipeline) -> None:
+    """Say how the cores of the contacts compare with the ball, if its presses have told."""
+    ratio = None if learned.photometric is None else learned.photometric.core_ratio
+    cores = [node.params.core for node in pipeline.nodes.values() if hasattr(node.params, "core")]
+    if ratio is not None and cores:
+        say(core_words(ratio, cores[0]))
 
 
 def _base(args: argparse.Namespace, pipeline: str | None) -> Calibration | None:

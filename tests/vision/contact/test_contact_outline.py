@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tactflow.vision.contact.contact_outline import CORE_SLOPE_FRACTION, contact_levels, largest_nearby
+from tactflow.vision.contact.contact_outline import (
+    contact_level,
+    largest_nearby,
+    relative_change,
+)
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
@@ -62,7 +66,7 @@ def punch(half_width: float = 32.0, half_height: float = 24.0) -> Float:
 
 def found(change: Float, core: NDArray[np.bool_], mixtures: Float = SLOPES) -> NDArray[np.bool_]:
     """Pixels in contact, of which some are known."""
-    return np.asarray(contact_levels(change, core.astype(np.uint8), mixtures)[0] > 0, np.bool_)
+    return np.asarray(contact_level(relative_change(change, mixtures), core.astype(np.uint8)) > 0, np.bool_)
 
 
 def hull_of(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -81,14 +85,15 @@ def test_a_disc_is_found_to_within_a_pixel(mixtures: Float) -> None:
 
 
 def test_a_higher_border_draws_the_outline_further_in() -> None:
-    change, core = tilted(disc()), (disc() < -4).astype(np.uint8)
-    areas = [int((level > 0).sum()) for level in contact_levels(change, core, SLOPES, (0.3, 0.55, 0.85))]
+    change, core = relative_change(tilted(disc()), SLOPES), (disc() < -4).astype(np.uint8)
+    areas = [int((contact_level(change, core, border) > 0).sum()) for border in (0.3, 0.55, 0.85)]
     assert areas == sorted(areas, reverse=True)
     assert areas[0] > areas[2]
 
 
 def test_the_core_of_a_contact_ends_where_the_gel_leaves_the_object() -> None:
-    (level,) = contact_levels(tilted(disc()), (disc() < -4).astype(np.uint8), SLOPES, [CORE_SLOPE_FRACTION])
+    shown = relative_change(tilted(disc()), SLOPES)
+    level = contact_level(shown, (disc() < -4).astype(np.uint8), 0.85)
     assert math.sqrt((level > 0).sum() / math.pi) == pytest.approx(30 - CLINGS, abs=1.0)
 
 
@@ -112,7 +117,7 @@ def test_what_the_core_does_not_reach_is_no_part_of_the_contact() -> None:
 def test_masks_are_left_as_they_are() -> None:
     change, core = tilted(disc()), (disc() < -4).astype(np.uint8)
     kept = change.copy(), core.copy()
-    contact_levels(change, core, SLOPES)
+    contact_level(relative_change(change, SLOPES), core)
     assert np.array_equal(change, kept[0])
     assert np.array_equal(core, kept[1])
 

@@ -13,9 +13,8 @@ core, where the gel clings to the object.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import reduce
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,33 +25,52 @@ BORDER_SLOPE_FRACTION: Final = 0.55
 """Slope at the border of a contact, as a fraction of its local maximum. Lower includes more of the
 surroundings and of wrinkled gel; higher opens the ring where the light is faint. On outlines of fifteen labs,
 values from 0.5 to 0.6 overlap equally well within 0.02 (`lab.judges.judge`)."""
-CORE_SLOPE_FRACTION: Final = 0.85
-"""The same where the gel leaves the object. Pressed by balls of known size, cores on four Minis have 0.99 to
-1.02 of the radius at which the gel leaves the ball, on two DIGITs 1.08 and 1.15, and on a thick Wedge 1.37
-(`lab.judges.radius`), where the slope has a plateau and higher fractions change little."""
+CORE_SLOPE_FRACTION: Final = 0.8
+"""The same where the gel leaves the object. Pressed by balls of known size, cores on four Minis have 0.97 to
+0.99 of the radius at which the gel leaves the ball, on two DIGITs 1.04 and 1.09, and on a thick Wedge 1.27
+(`lab.judges.radius`)."""
 BORDER_DEPTH_FRACTION: Final = 0.2
 """Depth at the border of a contact, as a fraction of its local maximum. Under a ball it is 0.32 on a
 half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap equally well with
 real outlines within 0.02."""
 
 
-def contact_levels(
-    change: Floats32, core: Mask, mixtures: Floats32, borders: Sequence[float] = (BORDER_SLOPE_FRACTION,)
-) -> list[Floats32]:
-    """Level sets of one contact's outlines.
+class RelativeChange(NamedTuple):
+    """What a window shows of a contact.
+
+    Attributes
+    ----------
+    values : (h, w) float32, size of the slope, or depth, over its local maximum.
+    border : of these values, the usual one at the outline of a contact.
+    """
+
+    values: Floats32
+    border: float
+
+
+def relative_change(change: Floats32, mixtures: Floats32) -> RelativeChange:
+    """The slope or depth of a gel over its local maximum.
+
+    change : (h, w, 3) float32, in the window of the contact, standard deviations; 0 outside its region.
+    mixtures : (k, 3) float32, weights of the channels; one mixture gives depth, several give slopes.
+    """
+    shows, border = _what_shows(change, mixtures)
+    return RelativeChange(np.asarray(shows / largest_nearby(shows), np.float32), border)
+
+
+def contact_level(change: RelativeChange, core: Mask, border: float = BORDER_SLOPE_FRACTION) -> Floats32:
+    """Level set of one contact's outline.
 
     Parameters
     ----------
-    change : (h, w, 3) float32, in the window of the contact, standard deviations; 0 outside its region.
+    change : in the window of the contact.
     core : (h, w) uint8, 1 where the contact certainly is, else 0; connected.
-    mixtures : (k, 3) float32, weights of the channels; one mixture gives depth, several give slopes.
-    borders : slope at each outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
+    border : slope at the outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
         fraction of the local depth is in proportion.
 
     Returns
     -------
-    levels : for each border (h, w) float32, positive inside the outline, negative outside; to be
-        interpolated.
+    level : (h, w) float32, positive inside the contact, negative outside; to be interpolated.
 
     Examples
     --------
@@ -61,19 +79,13 @@ def contact_levels(
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> disc = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
     >>> core = (disc == 1).astype(np.uint8)
-    >>> (level,) = contact_levels(np.stack([disc] * 3, axis=2), core, np.ones((1, 3), np.float32))
+    >>> change = relative_change(np.stack([disc] * 3, axis=2), np.ones((1, 3), np.float32))
+    >>> level = contact_level(change, core)
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
-    shows, usual = _what_shows(change, mixtures)
-    relative = np.asarray(shows / largest_nearby(shows), np.float32)
-    fractions = [min(usual * border / BORDER_SLOPE_FRACTION, 1.0) for border in borders]
-    return [_level(relative, core, fraction) for fraction in fractions]
-
-
-def _level(relative: Floats32, core: Mask, fraction: float) -> Floats32:
-    """Level set (h, w) of one outline; relative : (h, w), slope or depth over its local maximum."""
-    level = np.asarray(relative - np.float32(fraction), np.float32)
+    fraction = min(change.border * border / BORDER_SLOPE_FRACTION, 1.0)
+    level = np.asarray(change.values - np.float32(fraction), np.float32)
     inside = _around(np.asarray((level > 0) | (core > 0)), core)
     # Pixels that are filled in or removed get the extreme values of the level.
     np.clip(level, -0.5, 0.5, out=level)

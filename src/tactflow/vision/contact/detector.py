@@ -28,18 +28,20 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from tactflow.vision.arrays import Flags, Floats32, check_color_image, check_mask
 from tactflow.vision.contact.background import CELL_PX, BackgroundModel, Change
-from tactflow.vision.contact.components import contact_cells, wide_change
+from tactflow.vision.contact.components import SQUARE, contact_cells, wide_change
 from tactflow.vision.contact.contact_outline import (
     BORDER_SLOPE_FRACTION,
     CORE_SLOPE_FRACTION,
-    contact_levels,
+    contact_level,
     draw_level,
+    relative_change,
 )
 from tactflow.vision.contact.heights import HeightModel
 from tactflow.vision.contact.level_lines import ContactFinder
@@ -118,8 +120,8 @@ class ContactDetector:
     creep : largest fraction of its change that a released gel loses from one frame to the next, 0..1. A
         change that fades faster, but not to `relaxation` at once, is a contact being lifted. Higher ends a
         contact earlier.
-    border : slope at the outline as a fraction of its largest nearby, in (0, 1). Higher draws it further in;
-        from 0.85 on, the core is the same.
+    border : slope at the outline as a fraction of its largest nearby, in (0, 1). Higher draws it further in.
+    core : the same at the border of the core; at least `border`.
 
     Raises
     ------
@@ -147,6 +149,7 @@ class ContactDetector:
         relaxation: float = 0.2,
         creep: float = 0.1,
         border: float = BORDER_SLOPE_FRACTION,
+        core: float = CORE_SLOPE_FRACTION,
     ) -> None:
         if not 0 < false_alarms < 1:
             raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
@@ -162,13 +165,15 @@ class ContactDetector:
             raise ValueError(f"creep: required in [0, 1], got {creep}")
         if not 0 < border < 1:
             raise ValueError(f"border: required in (0, 1), got {border}")
+        if not 0 < core < 1:
+            raise ValueError(f"core: required in (0, 1), got {core}")
         self._false_alarms = false_alarms
         self._repeatability = repeatability
         self._tint = min(tint, repeatability)
         self._shift = shift
         self._relaxation = relaxation
         self._creep = creep
-        self._border = border
+        self._borders = border, max(border, core)
         self.reset()
 
     def reset(self) -> None:
@@ -256,13 +261,12 @@ class ContactDetector:
         assert self._before is not None
         heights = self._heights(self._background.signed_change(change))
         mask, inner = np.zeros((2, *shape), np.uint8)
-        borders = self._border, max(self._border, CORE_SLOPE_FRACTION)
         regions = self._contacts(heights, self._before)
         for rows, columns, inside, core in regions:
             window = self._background.window_change(change, rows, columns, inside)
-            surely = core.repeat(2, axis=0).repeat(2, axis=1)
-            levels = contact_levels(window, surely, heights.mixtures, borders)
-            for level, drawn in zip(levels, (mask, inner), strict=True):
+            shown = relative_change(window, heights.mixtures)
+            for border, surely, drawn in zip(self._borders, (core, _inner(core)), (mask, inner), strict=True):
+                level = contact_level(shown, surely.repeat(2, axis=0).repeat(2, axis=1), border)
                 draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, drawn)
         if not regions:
             draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL_PX)
@@ -316,3 +320,9 @@ class ContactDetector:
     def _limit(self, cells: int) -> float:
         """Detection threshold on squared deviations, corrected for the number of cells."""
         return chi_square_threshold(self._false_alarms / cells)
+
+
+def _inner(core: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Cells (h, w) surrounded by others of a region, if there are any: changes are smoothed by a cell."""
+    inner = cv2.erode(core, SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=(1.0,))
+    return np.asarray(inner, np.uint8) if inner.any() else core
