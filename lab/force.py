@@ -23,7 +23,8 @@ from pathlib import Path
 import numpy as np
 
 import tactflow
-from tactflow.calibration.force import Watched, Watcher, align, fit_force
+from tactflow.calibration.force import fit_force
+from tactflow.calibration.force_samples import Watched, Watcher, align
 from tactflow.calibration.reference import Reference, read_reference
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result

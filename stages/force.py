@@ -8,8 +8,11 @@ from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Unmarked, Untouched
-from tactflow.vision.force import LightChange, seen, seen_without_contact
-from tactflow.vision.types import Contact, Depth, Flow, Scale
+from tactflow.vision.arrays import Floats
+from tactflow.vision.field_force import displacement
+from tactflow.vision.flow.displacement_field import MIN_MARKERS, FieldModel
+from tactflow.vision.force import LightChange, Seen, seen, seen_without_contact
+from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 from tactflow.vision.types import Force as ForceOnGel
 
 logger = logging.getLogger("tactflow")
@@ -18,9 +21,11 @@ logger = logging.getLogger("tactflow")
 class Force(Stage):
     """Force in N, by the force part of the sensor's calibration; nothing without it.
 
-    A calibration without heights measures the change of the light of the whole gel. Where that is larger than
-    it is ever at rest, it is a force, though no contact is found: a soft object that covers all of the gel
-    has no outline. A contact larger than those that the calibration was fitted to is a warning, once.
+    Where the calibration measures the press by the displacement of the dots, every frame has a force. Else it
+    is that of a contact. A calibration with neither heights nor dots measures the change of the light of the
+    whole gel. Where that is larger than it is ever at rest, it is a force, though no contact is found: a soft
+    object that covers all of the gel has no outline. A contact or a force larger than those that the
+    calibration was fitted to is a warning, once.
 
     >>> import numpy as np
     >>> import tactflow
@@ -37,7 +42,8 @@ class Force(Stage):
         """Prepare. calibration : of the sensor."""
         super().__init__(params)
         self._entry = None if calibration is None else calibration.force
-        self._model = None if self._entry is None else self._entry.model()
+        field = None if calibration is None else calibration.field_force
+        self._model = None if self._entry is None else self._entry.model(field)
         self._warned = False
 
     def process(
@@ -48,11 +54,48 @@ class Force(Stage):
         untouched: Untouched,
         depth: Depth | None = None,
         flow: Flow | None = None,
+        markers: Markers | None = None,
     ) -> ForceOnGel | Absent:
         """The force of this frame's contact, or of the gel as a whole."""
-        model, known = self._model, self._entry
-        if model is None or known is None:
+        if self._model is None or self._entry is None:
             return Absent("no_calibration")
+        moved = None if markers is None else self._displacement(markers, scale, unmarked)
+        if self._model.press is None and moved is None:
+            return Absent("no_markers")
+        features = self._features(contact, scale, unmarked, untouched, depth, flow)
+        if isinstance(features, Absent):
+            return features
+        force = self._model.force(features, moved)
+        if not force.in_range and not self._warned:
+            self._warned = True
+            logger.warning(
+                "force: %.2f N is of a larger contact, or one with more shear, than those the calibration "
+                "was fitted to (%.2f to %.2f N); its standard error does not hold (said once)",
+                force.value[2],
+                *self._entry.pressing.range,
+            )
+        return force
+
+    def _displacement(self, markers: Markers, scale: Scale, image: Unmarked) -> Floats | None:
+        """(S, 2), mm, see `field_force`; None where it is unknown or not needed."""
+        if self._model is None or self._model.dots is None or len(markers.origin) < MIN_MARKERS:
+            return None
+        size = (image.shape[1], image.shape[0])
+        return displacement(self.once(FieldModel, markers.origin, size), markers, scale, size)
+
+    def _features(
+        self,
+        contact: Contact | None,
+        scale: Scale,
+        unmarked: Unmarked,
+        untouched: Untouched,
+        depth: Depth | None,
+        flow: Flow | None,
+    ) -> Seen | Absent:
+        """What light and heights show of the contact, or of the gel as a whole."""
+        model = self._model
+        if model is None or model.press is None:
+            return Seen({}, {}) if contact is None else seen(contact, scale, None, 0.0, flow)
         if contact is None and (model.needs_depth or model.least_change is None):
             return Absent("no_contact")
         change = 0.0
@@ -63,18 +106,7 @@ class Force(Stage):
             light_change = self.once(LightChange, untouched)
             change = scale.area(light_change(unmarked)) - model.change_at_rest
         if contact is not None:
-            features = seen(contact, scale, depth, change, flow)
-        elif model.least_change is not None and change > model.least_change:
-            features = seen_without_contact(change)
-        else:
-            return Absent("no_contact")
-        force = model.force(features)
-        if not force.in_range and not self._warned:
-            self._warned = True
-            logger.warning(
-                "force: %.2f N is of a larger contact, or one with more shear, than those the calibration "
-                "was fitted to (%.2f to %.2f N); its standard error does not hold (said once)",
-                force.value[2],
-                *known.press.range,
-            )
-        return force
+            return seen(contact, scale, depth, change, flow)
+        if model.least_change is not None and change > model.least_change:
+            return seen_without_contact(change)
+        return Absent("no_contact")

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactflow.calibration.force import Watched, fit_force
+from tactflow.calibration.force import fit_force
+from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.reference import Reference, read_reference, time_offset
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.force import Seen

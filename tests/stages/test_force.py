@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry, ScaleEntry
+from tactflow.calibration.file import Calibration, DotsForceEntry, ForceEntry, LinearForceEntry, ScaleEntry
 from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import Absent
 from tactflow.stages.force import Force
+from tactflow.vision.field_force import FieldForce
 from tactflow.vision.force import LightChange
-from tactflow.vision.types import Contact, Depth, Flow, Scale
+from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 
 SCALE = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
 GEL = np.full((24, 32, 3), 90, np.uint8)
@@ -28,18 +29,25 @@ BY_DEPTH = LinearForceEntry(
 )  # type: ignore[arg-type]
 BY_CHANGE = LinearForceEntry(stiffness={"root_change": 0.1}, greatest={"root_change": 90}, **FIT)  # type: ignore[arg-type]
 DRAG = LinearForceEntry(stiffness={"shear_by_area": 0.5}, greatest={"shear_by_area": 4.0}, **FIT)  # type: ignore[arg-type]
+BY_DOTS = FieldForce(
+    np.stack([np.tile([1 / 48, 0.0], 48), np.tile([0.0, 1 / 48], 48)]),
+    np.array([[2.0, 0, 0], [0, 2, 10], [0, 0, 0], [0, 0, 0], [0, 0, 0]]),
+)
+"""x and y are twice the mean displacement, z ten times that along y, N per mm."""
 
 
 def stage(
     folder: Path,
-    press: LinearForceEntry,
+    press: LinearForceEntry | None,
     drag: LinearForceEntry | None = None,
     least_change: float | None = None,
+    dots: dict[Any, DotsForceEntry] | None = None,
 ) -> Any:
     """The stage with a calibration that knows such a force."""
     force = ForceEntry(
         press=press,
         drag=drag,
+        dots=dots or {},
         change_at_rest=0.2,
         least_change=least_change,
         recordings={"a": 0.0},
@@ -55,6 +63,7 @@ def stage(
         scale=ScaleEntry.of(SCALE, "pitch"),
         look=np.full((12, 16, 3), 90, np.float32),
         force=force,
+        field_force=BY_DOTS if dots else None,
     )
     made.save(folder / "main.yaml")
     return Force(StageParams(), Calibration.load(folder / "main.yaml"))
@@ -142,3 +151,37 @@ def test_a_contact_beyond_the_fit_is_told_and_warned_of_once(
     (record,) = caplog.records
     assert "7.00 N is of a larger contact" in record.getMessage()
     assert "0.20 to 6.00 N" in record.getMessage()
+
+
+def dragged(x: float, y: float) -> Markers:
+    """Dots all over the gel that have moved by (x, y), px."""
+    across, down = np.meshgrid(np.arange(2.0, 32, 4), np.arange(2.0, 24, 4))
+    origin = np.column_stack([across.ravel(), down.ravel()])
+    return Markers(origin, origin + np.array([x, y]), np.zeros(48, np.uint8), np.full(48, 0.01))
+
+
+def test_dots_give_the_force_in_three_directions_without_a_contact(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    part = DotsForceEntry(error=(0.1, 0.05), range=(-1, 3), rmse=0.2, r2=0.9)
+    force = stage(tmp_path, None, dots=dict.fromkeys("xyz", part))
+    found = force.process(None, SCALE, GEL, GEL, markers=dragged(-3, 2))
+    # Mean displacement of (-0.3, 0.2) mm; between dots and beyond them it is estimated.
+    assert found.value == pytest.approx((-0.6, 0.4, 2.0), rel=0.1)
+    error = np.hypot(0.1, 0.05 * np.linalg.norm(found.value))
+    assert found.stderr == pytest.approx((error, error, error))
+    assert found.in_range
+    # Nothing pulls at the gel.
+    assert force.process(None, SCALE, GEL, GEL, markers=dragged(0, -2)).value[2] == 0
+    assert force.process(CONTACT, SCALE, GEL, GEL) == Absent("no_markers")
+    with caplog.at_level(logging.WARNING, "tactflow"):
+        assert not force.process(None, SCALE, GEL, GEL, markers=dragged(0, 4)).in_range
+    assert "was fitted to (-1.00 to 3.00 N)" in caplog.text
+
+
+def test_dots_may_give_the_drag_and_heights_the_press(tmp_path: Path) -> None:
+    part = DotsForceEntry(error=(0.1, 0.0), range=(-1, 3), rmse=0.2, r2=0.9)
+    force = stage(tmp_path, BY_DEPTH, dots={"x": part, "y": part})
+    found = force.process(CONTACT, SCALE, GEL, GEL, DEPTH, markers=dragged(3, 0))
+    assert found.value == pytest.approx((0.6, 0, 2 * 1.5 + 0.5 * 4), rel=0.1, abs=0.01)
+    assert force.process(None, SCALE, GEL, GEL, markers=dragged(3, 0)) == Absent("no_contact")

@@ -7,11 +7,13 @@ from typing import Final, NamedTuple
 
 from tactflow.calibration.darkness import darkness_error
 from tactflow.calibration.file import UNLIKE, Calibration, DarknessEntry, ForceEntry, PhotometricEntry
-from tactflow.calibration.force import Watched, try_force
+from tactflow.calibration.force import try_force
+from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.presses import Session
 from tactflow.calibration.reference import Reference
 from tactflow.calibration.samples import press_errors, summary
 from tactflow.calibration.words import darkness_words, photometric_words
+from tactflow.vision.field_force import FieldForce
 
 MIN_DRIFT_RATIO: Final = 1.5
 """Ratio of the error on new presses to the stored one above which a calibration counts as drifted."""
@@ -70,8 +72,10 @@ def _check_depth(
     return Comparison(error <= limit, lines)
 
 
-def check_force(then: ForceEntry, watched: Watched, readings: Reference) -> Comparison:
-    """Compare the force with the readings of a gauge."""
-    now = try_force(then, readings.name, watched, readings)
-    text = f"force: {now:.2f} N RMS from the gauge today; when it was made: {then.press.rmse:.2f} N"
-    return Comparison(now <= MIN_DRIFT_RATIO * then.press.rmse, [text])
+def check_force(
+    then: ForceEntry, field: FieldForce | None, watched: Watched, readings: Reference
+) -> Comparison:
+    """Compare the force with the readings of a gauge. field : of the force by dots, None without."""
+    now, usual = try_force(then, readings.name, watched, readings, field), then.pressing.rmse
+    text = f"force: {now:.2f} N RMS from the gauge today; when it was made: {usual:.2f} N"
+    return Comparison(now <= MIN_DRIFT_RATIO * usual, [text])

@@ -27,7 +27,8 @@ from tactflow.system.redaction import public_address
 from tactflow.vision.depth.darkness import DarknessModel
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel
 from tactflow.vision.depth.surface import SurfaceErrors
-from tactflow.vision.force import ForceModel, LinearForce
+from tactflow.vision.field_force import FieldForce
+from tactflow.vision.force import Accuracy, DotsForce, ForceModel, LinearForce
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.types import Scale
 
@@ -48,7 +49,9 @@ TERMS: Final = PLACE_TERMS * COLOUR_TERMS
 
 Pair = Annotated[tuple[float, float], BeforeValidator(tuple)]
 Size = Annotated[tuple[int, int], BeforeValidator(tuple)]
-LeftOut = Literal["object", "recording", "press"]
+AXES: Final[tuple[Literal["x", "y", "z"], ...]] = ("x", "y", "z")
+"""Components of a force, in order."""
+LeftOut = Literal["object", "recording", "press", "load"]
 
 
 class _Entry(BaseModel):
@@ -133,26 +136,52 @@ class LinearForceEntry(_Entry):
         return LinearForce(self.stiffness, self.greatest, self.error)
 
 
+class DotsForceEntry(_Entry):
+    """One component of the force by the displacement of the dots, and its cross-validated errors.
+
+    error : see `Accuracy`. range, rmse, r2 : as in `LinearForceEntry`.
+    """
+
+    error: Pair
+    range: Pair
+    rmse: float
+    r2: float
+
+    def model(self) -> Accuracy:
+        """What the stage `force` states about this component."""
+        return Accuracy(self.error, max(map(abs, self.range)))
+
+
 class ForceEntry(_Entry):
     """`force` of the file.
 
-    press : of z. drag : of x and y; None where the reference had no such columns. change_at_rest,
-    least_change : see `ForceModel`. recordings : source -> offset of its frames' time against that of its
-    CSV, s. presses : in all of them. left_out : what the errors are cross-validated over.
+    press : of z; None where the dots measure it better. drag : of x and y; None where the reference had no
+    such columns, or the flow does not explain them. dots : component ("x", "y", "z") -> its errors; the terms
+    are `field_force` of the `Calibration`. change_at_rest, least_change : see `ForceModel`. recordings :
+    source -> offset of its frames' time against that of its CSV, s. presses : or loads, in all of them.
+    left_out : what the errors are cross-validated over.
     """
 
-    press: LinearForceEntry
+    press: LinearForceEntry | None
     drag: LinearForceEntry | None = None
+    dots: dict[Literal["x", "y", "z"], DotsForceEntry] = Field(default_factory=dict)
     change_at_rest: float
     least_change: float | None = None
     recordings: dict[str, float]
     presses: int
     left_out: LeftOut
 
-    def model(self) -> ForceModel:
-        """The model that the stage `force` evaluates."""
-        drag = None if self.drag is None else self.drag.model()
-        return ForceModel(self.press.model(), drag, self.change_at_rest, self.least_change)
+    @property
+    def pressing(self) -> LinearForceEntry | DotsForceEntry:
+        """Errors of the component z."""
+        return self.dots["z"] if self.press is None else self.press
+
+    def model(self, field: FieldForce | None = None) -> ForceModel:
+        """The model that the stage `force` evaluates. field : None without dots."""
+        press, drag = (None if part is None else part.model() for part in (self.press, self.drag))
+        x, y, z = (None if (entry := self.dots.get(axis)) is None else entry.model() for axis in AXES)
+        dots = None if field is None or not self.dots else DotsForce(field, (x, y, z))
+        return ForceModel(press, drag, self.change_at_rest, self.least_change, dots)
 
 
 class Calibration(_Entry):
@@ -169,7 +198,7 @@ class Calibration(_Entry):
     look : (12, 16, 3) float32, the untouched gel without markers, grey levels, BGR.
     recorded : whether it comes from a recording, which was made with it.
     information : (114, 114) float64, `Photometry.information`, to refine it for another sensor; None without
-    slopes.
+    slopes. field_force : of the force by dots; None without.
     """
 
     model_config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, populate_by_name=True)
@@ -193,6 +222,7 @@ class Calibration(_Entry):
     recorded: bool = Field(False, exclude=True, repr=False)
     slopes: SlopeModel | None = Field(None, exclude=True, repr=False)
     information: NDArray[np.float64] | None = Field(None, exclude=True, repr=False)
+    field_force: FieldForce | None = Field(None, exclude=True, repr=False)
 
     @cached_property
     def scale(self) -> Scale:
@@ -240,6 +270,8 @@ class Calibration(_Entry):
         if self.information is not None:
             # It is symmetric.
             arrays["information"] = self.information[np.tril_indices(TERMS)].astype(np.float32)
+        if self.field_force is not None:
+            arrays["force_modes"], arrays["force_weights"] = self.field_force.modes, self.field_force.weights
         try:
             # Both are complete before either replaces an earlier calibration.
             with completed(path) as unfinished, completed(path.with_suffix(".npz")) as unfinished_arrays:
@@ -263,10 +295,23 @@ class Calibration(_Entry):
                 raise ValueError("its .npz is of another file")
             slopes = SlopeModel(arrays["slopes"]) if "slopes" in arrays else None
             information = _symmetric(arrays["information"]) if "information" in arrays else None
-            look = arrays["look"].astype(np.float32)
-            recorded = path.suffix == ".mcap"
-            loaded = cls(**document, look=look, slopes=slopes, information=information, recorded=recorded)
-            if (slopes is None) != (loaded.photometric is None):
+            field = (
+                FieldForce(arrays["force_modes"], arrays["force_weights"])
+                if "force_modes" in arrays
+                else None
+            )
+            loaded = cls(
+                **document,
+                look=arrays["look"].astype(np.float32),
+                slopes=slopes,
+                information=information,
+                field_force=field,
+                recorded=path.suffix == ".mcap",
+            )
+            by_dots = loaded.force is not None and bool(loaded.force.dots)
+            if loaded.force is not None and loaded.force.press is None and "z" not in loaded.force.dots:
+                raise ValueError("its force does not say how hard something presses")
+            if (slopes is None) != (loaded.photometric is None) or (field is None) == by_dots:
                 raise ValueError("its .npz is of another file")
             if loaded.darkness is not None:
                 loaded.darkness.model()

@@ -1,176 +1,70 @@
 """Fit the force on the gel to recordings made while a force gauge was read.
 
-`tactflow.vision.force` explains the features that the force is linear in. Stiffnesses are never negative, so
+`tactflow.vision.force` explains the features of a contact that the force is linear in, and
+`tactflow.vision.field_force` the terms of the displacement of the dots. Of the two, the one with the smaller
+error on forces left out is kept, for the press and sideways. Stiffnesses of contacts are never negative, so
 that the fit stays plausible a little outside of its range. The errors are cross-validated: each object in
-turn is left out, or each recording or press where there are too few of the others.
+turn is left out, or each recording, press or load where there are too few of the others.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.stats import norm, t
 
-from tactflow.calibration.file import ForceEntry, LeftOut, LinearForceEntry
-from tactflow.calibration.reference import Reference, TimeOffset, time_offset
+from tactflow.calibration.field_force import error_parts, fit_field
+from tactflow.calibration.file import AXES, DotsForceEntry, ForceEntry, LeftOut, LinearForceEntry
+from tactflow.calibration.force_samples import Aligned, Watched, align
+from tactflow.calibration.reference import Reference, TimeOffset
 from tactflow.engine.errors import ConfigError
-from tactflow.message.result import Result
 from tactflow.vision.arrays import Floats
-from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, LightChange, Seen, seen
+from tactflow.vision.field_force import FieldForce
+from tactflow.vision.force import BY_CHANGE, BY_SHEAR
 
-NEEDED: Final = {"contact": "hull", "untouched": "untouched", "scale": "scale"}
-"""Ports that a pipeline must have -> the stage that gives them; heights need `depth`, shear a flow."""
 FEWEST_PRESSES: Final = 4
 """Presses that a fit needs at least; ten or more are advised. Chosen by hand."""
 FEWEST_GROUPS: Final = 3
 """With at least this many objects, or else recordings, the fit is cross-validated over them. By hand."""
-GAP: Final = 3
-"""Frames without a contact that do not end a press: a light one flickers. Chosen by hand."""
-UNLOADED: Final = 0.01
-"""Force over the greatest of a recording, up to which nothing presses: the noise of a gauge."""
 FALSE_FORCES: Final = 0.01
 """Share of the frames at rest whose change of light exceeds the limit for a force without a contact."""
 FEWEST_AT_REST: Final = 20
 """Frames at rest from which this limit can be learned: fewer do not show how the light varies."""
-RATIOS: Final = np.concatenate([[0.0], np.logspace(-3, 1, 41)])
-"""Candidates for the ratio of the relative to the absolute part of the standard error, per N."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Watched:
-    """Features of the contacts in a recording, frame by frame; n frames.
-
-    frames, times : (n,) float64, number and time (s). press : feature -> (n,) float64, of `BY_DEPTH` where
-    heights are known, else of `BY_CHANGE`, which includes the change at rest; 0 where nothing touches.
-    drag : feature -> (n,) complex128, x + i y; NaN where the flow is not known. touched : (n,) bool.
-    change : (n,) float64, of the light of the whole gel, touched or not, mm^2. change_at_rest : see
-    `ForceModel`.
-    """
-
-    frames: Floats
-    times: Floats
-    press: dict[str, Floats]
-    drag: dict[str, NDArray[np.complex128]]
-    touched: NDArray[np.bool_]
-    change: Floats
-    change_at_rest: float
-
-
-class Watcher:
-    """Collects the features of results with pictures, from a pipeline with a scale (`NEEDED`) that skips
-    nothing."""
-
-    def __init__(self) -> None:
-        self._frames: list[tuple[int, float]] = []
-        self._contacts: list[Seen | None] = []
-        self._changes: list[float] = []
-        self._light: LightChange | None = None
-
-    def add(self, result: Result) -> None:
-        """Add one result."""
-        scale, unmarked, contact = result.scale, result.get("unmarked", result.image), result.contact
-        if scale is None or unmarked is None:
-            return
-        if self._light is None or self._light.untouched is not result["untouched"]:
-            self._light = LightChange(result["untouched"])
-        change = scale.area(self._light(unmarked))
-        self._frames.append((result.seq, result.t))
-        self._contacts.append(
-            None if contact is None else seen(contact, scale, result.depth, change, result.flow)
-        )
-        self._changes.append(change)
-
-    def watched(self) -> Watched:
-        """The features of all results. Raises ConfigError if there were none."""
-        if not self._frames:
-            raise ConfigError("calibrate force: the source has no frames")
-        frames, times = np.array(self._frames, float).T
-        contacts = [contact or Seen({}, {}) for contact in self._contacts]
-        touched = np.array([contact is not None for contact in self._contacts])
-        changes = np.array(self._changes)
-        at_rest = changes[~touched]
-        by_depth = any("volume" in contact.press for contact in contacts)
-        unknown = (math.nan, math.nan)
-        return Watched(
-            frames=frames,
-            times=times,
-            press={
-                name: np.array([contact.press.get(name, 0.0) for contact in contacts])
-                for name in (BY_DEPTH if by_depth else BY_CHANGE)
-            },
-            drag={
-                name: np.array([complex(*contact.drag.get(name, unknown)) for contact in contacts])
-                for name in BY_SHEAR
-            },
-            touched=touched,
-            change=changes,
-            change_at_rest=float(np.median(at_rest)) if len(at_rest) else 0.0,
-        )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Aligned:
-    """The n frames of a recording that have both a contact and a force.
-
-    name : of the recording. offset : of its time against the reference's. press : (n, k) float64.
-    drag : (n, 2) complex128. force : (n, 3) float64, N. presses : (n,) int, which press a frame belongs to.
-    change_unloaded : (m,), of the whole gel in frames without a contact and without a force, less that at
-        rest, mm^2.
-    """
-
-    name: str
-    offset: TimeOffset
-    press: Floats
-    drag: NDArray[np.complex128]
-    force: Floats
-    presses: NDArray[np.intp]
-    change_unloaded: Floats
-
-
-def align(name: str, watched: Watched, reference: Reference, change_at_rest: float) -> Aligned:
-    """Interpolate the force at the frames of a recording. change_at_rest : of the sensor, see `ForceModel`.
-
-    Raises ConfigError if nothing touches, or the reference is of another recording.
-    """
-    if not watched.touched.any():
-        raise ConfigError(
-            f"{name}: nothing touches the gel in {len(watched.times)} frames; the first must show it "
-            "untouched"
-        )
-    known = dict(watched.press)
-    if "root_change" in known:
-        known["root_change"] = np.maximum(known["root_change"] - change_at_rest, 0)
-    press = np.stack(list(known.values()), axis=1)
-    seconds = reference.seconds(watched.frames, watched.times)
-    offset = time_offset(reference, seconds, watched.times, press)
-    now = watched.times - offset.seconds
-    known_force = (now >= seconds[0]) & (now <= seconds[-1])
-    chosen = watched.touched & known_force
-    force = np.stack([np.interp(now, seconds, part) for part in reference.force.T], axis=1)
-    began = np.flatnonzero(chosen)
-    numbers = np.cumsum((np.diff(began, prepend=began[0]) > GAP).astype(np.intp))
-    drag = np.stack(list(watched.drag.values()), axis=1)
-    unloaded = np.abs(force[:, 2]) <= UNLOADED * float(np.abs(force[:, 2]).max())
-    at_rest = watched.change[~watched.touched & known_force & unloaded] - change_at_rest
-    return Aligned(name, offset, press[chosen], drag[chosen], force[chosen], numbers, at_rest)
+MOUNTED_STDERRS: Final = 2.0
+"""Standard errors from a quarter turn up to which the axes of a gauge count as parallel to the picture's."""
 
 
 class Fit(NamedTuple):
-    """entry : for the calibration file; without `drag` where the flow does not explain fx and fy. offsets :
-    recording -> that of its clock. turned : direction of the gauge's x axis in the picture, degrees,
-    counter-clockwise; None without fx and fy. mirrored : whether its y axis is mirrored relative to the
-    picture's."""
+    """entry : for the calibration file; sideways only what dots or the flow explain. offsets : recording ->
+    that of its clock. field : of the force by dots; None if it is worse, or there are no dots. turned :
+    direction of the gauge's x axis in the picture, degrees, counter-clockwise; None without fx and fy.
+    mirrored : whether its y axis is mirrored relative to the picture's."""
 
     entry: ForceEntry
     offsets: dict[str, TimeOffset]
+    field: FieldForce | None = None
     turned: float | None = None
     mirrored: bool = False
+
+
+class Turn(NamedTuple):
+    """How the axes of a gauge lie in the picture: the unit number that rotates its x + i y into the
+    picture's, and whether its y is mirrored first."""
+
+    factor: complex
+    mirrored: bool
+
+    def __call__(self, force: Floats) -> Floats:
+        """The same forces (n, 3) in the axes of the picture."""
+        sideways = force[:, 0] + 1j * force[:, 1]
+        turned = (sideways.conj() if self.mirrored else sideways) * self.factor
+        return np.column_stack([turned.real, turned.imag, force[:, 2]])
 
 
 def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference]) -> Fit:
@@ -186,45 +80,98 @@ def fit_force(watched: Mapping[str, Watched], references: Mapping[str, Reference
         raise ConfigError("calibrate force: heights are known in some of the recordings only")
     at_rest = float(np.median([recording.change_at_rest for recording in watched.values()]))
     aligned = [align(name, watched[name], references[name], at_rest) for name in watched]
-    first = np.cumsum([0, *(int(recording.presses.max()) + 1 for recording in aligned)])
-    presses = np.concatenate([part.presses + start for part, start in zip(aligned, first, strict=False)])
-    if first[-1] < FEWEST_PRESSES:
+    count = sum(part.count for part in aligned)
+    if count < FEWEST_PRESSES:
         raise ConfigError(
             f"calibrate force: required {FEWEST_PRESSES} presses or more (ten are better, by all that the "
-            f"sensor will meet), found {first[-1]} in {len(aligned)} recordings"
+            f"sensor will meet), found {count} in {len(aligned)} recordings"
         )
-    left_out, groups = _left_out(aligned, presses)
-    force = np.concatenate([part.force for part in aligned])
-    features = np.concatenate([part.press for part in aligned])
-    offsets = {part.name: part.offset for part in aligned}
     (features_of_press,) = names
-    by_depth = features_of_press != BY_CHANGE
+    sideways = all(references[name].sideways for name in watched)
+    return fit_aligned(aligned, features_of_press, at_rest, sideways)
+
+
+def fit_aligned(
+    aligned: Sequence[Aligned], features_of_press: Sequence[str], at_rest: float, sideways: bool
+) -> Fit:
+    """Fit the force to frames with known forces. sideways : whether fx and fy were measured. See `fit_force`.
+
+    Raises ConfigError if neither contacts nor dots show the force.
+    """
+    left_out, groups, field_groups = _left_out(aligned)
+    turn = _turn(aligned, groups, field_groups) if sideways else None
+    press, drag = _by_contact(aligned, features_of_press, groups, turn)
+    dots, field = _by_dots(aligned, field_groups, turn)
+    if press is None and "z" not in dots:
+        raise ConfigError("calibrate force: neither contacts nor dots are seen in two or more presses")
+    if press is not None and "z" in dots and press.rmse <= dots["z"].rmse:
+        del dots["z"]
+    by_flow = math.inf if drag is None else 2 * drag.rmse**2
+    if "x" in dots and by_flow <= dots["x"].rmse ** 2 + dots["y"].rmse ** 2:
+        del dots["x"], dots["y"]
     entry = ForceEntry(
-        press=_learn(features_of_press, features, force[:, 2], groups),
+        press=None if "z" in dots else press,
+        drag=drag,
+        dots=dots,
         change_at_rest=at_rest,
-        least_change=None if by_depth else _least_change(aligned),
+        least_change=None if tuple(features_of_press) != BY_CHANGE else _least_change(aligned),
         recordings={part.name: part.offset.seconds for part in aligned},
-        presses=int(first[-1]),
+        presses=sum(part.count for part in aligned),
         left_out=left_out,
     )
-    if not all(references[name].sideways for name in watched):
-        return Fit(entry, offsets)
+    offsets = {part.name: part.offset for part in aligned}
+    # y points down, so that a positive angle of a complex number is clockwise as seen.
+    angle = None if turn is None else -float(np.degrees(np.angle(turn.factor)))
+    return Fit(entry, offsets, field if dots else None, angle, turn is not None and turn.mirrored)
+
+
+def _by_contact(
+    aligned: Sequence[Aligned], names: Sequence[str], groups: NDArray[np.intp], turn: Turn | None
+) -> tuple[LinearForceEntry | None, LinearForceEntry | None]:
+    """The fits of the press and sideways to features of contacts; None where there is none.
+
+    groups : (n,), of all frames with a contact, left out in turn.
+    """
+    if len(np.unique(groups)) < 2:
+        return None, None
+    force = np.concatenate([part.force for part in aligned])
+    press = _learn(names, np.concatenate([part.press for part in aligned]), force[:, 2], groups)
     drag = np.concatenate([part.drag for part in aligned])
     known = np.isfinite(drag).all(axis=1)
-    if len(np.unique(groups[known])) < 2:
-        raise ConfigError(
-            "calibrate force: the CSV has fx and fy, but the flow of the contact is not known; add the "
-            "stages tracker and flow_in_mask, or leave these columns out"
-        )
-    drag, sideways, groups = drag[known], force[known, 0] + 1j * force[known, 1], groups[known]
-    turn, mirrored = _turn(drag, sideways)
-    sideways = (sideways.conj() if mirrored else sideways) * turn
+    if turn is None or len(np.unique(groups[known])) < 2:
+        return press, None
     # The same stiffness for x and y: both are samples of one fit.
-    both = [np.concatenate([part.real, part.imag]) for part in (*drag.T, sideways)]
-    learned = _learn(BY_SHEAR, np.stack(both[:-1], axis=1), both[-1], np.tile(groups, 2))
-    entry = entry.model_copy(update={"drag": learned if learned.r2 > 0 else None})
-    # y points down, so that a positive angle of a complex number is clockwise as seen.
-    return Fit(entry, offsets, -float(np.degrees(np.angle(turn))), mirrored)
+    x, y, _ = turn(force[known]).T
+    features = np.concatenate([drag[known].real, drag[known].imag])
+    learned = _learn(BY_SHEAR, features, np.concatenate([x, y]), np.tile(groups[known], 2))
+    return press, learned if learned.r2 > 0 else None
+
+
+def _by_dots(
+    aligned: Sequence[Aligned], groups: NDArray[np.intp], turn: Turn | None
+) -> tuple[dict[Literal["x", "y", "z"], DotsForceEntry], FieldForce | None]:
+    """The fit to the displacement of the dots: component -> its errors, and the terms; none without dots.
+
+    groups : (n,), of all frames with a field, left out in turn. Errors are those under load.
+    """
+    fields = [part.field for part in aligned if part.field is not None]
+    if len(np.unique(groups)) < FEWEST_GROUPS or len(fields) < len(aligned):
+        return {}, None
+    force = np.concatenate([part.force for part in fields])
+    force = np.column_stack([np.full((len(force), 2), np.nan), force[:, 2]]) if turn is None else turn(force)
+    fit = fit_field(np.concatenate([part.moved for part in fields]), force, groups)
+    loaded = np.concatenate([part.loaded for part in fields])[fit.kept]
+    length = np.sqrt(np.nansum(np.square(fit.predicted[loaded]), axis=1))
+    entries = {
+        axis: DotsForceEntry(
+            **_quality(known[fit.kept][loaded], said[loaded], groups[fit.kept][loaded], length)
+        )
+        for axis, known, said in zip(AXES, force.T, fit.predicted.T, strict=True)
+        if np.isfinite(known).all()
+    }
+    if "x" in entries and min(entries["x"].r2, entries["y"].r2) <= 0:
+        del entries["x"], entries["y"]
+    return entries, fit.model
 
 
 def _least_change(aligned: Sequence[Aligned]) -> float | None:
@@ -236,31 +183,51 @@ def _least_change(aligned: Sequence[Aligned]) -> float | None:
     return max(float(np.quantile(at_rest, 1 - FALSE_FORCES)), 0.0)
 
 
-def _left_out(aligned: Sequence[Aligned], presses: NDArray[np.intp]) -> tuple[LeftOut, NDArray[np.intp]]:
-    """What is left out in turn to cross-validate the fit, and the group of each frame, (n,)."""
+def _left_out(aligned: Sequence[Aligned]) -> tuple[LeftOut, NDArray[np.intp], NDArray[np.intp]]:
+    """What is left out in turn to cross-validate the fit, and the group of each frame with a contact and of
+    each with a field."""
     names = [Path(part.name).stem for part in aligned]
     # The names of recordings of one object differ in a number at the end.
     objects = [name.rstrip("0123456789").rstrip("_- ") for name in names]
+    presses = [part.presses for part in aligned]
+    loads = [np.zeros(0, np.intp) if part.field is None else part.field.loads for part in aligned]
     ways: list[tuple[LeftOut, list[str]]] = [("object", objects), ("recording", names)]
     for left_out, labels in ways:
         kinds, numbers = np.unique(labels, return_inverse=True)
         if len(kinds) >= FEWEST_GROUPS:
-            return left_out, np.repeat(numbers, [len(part.press) for part in aligned])
-    return "press", presses
+            by_press, by_load = (
+                np.repeat(numbers, [len(part) for part in parts]) for parts in (presses, loads)
+            )
+            return left_out, by_press, by_load
+    first = np.cumsum([0, *(max(map(len, parts)) + 1 for parts in zip(presses, loads, strict=True))])
+    by_press, by_load = (
+        np.concatenate([part + start for part, start in zip(parts, first, strict=False)])
+        for parts in (presses, loads)
+    )
+    return "load" if all(part.pictures for part in aligned) else "press", by_press, by_load
 
 
-def try_force(entry: ForceEntry, name: str, watched: Watched, reference: Reference) -> float:
-    """RMS error of the force z in another recording, N.
+def try_force(
+    entry: ForceEntry, name: str, watched: Watched, reference: Reference, field: FieldForce | None = None
+) -> float:
+    """RMS error of the force z in another recording, N. field : of the force by dots.
 
-    Raises ConfigError if the reference is of another recording, or heights are known in one of the two only.
+    Raises ConfigError if the reference is of another recording, heights are known in one of the two only, or
+    dots are needed and not seen.
     """
-    if watched.press.keys() != entry.press.stiffness.keys():
+    if entry.press is not None and watched.press.keys() != entry.press.stiffness.keys():
         raise ConfigError(
             f"{name}: heights are known here and not in the calibration, or the other way round"
         )
     aligned = align(name, watched, reference, entry.change_at_rest)
-    stiffness = np.array([entry.press.stiffness[feature] for feature in watched.press])
-    return float(np.sqrt(np.mean((aligned.press @ stiffness - aligned.force[:, 2]) ** 2)))
+    if entry.press is not None:
+        stiffness = np.array([entry.press.stiffness[feature] for feature in watched.press])
+        return float(np.sqrt(np.mean((aligned.press @ stiffness - aligned.force[:, 2]) ** 2)))
+    if field is None or aligned.field is None:
+        raise ConfigError(f"{name}: the calibration measures the force by dots, and none are seen here")
+    loaded = aligned.field.loaded
+    said = np.array([field(moved)[2] for moved in aligned.field.moved[loaded]])
+    return float(np.sqrt(np.mean((said - aligned.field.force[loaded, 2]) ** 2)))
 
 
 def _learn(
@@ -275,43 +242,73 @@ def _learn(
     for group in np.unique(groups):
         held = groups == group
         predicted[held] = features[held] @ nnls(features[~held], force[~held])[0]
-    residual = force - predicted
-    spread = float(((force - force.mean()) ** 2).sum())
     return LinearForceEntry(
         stiffness=dict(zip(names, (fitted / size).tolist(), strict=True)),
         greatest=dict(zip(names, size.tolist(), strict=True)),
-        error=_error(residual, predicted),
-        range=(float(force.min()), float(force.max())),
-        rmse=float(np.sqrt(np.mean(residual**2))),
-        r2=1 - float(residual @ residual) / spread if spread else 0.0,
+        **_quality(force, predicted, groups),
     )
 
 
-def _error(residual: Floats, force: Floats) -> tuple[float, float]:
-    """Maximum likelihood estimate of the absolute and the relative part of the standard error.
+def _quality(
+    force: Floats, predicted: Floats, groups: NDArray[np.intp], length: Floats | None = None
+) -> dict[str, Any]:
+    """error, range, rmse and r2 of an entry. force, predicted : (n,), N, the latter by the other groups.
+    length : (n,), N, that a part of the error is relative to; default: predicted.
 
-    residual, force : (n,), N.
-
-    >>> force = np.tile([1.0, 10.0], 500)
-    >>> absolute, relative = _error(force * np.random.default_rng(1).normal(0, 0.1, 1000), force)
-    >>> absolute < 0.02, round(relative, 1)
-    (True, 0.1)
+    The spread of few independent errors is uncertain, and so the stated error is the half width of the
+    interval that holds 68 % of them (Student). Errors in a group may resemble each other: their sums say how
+    many are independent, between the number of groups and that of frames.
     """
-    forms = 1 + (RATIOS[:, None] * force) ** 2
-    variances = np.maximum(np.mean(residual**2 / forms, axis=1), 1e-30)
-    best = int(np.argmin(len(residual) * np.log(variances) + np.log(forms).sum(axis=1)))
-    absolute = math.sqrt(variances[best])
-    return absolute, float(RATIOS[best]) * absolute
+    residual = force - predicted
+    spread = float(((force - force.mean()) ** 2).sum())
+    sums = np.array([residual[groups == group].sum() for group in np.unique(groups)])
+    independent = len(residual) * float(residual @ residual) / max(float(sums @ sums), 1e-30)
+    few = float(t.ppf(norm.cdf(1), max(independent, len(sums)) - 1))
+    absolute, relative = error_parts(residual, predicted if length is None else length)
+    return {
+        "error": (few * absolute, few * relative),
+        "range": (float(force.min()), float(force.max())),
+        "rmse": float(np.sqrt(np.mean(residual**2))),
+        "r2": 1 - float(residual @ residual) / spread if spread else 0.0,
+    }
 
 
-def _turn(drag: NDArray[np.complex128], force: NDArray[np.complex128]) -> tuple[complex, bool]:
-    """The unit number that rotates the gauge's axes into the picture's, and whether y is mirrored first.
+def _turn(aligned: Sequence[Aligned], groups: NDArray[np.intp], field_groups: NDArray[np.intp]) -> Turn:
+    """How the gauge is mounted: the gel moves in the direction of the force.
 
-    The gel moves in the direction of the force, so the flow shows how the gauge is mounted.
+    The flow of the contacts shows it, or else the mean displacement of the dots. A gauge is usually mounted
+    parallel to the picture, and no gel is equally stiff in all directions: a quarter turn is kept unless the
+    jackknife over groups contradicts it.
+
+    Raises ConfigError where neither is known.
     """
-    moved = drag[:, 0]
-    plain, mirror = complex((moved * force.conj()).sum()), complex((moved * force).sum())
-    mirrored = abs(mirror) > abs(plain)
-    direction = mirror if mirrored else plain
-    strength = abs(direction)
-    return (direction / strength if strength else 1 + 0j), mirrored
+    moved = np.concatenate([part.drag[:, 0] for part in aligned])
+    force = np.concatenate([part.force for part in aligned])
+    known = np.isfinite(moved)
+    if len(np.unique(groups[known])) < 2:
+        fields = [part.field for part in aligned if part.field is not None]
+        if not fields:
+            raise ConfigError(
+                "calibrate force: the CSV has fx and fy, but the flow of the contact is not known; add the "
+                "stages tracker and flow_in_mask, or leave these columns out"
+            )
+        mean = np.concatenate([part.moved.mean(axis=1) for part in fields])
+        moved, groups = mean[:, 0] + 1j * mean[:, 1], field_groups
+        force, known = np.concatenate([part.force for part in fields]), np.isfinite(moved)
+    sideways = force[known, 0] + 1j * force[known, 1]
+    plain, mirror = (
+        np.array([(moved[known] * other)[groups[known] == group].sum() for group in np.unique(groups[known])])
+        for other in (sideways.conj(), sideways)
+    )
+    mirrored = abs(mirror.sum()) > abs(plain.sum())
+    parts = mirror if mirrored else plain
+    total = complex(parts.sum())
+    if not total:
+        return Turn(1 + 0j, False)
+    factor = total / abs(total)
+    # Angles relative to that of all, so that none wraps around.
+    without = np.angle((total - parts) / factor)
+    stderr = math.sqrt((len(parts) - 1) * float(np.var(without)))
+    quarter = 1j ** round(np.angle(factor) / (math.pi / 2))
+    parallel = abs(np.angle(factor / quarter)) <= MOUNTED_STDERRS * stderr
+    return Turn(complex(quarter) if parallel else factor, mirrored)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from tactflow.engine.errors import ConfigError
+from tactflow.sources.files import is_image, natural_key
 from tactflow.system.files import expanded
 from tactflow.system.spelling import joined
 from tactflow.vision.arrays import Floats
@@ -20,6 +21,7 @@ from tactflow.vision.arrays import Floats
 NAMES: Final = {
     "t": ("t", "time", "t_s", "time_s"),
     "frame": ("frame",),
+    "file": ("file", "picture"),
     "fx": ("fx", "fx_n", "force_x"),
     "fy": ("fy", "fy_n", "force_y"),
     "fz": ("fz", "fz_n", "force_z", "force", "force_n"),
@@ -65,11 +67,14 @@ class Reference:
         return bool(np.isfinite(self.force[:, :2]).all())
 
 
-def read_reference(path: Path) -> Reference:
+def read_reference(path: Path, source: str = "") -> Reference:
     """Read a CSV with a header: `t` (s) or `frame`, and `fz` (N); `fx` and `fy` if they were measured.
 
-    `NAMES` lists other headers that are understood. Further columns are ignored. Raises ConfigError for a
-    file that is not such a CSV, has too few lines, or a constant force.
+    For a folder of pictures, `file` names the picture of each line instead: a line without one has no force.
+    `NAMES` lists other headers that are understood. Further columns are ignored.
+
+    source : the recording or folder. Raises ConfigError for a file that is not such a CSV, has too few lines,
+    names another picture, or has a constant force.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "a.csv"
@@ -91,7 +96,11 @@ def read_reference(path: Path) -> Reference:
     table = {
         name: np.array([_number(f"{path}, line {number}: {name}", row, column) for number, row in rows])
         for name, column in columns.items()
+        if name != "file"
     }
+    if not {"t", "frame"} & {*table}:
+        names = [row[columns["file"]].strip() if columns["file"] < len(row) else "" for _, row in rows]
+        table["frame"] = _frames_of_files(path, names, source)
     clock = "t" if "t" in table else "frame"
     back = np.flatnonzero(np.diff(table[clock]) <= 0)
     if len(back):
@@ -115,7 +124,7 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
     columns = {
         name: found.index(word) for name, words in NAMES.items() for word in words[::-1] if word in found
     }
-    missing = [] if "t" in columns or "frame" in columns else ["t (s) or frame"]
+    missing = [] if {"t", "frame", "file"} & {*columns} else ["t (s) or frame"]
     missing += [] if "fz" in columns else ["fz (N)"]
     missing += [f"{name} (N)" for name in ("fx", "fy") if name not in columns and {"fx", "fy"} & {*columns}]
     if missing:
@@ -124,6 +133,24 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
             f"missing {joined(missing)}, found {', '.join(filter(None, found[:8])) or 'nothing'}"
         )
     return columns
+
+
+def _frames_of_files(path: Path, names: Sequence[str], source: str) -> Floats:
+    """(N,): the numbers of the frames that are named by their pictures in the folder `source`."""
+    folder = expanded(source)
+    pictures = sorted(filter(is_image, folder.iterdir()), key=_natural) if folder.is_dir() else []
+    numbers = {picture.name: float(number) for number, picture in enumerate(pictures)}
+    for line, name in enumerate(names, 2):
+        if name not in numbers:
+            raise ConfigError(
+                f"{path}, line {line}: file: {source or 'the source'} has no picture {name!r}; for a "
+                "recording that is not a folder of pictures, give t (s) or frame instead"
+            )
+    return np.array([numbers[name] for name in names])
+
+
+def _natural(picture: Path) -> list[tuple[int, int, str]]:
+    return natural_key(picture.name)
 
 
 def _number(what: str, row: Sequence[str], column: int) -> float:

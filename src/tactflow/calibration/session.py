@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
-from tactflow.calibration import force
+from tactflow.calibration import force_samples
 from tactflow.calibration.darkness import fit_darkness
 from tactflow.calibration.file import UNLIKE, Calibration, ScaleEntry, raw_corners, small_picture
+from tactflow.calibration.force import fit_force
 from tactflow.calibration.guide import Guide
 from tactflow.calibration.judgement import FEWEST_PRESSES, STRETCHED, doubt
 from tactflow.calibration.likeness import place
@@ -244,22 +245,23 @@ def _depth(
     return fields
 
 
-def watch(play: Play, calibration: Path) -> force.Watched:
+def watch(play: Play, calibration: Path) -> force_samples.Watched:
     """Features for the force. calibration : the file, with a scale."""
-    watcher = force.Watcher()
+    watcher = force_samples.Watcher()
 
-    def take(result: Result, _source: Source) -> bool:
+    def take(result: Result, source: Source) -> bool:
+        watcher.pictures = source.pictures
         watcher.add(result)
         return True
 
-    play(take, force.NEEDED, calibration)
+    play(take, force_samples.NEEDED, calibration)
     return watcher.watched()
 
 
 def learn_force(
     calibration: Calibration,
     gauges: Mapping[str, Path],
-    watched: Callable[[str], force.Watched],
+    watched: Callable[[str], force_samples.Watched],
     offset: float,
     say: Say,
 ) -> Calibration:
@@ -270,13 +272,13 @@ def learn_force(
 
     Raises TactflowError if none can be used.
     """
-    features: dict[str, force.Watched] = {}
+    features: dict[str, force_samples.Watched] = {}
     readings: dict[str, Reference] = {}
     for name, file in gauges.items():
         try:
-            reading = read_reference(file).later(offset)
+            reading = read_reference(file, name).later(offset)
             found = watched(name)
-            force.align(name, found, reading, found.change_at_rest)
+            force_samples.align(name, found, reading, found.change_at_rest)
         except TactflowError as problem:
             if len(gauges) == 1:
                 raise
@@ -286,7 +288,7 @@ def learn_force(
         say(f"{name}: {len(found.touched)} frames, {found.touched.sum()} of them with contact")
     if not features:
         raise ConfigError(f"calibrate force: none of the {len(gauges)} recordings can be used")
-    fit = force.fit_force(features, readings)
+    fit = fit_force(features, readings)
     for words in force_words(fit, readings):
         say(words)
-    return calibration.model_copy(update={"force": fit.entry})
+    return calibration.model_copy(update={"force": fit.entry, "field_force": fit.field})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from tactflow.calibration.file import DarknessEntry, LinearForceEntry
+from tactflow.calibration.file import DarknessEntry, DotsForceEntry, LinearForceEntry
 from tactflow.calibration.force import Fit
 from tactflow.calibration.reference import Reference
 from tactflow.calibration.samples import fitting_core
@@ -56,9 +56,15 @@ def force_words(fit: Fit, readings: Mapping[str, Reference]) -> list[str]:
         f"{name}: its clock is {offset.seconds:+.3f} +- {offset.stderr:.3f} s ahead of its CSV's, which is "
         "taken into account"
         for name, offset in fit.offsets.items()
+        if offset.stderr > 0
     ]
-    words.append(f"force, {entry.presses} presses: {_quality(entry.press, entry.left_out)}")
-    if "volume" not in entry.press.stiffness:
+    kind = "loads" if entry.left_out == "load" else "presses"
+    by_dots = ", by the displacement of the dots"
+    words.append(
+        f"force{by_dots if entry.press is None else ''}, {entry.presses} {kind}: "
+        f"{_quality(entry.pressing, entry.left_out)}"
+    )
+    if entry.press is not None and "volume" not in entry.press.stiffness:
         words.append(
             "heights are not known, so the force is fitted to the change of light and the area: it is valid "
             "only for objects like these"
@@ -68,18 +74,23 @@ def force_words(fit: Fit, readings: Mapping[str, Reference]) -> list[str]:
         words.append(
             f"the gauge's x axis lies {fit.turned:+.0f} degrees counter-clockwise in the picture{side}"
         )
-        if entry.drag is None:
-            words.append("fx and fy do not follow the flow of the contact, and are left out")
-        else:
+        if entry.drag is not None and "x" not in entry.dots:
             words.append(f"force sideways: {_quality(entry.drag, entry.left_out)}")
+        words.extend(
+            f"force along {axis}{by_dots}: {_quality(part, entry.left_out)}"
+            for axis, part in entry.dots.items()
+            if axis != "z"
+        )
+        if entry.drag is None and "x" not in entry.dots:
+            words.append("fx and fy do not follow the flow of the contact, and are left out")
     elif any(reading.sideways for reading in readings.values()):
         words.append("fx and fy are left out: not every CSV has them")
     return words
 
 
-def _quality(part: LinearForceEntry, left_out: str) -> str:
+def _quality(part: LinearForceEntry | DotsForceEntry, left_out: str) -> str:
     absolute, relative = part.error
-    groups = {"object": "objects", "recording": "recordings", "press": "presses"}[left_out]
+    groups = {"object": "objects", "recording": "recordings", "press": "presses", "load": "loads"}[left_out]
     return (
         f"RMS error {part.rmse:.2f} N of {part.range[0]:.1f} to {part.range[1]:.1f} N, "
         f"{100 * part.r2:.0f} % of the variance explained, on {groups} left out of the fit; "

@@ -13,7 +13,7 @@ from typing import Any, Final
 from tactflow.api import Settings, ended_by_signals, load, make_runner
 from tactflow.calibration.check import check, check_force
 from tactflow.calibration.file import Calibration
-from tactflow.calibration.force import Watched
+from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.guide import Guide
 from tactflow.calibration.reference import read_reference, recordings_with_csv
 from tactflow.calibration.session import (
@@ -239,7 +239,10 @@ def _check(args: argparse.Namespace) -> int:
             raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
         watched = watch(_player(_load(args, pipeline)), path)
         force_fits, lines = check_force(
-            calibration.force, watched, read_reference(args.csv).later(args.offset)
+            calibration.force,
+            calibration.field_force,
+            watched,
+            read_reference(args.csv, args.source or "").later(args.offset),
         )
         show(lines)
         fits = fits and force_fits

@@ -531,7 +531,9 @@ class Message(Part):
     )
     scale: Scale | None = sent("makes mm of px (calibrated)", if_known=True)
     slip: Slip | None = sent("of the contact (only where the pipeline has the stage slip)", if_known=True)
-    force: Force | None = sent("on the gel; only where something touches (calibrated)", if_known=True)
+    force: Force | None = sent(
+        "on the gel, where something touches; by dots, in every frame (calibrated)", if_known=True
+    )
     pose: Pose | None = sent(
         "of the object (only where the pipeline has the stage pose; calibrated)", if_known=True
     )

@@ -15,6 +15,8 @@ deep one shear times width (Mindlin). The same stiffness resists a twist: for a 
 torque per rad is the stiffness to shear times a^2 / 2 on a thin layer, whose springs each resist their own
 motion, and times a^2 on a deep gel, if that is incompressible and sticks to the object (Reissner and Sagoci).
 
+Where there are dots, `tactflow.vision.field_force` measures the force on the whole gel without a contact.
+
 References
 ----------
 K. L. Johnson, Contact Mechanics (1985): ch. 3.4, 3.7 and 3.9, 4.2 and 4.3, 7.2.
@@ -30,9 +32,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import check_color_image
+from tactflow.vision.arrays import Floats, check_color_image
 from tactflow.vision.contact.cells import MASKED_MEAN_GREY, to_cells, to_planes
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
+from tactflow.vision.field_force import FieldForce
 from tactflow.vision.geometry.valid_area import valid_area
 from tactflow.vision.types import Contact, Depth, Flow, Force, Scale
 
@@ -49,7 +52,7 @@ FAINT: Final = 0.02
 """Relative change due to noise and the fit of the lamps; a smaller change counts less than its root. The
 errors on real grasps are the same from 0.01 to 0.02; those on another day grow from 0.04 on."""
 BEYOND: Final = 1.1
-"""Largest feature of a contact in range, over the largest of the fit. Chosen by hand."""
+"""Largest feature of a contact, or force by dots, in range, over the largest of the fit. Chosen by hand."""
 
 
 class Seen(NamedTuple):
@@ -167,38 +170,93 @@ class LinearForce:
 
 
 @dataclass(frozen=True, slots=True)
-class ForceModel:
-    """The force on the gel from what is seen of a contact.
+class Accuracy:
+    """How well one component is known by the dots.
 
-    press : of z. drag : of x and of y, the same for both; None where the calibration had no such reference.
-    change_at_rest : the change of a gel that nothing touches, from noise alone, mm^2. least_change : beyond
-        it, from which the change is a force though no contact is found, as under a soft object that covers
-        all of the gel, mm^2; None: it never is.
+    error : (absolute, relative): the standard error is hypot(absolute, relative |F|), with |F| the length of
+    the force as far as it is known. greatest : largest force of the fit, N.
+    """
+
+    error: tuple[float, float]
+    greatest: float
+
+    def stderr(self, length: float) -> float:
+        """Standard error, N, where the whole force has a length, N."""
+        return math.hypot(self.error[0], self.error[1] * length)
+
+    def knows(self, value: float) -> bool:
+        """Whether the force is no farther than `BEYOND` from those of the fit."""
+        return abs(value) <= BEYOND * self.greatest
+
+
+@dataclass(frozen=True, slots=True)
+class DotsForce:
+    """The force by the dots. field : of the displacement. accuracy : of x, y and z; None: not known."""
+
+    field: FieldForce
+    accuracy: tuple[Accuracy | None, Accuracy | None, Accuracy | None]
+
+
+@dataclass(frozen=True, slots=True)
+class ForceModel:
+    """The force on the gel from what is seen of a contact, from its dots, or from both.
+
+    press : of z; None: the dots give it. drag : of x and of y, the same for both, and of the torque; None
+    where the calibration had no such reference. change_at_rest : the change of a gel that nothing touches,
+    from noise alone, mm^2. least_change : beyond it, from which the change is a force though no contact is
+    found, as under a soft object that covers all of the gel, mm^2; None: it never is. dots : None without;
+    what they give counts before drag.
 
     >>> model = ForceModel(LinearForce({"volume": 2.0}, {"volume": 1.0}, (0.1, 0.0)), None, 0.0)
     >>> model.force(Seen({"volume": 0.5, "area": 3.0}, {}))
     Force(value=(None, None, 1.0), stderr=(None, None, 0.1), in_range=True, torque=None)
     """
 
-    press: LinearForce
+    press: LinearForce | None
     drag: LinearForce | None
     change_at_rest: float
     least_change: float | None = None
+    dots: DotsForce | None = None
 
     @property
     def needs_depth(self) -> bool:
         """Whether it is no use without heights."""
-        return "root_change" not in self.press.stiffness
+        return self.press is not None and "root_change" not in self.press.stiffness
 
-    def force(self, contact: Seen) -> Force:
-        """The force of a contact. Raises KeyError where a feature of the press is missing."""
-        pressed = self.press.value(contact.press)
-        in_range = self.press.knows(contact.press)
-        if self.drag is None or not contact.drag:
-            return Force((None, None, pressed), (None, None, self.press.stderr(pressed)), in_range)
-        along = [{name: vector[axis] for name, vector in contact.drag.items()} for axis in (0, 1)]
-        x, y = (self.drag.value(features) for features in along)
-        in_range = in_range and all(self.drag.knows(features) for features in along)
-        stderr = (self.drag.stderr(x), self.drag.stderr(y), self.press.stderr(pressed))
-        torque = self.drag.value(contact.twist) if contact.twist else None
-        return Force((x, y, pressed), stderr, in_range, torque)
+    def force(self, contact: Seen, moved: Floats | None = None) -> Force:
+        """The force of a contact. moved : (S, 2) float64, mm, see `field_force.displacement`; None: unknown.
+
+        Raises KeyError where a feature of the press is missing, ValueError where the press is by dots and
+        these are unknown.
+        """
+        components = self._by_dots(moved)
+        if self.press is not None:
+            pressed = self.press.value(contact.press)
+            components[2] = pressed, self.press.stderr(pressed), self.press.knows(contact.press)
+        if self.drag is not None and contact.drag and components[0] is None:
+            for axis in (0, 1):
+                along = {name: vector[axis] for name, vector in contact.drag.items()}
+                dragged = self.drag.value(along)
+                components[axis] = dragged, self.drag.stderr(dragged), self.drag.knows(along)
+        x, y, z = components
+        if z is None:
+            raise ValueError("required the displacement of the dots, by which this calibration measures")
+        return Force(
+            (x and x[0], y and y[0], z[0]),
+            (x and x[1], y and y[1], z[1]),
+            all(component is None or component[2] for component in components),
+            self.drag.value(contact.twist) if self.drag is not None and contact.twist else None,
+        )
+
+    def _by_dots(self, moved: Floats | None) -> list[tuple[float, float, bool] | None]:
+        """Value and standard error, N, of x, y and z, and whether they are in range."""
+        if self.dots is None or moved is None:
+            return [None, None, None]
+        values = self.dots.field(moved).tolist()
+        # Nothing pulls at the gel; without this, noise at rest would.
+        values[2] = max(values[2], 0.0)
+        length = math.hypot(*(value for value in values if math.isfinite(value)))
+        return [
+            None if accuracy is None else (value, accuracy.stderr(length), accuracy.knows(value))
+            for value, accuracy in zip(values, self.dots.accuracy, strict=True)
+        ]

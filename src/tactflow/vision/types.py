@@ -306,7 +306,8 @@ class Force:
     value : (x, y, z), N, along the axes of `Scale`: z is how hard the object presses, >= 0; x and y are how
         it drags the gel. None for a component that the calibration does not know.
     stderr : standard error of each component, N; None where `value` is, NaN where it is not known.
-    in_range : whether the contact is like those the calibration was fitted to; `stderr` only holds there.
+    in_range : whether the contact, or the force by dots, is like those the calibration was fitted to;
+        `stderr` only holds there.
     torque : on the gel about z, through the middle of the contact, N mm, positive from x to y: what the
         elasticity of a round contact gives for the twist of the gel. None where that, or `value` of x and y,
         is not known.
