@@ -37,6 +37,8 @@ MISFIT_FREEDOM: Final = 44
 """Degrees of freedom of a misfit: see `MAX_MISFIT`."""
 MAX_MISFIT_RATIO: Final = float(f.isf(0.05, MISFIT_FREEDOM, MISFIT_FREEDOM))
 """Misfit over that of the best motion up to which another one fits as well: the F test, 5 %."""
+MAX_LOOPS: Final = 5
+"""Earlier keyframes with which one is registered in a round, at most: those that show most of its patch."""
 MAX_ROUNDS: Final = 5
 """Rounds of finding loops; each may show more, since poses are more accurate after the last one."""
 
@@ -83,11 +85,11 @@ def _overlapping(keyframes: Sequence[Keyframe], graph: Graph) -> list[tuple[int,
     for now, keyframe in enumerate(keyframes):
         far = np.linalg.norm(middles[: max(now - 1, 0)] - middles[now], axis=1)
         near = np.flatnonzero(far < reach[now] + np.array(reach[: len(far)])).tolist()
-        motions = [graph.poses[before] @ backs[now] for before in near]
-        shared = [
-            overlap(keyframes[i].imprint, keyframe.template, m) for i, m in zip(near, motions, strict=True)
-        ]
-        pairs += [(i, now) for i, share in zip(near, shared, strict=True) if share >= MIN_OVERLAP]
+        shared = {
+            i: overlap(keyframes[i].imprint, keyframe.template, graph.poses[i] @ backs[now]) for i in near
+        }
+        best = sorted(near, key=lambda i, shared=shared: -shared[i])[:MAX_LOOPS]  # type: ignore[misc]
+        pairs += [(i, now) for i in best if shared[i] >= MIN_OVERLAP]
     return pairs
 
 
@@ -97,12 +99,12 @@ def _loop(keyframes: Sequence[Keyframe], graph: Graph, before: int, now: int) ->
     Where several motions fit as well as the best one, their scatter is part of the error: a rod with a
     regular thread may be turned by any angle.
     """
-    found = []
-    for start in _starts(keyframes[before].template, graph.motion(before, now)):
+    found, covariance = [], graph.covariance(before, now)
+    for start in _starts(keyframes[before].template, graph.motion(before, now, covariance)):
         registration = registered(keyframes, before, now, start)
         if registration is not None:
             misfit, edge = registration
-            found.append((misfit, graph.contradiction(edge), edge))
+            found.append((misfit, graph.contradiction(edge, covariance), edge))
     if not found:
         return None
     misfit, contradiction, best = min(found, key=lambda one: one[0] + one[1])

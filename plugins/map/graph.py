@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from tactflow.vision.arrays import Floats, Indices
 from tactflow.vision.pose.rigid import adjoint, inverse, rigid, skew, vector
@@ -25,7 +25,6 @@ MAX_STEPS: Final = 20
 """Largest number of steps of Gauss-Newton; five are usual."""
 MIN_STEP_STDERRS: Final = 0.01
 """Length of the last step, in standard errors."""
-
 SMALL_RADIANS: Final = 1e-3
 """Angle below which a series with an error of its fourth power is used."""
 
@@ -44,29 +43,37 @@ class Graph:
     slope_error : by how much all slopes and heights are too small, relative.
     edges : measured motions, N - 1 at least, that connect all keyframes.
     anchor : index of the keyframe whose pose is known.
-    covariance : (6 N + 1, 6 N + 1): of e in true pose = rigid(e) @ pose of each keyframe, mm and radians, and
-        of `slope_error`.
+    solver : factorised information (6 N - 5, 6 N - 5) of the errors e in true pose = rigid(e) @ pose of each
+        keyframe but the anchor, mm and radians, and of `slope_error`.
     """
 
     poses: list[Floats]
     slope_error: float
     edges: list[Edge]
     anchor: int
-    covariance: Floats
+    solver: SuperLU
 
-    def motion(self, before: int, now: int) -> Edge:
-        """The motion between two keyframes; its covariance contains the error of the slopes."""
+    def covariance(self, *keyframes: int) -> Floats:
+        """(6 K + 1, 6 K + 1): of the errors of the poses of K keyframes, and of `slope_error`."""
+        places = np.concatenate([*(6 * index + np.arange(6) for index in keyframes), [6 * len(self.poses)]])
+        known = (places // 6 == self.anchor) & (places < 6 * len(self.poses))
+        rows = (places - 6 * (places > 6 * self.anchor + 5))[~known]
+        unit = np.zeros((6 * len(self.poses) - 5, len(rows)))
+        unit[rows, np.arange(len(rows))] = 1
+        covariance = np.zeros((len(places), len(places)))
+        covariance[np.ix_(~known, ~known)] = self.solver.solve(unit)[rows]
+        return covariance
+
+    def motion(self, before: int, now: int, covariance: Floats) -> Edge:
+        """The motion between two keyframes, with the error that the slopes cause. covariance : of both."""
         motion = np.asarray(self.poses[now] @ inverse(self.poses[before]))
-        edge = Edge(before, now, motion, np.zeros((6, 6)), np.zeros(6))
-        row = _row(edge, self.poses, self.slope_error)
-        covariance = row.by @ self.covariance[np.ix_(row.places, row.places)] @ row.by.T
-        return edge._replace(covariance=covariance)
+        by = _row(Edge(before, now, motion, np.eye(6), np.zeros(6)), self.poses, self.slope_error).by
+        return Edge(before, now, motion, by @ covariance @ by.T, np.zeros(6))
 
-    def contradiction(self, edge: Edge) -> float:
+    def contradiction(self, edge: Edge, covariance: Floats) -> float:
         """Squared distance of a new edge from this graph, in standard errors: chi squared with 6 degrees of
-        freedom."""
+        freedom. covariance : of its keyframes."""
         row = _row(edge, self.poses, self.slope_error)
-        covariance = self.covariance[np.ix_(row.places, row.places)]
         expected = edge.covariance + row.by @ covariance @ row.by.T
         return float(row.error @ np.linalg.solve(expected, row.error))
 
@@ -127,9 +134,7 @@ def optimised(
         slope_error += step[-1]
         if step @ (information @ step) < MIN_STEP_STDERRS**2 * size:
             break
-    covariance = np.zeros((size, size))
-    covariance[np.ix_(free, free)] = solver.solve(np.eye(len(free)))
-    return Graph(poses, float(slope_error), list(edges), anchor, covariance)
+    return Graph(poses, float(slope_error), list(edges), anchor, solver)
 
 
 def _normal_equations(

@@ -230,8 +230,7 @@ def unseen(contact: Contact, graph: Graph) -> Iterator[str]:
     for index, keyframe in enumerate(contact.keyframes):
         if keyframe.imprint.area < largest / 2:
             continue
-        part = slice(6 * index, 6 * index + 6)
-        covariance = graph.covariance[part, part]
+        covariance = graph.covariance(index)[:6, :6]
         place = keyframe.template.center
         moves = np.concatenate([np.eye(3), skew(place)], axis=1)
         for kind, matrix in enumerate((moves @ covariance @ moves.T, covariance[3:, 3:])):
@@ -259,7 +258,7 @@ def _vector(axis: Floats) -> str:
 
 def _facts(points: Points, contact: Contact, graph: Graph) -> Html:
     loops = len(graph.edges) - len(contact.edges)
-    stderr = float(np.sqrt(graph.covariance[-1, -1]))
+    stderr = float(np.sqrt(graph.covariance()[0, 0]))
     rows: Sequence[Sequence[object]] = [
         ["frames of the contact", contact.frames],
         ["keyframes", len(contact.keyframes)],

@@ -27,6 +27,8 @@ NEIGHBOURS: Final = 32
 """Largest number of points that are averaged: those of ten patches, three each."""
 REACH_CELLS: Final = 1.0
 """Standard deviation of the weights along the surface, cells: what one cell averages already."""
+BLOCK_POINTS: Final = 10_000
+"""Points that are moved at once, so that a large surface does not take much memory."""
 STEPS: Final = 2
 """Steps of each point towards the surface; the second moves it by less than a tenth of the first."""
 
@@ -96,18 +98,23 @@ def merged(keyframes: Sequence[Keyframe], graph: Graph) -> Points:
     """
     patches = []
     for index, (keyframe, pose) in enumerate(zip(keyframes, graph.poses, strict=True)):
-        part = [*range(6 * index, 6 * index + 6), -1]
-        patches.append(patch(keyframe, pose, graph.slope_error, graph.covariance[np.ix_(part, part)]))
-    names = [field.name for field in fields(Points)]
-    points = Points(*(np.concatenate([getattr(part, name) for part in patches]) for name in names))
+        patches.append(patch(keyframe, pose, graph.slope_error, graph.covariance(index)))
+    points = _joined(patches)
     cell = float(np.mean(keyframes[0].imprint.cell))
     places, normals = _per_cell(points.place, points.normal, cell)
     tree = cKDTree(points.place)
     for _ in range(STEPS):
-        found = _averaged(tree, points, places, normals, cell)
+        starts = range(0, len(places), BLOCK_POINTS)
+        blocks = [slice(start, start + BLOCK_POINTS) for start in starts]
+        found = _joined([_averaged(tree, points, places[one], normals[one], cell) for one in blocks])
         places, normals = found.place, found.normal
     kept = _one_per_cell(found.place, cell)
     return found.at(kept[found.weight[kept] > 0])
+
+
+def _joined(parts: Sequence[Points]) -> Points:
+    names = [field.name for field in fields(Points)]
+    return Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _averaged(tree: cKDTree, points: Points, places: Floats, normals: Floats, cell: float) -> Points:

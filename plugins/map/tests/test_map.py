@@ -87,7 +87,9 @@ def test_a_place_that_is_touched_again_closes_a_loop(plate: Contact) -> None:
     last = len(plate.keyframes) - 1
     assert plain.edges == plate.edges
     assert any(loop.before < 3 and loop.now > last - 3 for loop in loops)
-    ends = [np.trace(one.motion(0, last).covariance[:3, :3]) for one in (plain, graph)]
+    ends = [
+        np.trace(one.motion(0, last, one.covariance(0, last)).covariance[:3, :3]) for one in (plain, graph)
+    ]
     assert ends[1] < ends[0] / 2
 
 
@@ -149,11 +151,23 @@ def test_a_closed_loop_shows_how_wrong_all_slopes_are() -> None:
     before = optimised(chained(edges, 0), edges, 0, 0.1)
     after = optimised(before.poses, [*edges, loop], 0, 0.1)
     assert before.slope_error == pytest.approx(0)
-    assert before.contradiction(loop) < 6
+    assert before.contradiction(loop, before.covariance(0, 24)) < 6
     assert after.slope_error == pytest.approx(0.05, abs=0.006)
-    assert after.covariance[-1, -1] ** 0.5 < 0.01
+    assert after.covariance()[0, 0] ** 0.5 < 0.01
     half = after.poses[12][:3, :3]
     assert np.arccos((np.trace(half) - 1) / 2) == pytest.approx(np.pi, abs=0.05)
+
+
+def test_the_pose_of_the_anchor_is_known_and_far_ones_are_less_so() -> None:
+    edges = rolled(0.0)
+    graph = optimised(chained(edges, 7), edges, 7, 0.1)
+    assert graph.covariance(7).shape == (7, 7)
+    assert not graph.covariance(7)[:6].any()
+    both = graph.covariance(3, 20)
+    np.testing.assert_allclose(both, both.T, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(both[6:, 6:], graph.covariance(20))
+    assert both[6 + 4, 6 + 4] > both[4, 4] > 0
+    assert both[-1, -1] == pytest.approx(0.1**2)
 
 
 def test_turns_about_a_fixed_axis_are_multiples_of_one_twist() -> None:
