@@ -194,7 +194,8 @@ class RunningNode:
                 reasons[slot] = value.reason
             elif inherited is not None:
                 reasons[slot] = inherited
-        self._count(values)
+        if self._counted:
+            self._count(values)
 
     def _inherited_reason(self, reasons: Mapping[int, str]) -> str | None:
         """Why its outputs are repeated: the reason of the first input, if all connected inputs have one.
@@ -214,7 +215,8 @@ class RunningNode:
         for number, slot in enumerate(self.slots):
             tick.values[slot] = absent if last is None else last[number]
             tick.reasons[slot] = absent.reason
-        self._count(tick.values)
+        if self._counted:
+            self._count(tick.values)
 
     def _count(self, values: list[Any]) -> None:
         for slot, stats, is_signal in self._counted:
