@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Flags, Floats, Indices, Mask, Points, check_mask
 from tactflow.vision.compiled import kernel
@@ -213,8 +214,7 @@ class FieldModel:
 
     def _kernel(self, points: Points) -> Floats:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
-        x, y = points.T[:, :, None] - self.origin.T[:, None]
-        return matern(np.sqrt(x * x + y * y) / self._length)
+        return matern(cdist(points, self.origin) / self._length)
 
     def __call__(self, markers: Markers) -> DisplacementField | None:
         """The field of one frame; None where fewer than three markers are seen.
