@@ -1,23 +1,26 @@
-"""Measure what pictures cost on their way to other processes: shared memory against JPEG over ZeroMQ.
+"""Measure what pictures cost on their way to other processes: shared memory, ROS 2, JPEG over ZeroMQ.
 
     python lab/shared_memory.py                  # 4 sensors, 2 readers each, 60 Hz, 800 x 600
     python lab/shared_memory.py --sensors 1
 
 Each sensor is a process that hands pictures of a simulated gel to the sink alone, at a fixed rate, so that
-the cost is that of the transport. Each reader gets the pictures as arrays, with their messages. The table has
-the CPU time of a picture (user and system, all threads), which other load on the machine changes least, and
-the share of one processor that this is at the full rate.
+the cost is that of the transport. Each reader gets the pictures as arrays, with their messages. The images of
+ROS 2 (`ros_images.py`, after `make ros-env`) have no messages with them. The table has the CPU time of a
+picture (user and system, all threads), which other load on the machine changes least, and the share of one
+processor that this is at the full rate.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -36,7 +39,14 @@ CYCLE_FRAMES = 12
 """Pictures that are repeated: enough for JPEG to see different ones."""
 WARM_UP_FRAMES = 30
 """Pictures before the clock starts."""
-TRANSPORTS = {"shm": "shared memory", "jpeg": "JPEG (quality 80) over ZeroMQ"}
+TRANSPORTS = {
+    "shm": "shared memory",
+    "ros": "`sensor_msgs/Image` of ROS 2 (rclpy, Fast DDS)",
+    "jpeg": "JPEG (quality 80) over ZeroMQ",
+}
+ROS_PYTHON = Path(__file__).resolve().parents[1] / ".venv-ros" / "bin" / "python"
+ROS_ENVIRONMENT = {"ROS_DOMAIN_ID": "77", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+"""So that its nodes find each other alone."""
 BASE_PORT = 5790
 """First of the TCP ports that are used, one per sensor."""
 
@@ -112,12 +122,19 @@ def read(transport: str, sensor: int, frames: int) -> None:
 def measure(transport: str, sensors: int, readers: int, frames: int) -> str:
     """A row of the table."""
 
-    def start(*arguments: object) -> subprocess.Popen[str]:
+    def start(role: str, sensor: int) -> subprocess.Popen[str]:
+        if transport == "ros":
+            program, numbers = ROS_PYTHON.parents[2] / "lab" / "ros_images.py", [readers, frames]
+            given = [role, sensor, *numbers[role == "read" :]]
+            command = [str(ROS_PYTHON), str(program), *map(str, given)]
+            return subprocess.Popen(
+                command, stdout=subprocess.PIPE, text=True, env=os.environ | ROS_ENVIRONMENT
+            )
         command = [sys.executable, __file__, "--frames", str(frames), "--readers", str(readers), "--role"]
-        return subprocess.Popen([*command, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
+        return subprocess.Popen([*command, role, transport, str(sensor)], stdout=subprocess.PIPE, text=True)
 
-    writing = [start("write", transport, sensor) for sensor in range(sensors)]
-    reading = [start("read", transport, sensor) for sensor in range(sensors) for _ in range(readers)]
+    writing = [start("write", sensor) for sensor in range(sensors)]
+    reading = [start("read", sensor) for sensor in range(sensors) for _ in range(readers)]
     writers = [json.loads(process.communicate()[0]) for process in writing]
     seen = [json.loads(process.communicate()[0]) for process in reading]
     writer, reader = (statistics.median(cpu for cpu, _ in values) for values in (writers, seen))
@@ -149,6 +166,8 @@ def main() -> None:
     for sensors in args.sensors:
         for _ in range(args.turns):
             for transport in TRANSPORTS:
+                if transport == "ros" and not ROS_PYTHON.exists():
+                    continue
                 print(measure(transport, sensors, args.readers, args.frames), flush=True)
 
 
