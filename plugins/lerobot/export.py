@@ -1,5 +1,6 @@
 """`tactflow export lerobot`: datasets of LeRobot (layout v3.0) with pictures, contact, flow and markers at a
-constant rate, and all results between two pictures; of a calibrated sensor also in mm and N.
+constant rate, of one sensor or several, and all results between two pictures; of a calibrated sensor also in
+mm and N.
 
 The layout is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v3. Each recording is an
 episode, in files of its own.
@@ -9,59 +10,50 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable
+from collections import ChainMap
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tactflow import __version__
 from tactflow.engine.errors import StageError
-from tactflow.message.episodes import MarkerOrder, Moments, at_rate
+from tactflow.message.episodes import aligned
 from tactflow.system.extras import missing
 
-from .features import (
-    TACTILE_FEATURE,
-    Window,
-    description,
-    marker_features,
-    numbers,
-    padded_window,
-)
+from .columns import Row, SensorColumns
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from tactflow.message.episodes import Results
     from tactflow.message.result import Result
 
 log = logging.getLogger("tactflow")
 
 VERSION = "v3.0"
 """Version of the layout, which LeRobot checks."""
-PICTURE_PREFIX = "observation.images."
 INTEGERS = ("frame_index", "episode_index", "index", "task_index")
 """Integer columns that every dataset has, besides `timestamp`."""
-WINDOW_ROWS = "window rows"
-"""Key of a row of the table under which its window is kept until the length of all windows is known."""
 FILES_PER_FOLDER = 1000
 """Files per folder, as in LeRobot."""
+NO_OVERLAP = "its recordings have no time in common: are they of one session?"
 ENCODER_OPTIONS = {"crf": "18", "g": "2", "preset": "veryfast"}
 """Options of the encoder: hardly any visible loss, and every other picture is a key frame, for random access.
 Chosen by hand."""
-STATISTICS_STEP_FRAMES = 10
-"""Every 10th picture counts for the statistics. Chosen by hand."""
 
 
 def export(
     folder: Path,
-    episodes: Iterable[tuple[str, Iterable[Result]]],
+    episodes: Iterable[tuple[str, Results]],
     *,
     fps: int,
     task: str = "touch",
     pictures: str = "video",
+    sensors: Sequence[str] = (),
     **_: object,
 ) -> None:
     """Write a dataset, for `tactflow export`.
@@ -73,12 +65,14 @@ def export(
     fps : of the dataset, frames per second.
     task : description of the task.
     pictures : "video" (H.264, lossy) or "png" (lossless).
+    sensors : several, which each episode has; then its results are a mapping.
 
     Raises
     ------
     StageError : a package is missing, or a recording does not match the earlier ones. OSError : the files
         cannot be written.
     """
+    del sensors
     writer = DatasetWriter(folder, fps, task, video=pictures == "video")
     for name, results in episodes:
         log.info("%s: %d frames", name, writer.add(results))
@@ -100,49 +94,62 @@ class DatasetWriter:
         self._folder, self._fps, self._task, self._is_video = folder, fps, task, video
         self._episodes: list[dict[str, Any]] = []
         self._frames = 0
-        self._kind = self._camera = ""
-        self._shape: tuple[int, ...] = ()
-        self._features: dict[str, dict[str, Any]] = {}
-        self._moments: dict[str, Moments] = {}
-        self._order = MarkerOrder()
-        self._window = Window()
-        self._window_length = 0
-        self._colors = Moments()
-        self._sampled = 0
+        self._sensors: dict[str, SensorColumns] = {}
 
-    def add(self, results: Iterable[Result]) -> int:
+    def add(self, results: Results) -> int:
         """Write one episode; returns the number of its frames.
 
-        results : of one sensor, with pictures.
+        results : with pictures, of one sensor; or sensor -> its results, with times of one clock. Then the
+            episode is the time in which all run.
 
         Raises
         ------
-        StageError : the sensor or the size of its pictures differs from the episodes before, only some have a
+        StageError : a sensor or the size of its pictures differs from the episodes before, only some have a
             calibration, or there is no picture. OSError : the files cannot be written.
         """
+        streams = results if isinstance(results, Mapping) else {"": results}
+        for name in () if self._sensors else streams:
+            self._sensors[name] = SensorColumns(video=self._is_video, named=len(streams) > 1)
+        if streams.keys() != self._sensors.keys():
+            given, earlier = (", ".join(names) for names in (streams, self._sensors))
+            raise StageError(f"sensors {given}; the earlier ones are {earlier}: make two datasets")
         episode = len(self._episodes)
-        file = f"chunk-{episode // FILES_PER_FOLDER:03d}/file-{episode % FILES_PER_FOLDER:03d}"
-        rows: list[dict[str, Any]] = []
-        encode: Callable[[NDArray[np.uint8] | None], None] | None = None
-        with ExitStack() as stack:
-            for index, result in enumerate(at_rate(self._window.remember(results), self._fps)):
-                image = self._check(result)
-                if self._is_video and encode is None:
-                    path = self._folder / "videos" / self._camera / f"{file}.mp4"
-                    encode = _open_video(stack, path, self._fps, image)
-                rows.append(self._row(result, image, index, episode))
-                if encode is not None:
-                    encode(image)
-            # After a failed write, this would crash the process.
-            if encode is not None:
-                encode(None)
+        rows = self._read(streams, f"{_file(episode)}.mp4")
         if not rows:
-            raise StageError("there is no frame in it")
-        self._complete(rows)
-        self._write_rows(rows, self._folder / "data" / f"{file}.parquet")
+            raise StageError("there is no frame in it" if len(streams) == 1 else NO_OVERLAP)
+        for index, row in enumerate(rows):
+            integers = (index, episode, self._frames + index, 0)
+            row |= {"timestamp": index / self._fps} | dict(zip(INTEGERS, integers, strict=True))
+        self._write_rows(rows, self._folder / "data" / f"{_file(episode)}.parquet")
         self._episodes.append(self._episode(episode, len(rows)))
         self._frames += len(rows)
         return len(rows)
+
+    def _read(self, streams: Mapping[str, Iterable[Result]], video: str) -> list[Row]:
+        """The columns of all sensors in each frame of an episode; encodes the pictures, if as a video."""
+        rows: dict[str, list[Row]] = {name: [] for name in streams}
+        encoders: dict[str, Callable[[NDArray[np.uint8] | None], None]] = {}
+        watched = {name: self._sensors[name].remember(results) for name, results in streams.items()}
+        with ExitStack() as stack:
+            for index, moment in enumerate(aligned(watched, self._fps)):
+                for name, result in moment.items():
+                    sensor = self._sensors[name]
+                    image = sensor.check(result)
+                    if self._is_video and name not in encoders:
+                        path = self._folder / "videos" / sensor.camera / video
+                        encoders[name] = _open_video(stack, path, self._fps, image)
+                    rows[name].append(sensor.row(result, image, index))
+                    if self._is_video:
+                        encoders[name](image)
+            # After a failed write, this would crash the process.
+            for encode in encoders.values():
+                encode(None)
+        for name, own in rows.items():
+            if own:
+                self._sensors[name].complete(own)
+        return [
+            {k: v for part in parts for k, v in part.items()} for parts in zip(*rows.values(), strict=True)
+        ]
 
     def finish(self) -> None:
         """Write the description of the dataset."""
@@ -160,93 +167,28 @@ class DatasetWriter:
         tasks = pa.table({"task_index": [0], "task": [self._task]})
         _write(tasks.replace_schema_metadata({"pandas": json.dumps(pandas)}), meta / "tasks.parquet")
         (meta / "info.json").write_text(json.dumps(self._info(), indent=4))
-        (meta / "stats.json").write_text(json.dumps(self._statistics(), indent=4))
+        statistics = [sensor.statistics(self._frames) for sensor in self._sensors.values()]
+        (meta / "stats.json").write_text(json.dumps(dict(ChainMap(*statistics)), indent=4))
 
-    def _check(self, result: Result) -> NDArray[np.uint8]:
-        """The picture of a result, if it matches the earlier ones."""
-        image = result.image
-        if image is None:
-            raise StageError("the pipeline makes no picture: it needs a stage preprocess")
-        camera, size = f"{PICTURE_PREFIX}{result.sensor}", f"{image.shape[1]} x {image.shape[0]} pixels"
-        calibrated = result.scale is not None
-        kind = f"{camera}, {size}, with{'' if calibrated else 'out'} calibration"
-        if not self._kind:
-            self._kind, self._camera, self._shape = kind, camera, image.shape
-        if kind != self._kind:
-            raise StageError(f"{kind}; the earlier ones are {self._kind}: make two datasets")
-        if self._is_video and (image.shape[0] % 2 or image.shape[1] % 2):
-            raise StageError(f"pictures of {size}: a video needs even numbers; give --pictures png")
-        return image
+    def _features(self) -> dict[str, dict[str, Any]]:
+        """Columns of all sensors but those of pictures -> their descriptions."""
+        sensors = self._sensors.values()
+        return {name: feature for sensor in sensors for name, feature in sensor.features.items()}
 
-    def _row(self, result: Result, image: NDArray[np.uint8], index: int, episode: int) -> dict[str, Any]:
-        row: dict[str, Any] = {
-            f"{TACTILE_FEATURE}.{name}": values for name, values in numbers(result).items()
-        }
-        row |= self._marker_rows(result)
-        row[WINDOW_ROWS] = self._window.take(result.t)
-        if index % STATISTICS_STEP_FRAMES == 0:
-            self._colors.add(image.reshape(-1, 3)[:, ::-1] / 255.0)
-            self._sampled += 1
-        if not self._is_video:
-            row[self._camera] = {"bytes": cv2.imencode(".png", image)[1].tobytes(), "path": None}
-        integers = (index, episode, self._frames + index, 0)
-        return row | {"timestamp": index / self._fps} | dict(zip(INTEGERS, integers, strict=True))
-
-    def _marker_rows(self, result: Result) -> dict[str, NDArray[Any]]:
-        """The features of the markers; empty before the first frame with markers."""
-        if result.markers is not None:
-            return marker_features(result.sensor, self._order.align(result.markers), result)
-        return {} if self._order.origin is None else marker_features(result.sensor, self._order.lost())
-
-    def _complete(self, rows: list[dict[str, Any]]) -> None:
-        """Complete the features of every row of an episode, and add their values to the statistics.
-
-        Raises
-        ------
-        StageError : this recording has markers, and those before had none.
-        """
-        sensor = self._camera.removeprefix(PICTURE_PREFIX)
-        if self._order.origin is not None:
-            lost = marker_features(sensor, self._order.lost())
-            rows[:] = [lost | row for row in rows]
-        self._complete_windows(rows, f"{TACTILE_FEATURE}.{sensor}.window")
-        values = [
-            {name: np.asarray(v) for name, v in row.items() if name.startswith(TACTILE_FEATURE)}
-            for row in rows
-        ]
-        if not self._features:
-            calibrated = f"{TACTILE_FEATURE}.contact_mm" in values[0]
-            self._features = {
-                name: description(name, value, calibrated=calibrated) for name, value in values[0].items()
-            }
-        if values[0].keys() != self._features.keys():
-            raise StageError("it has markers, and the recordings before have none: make two datasets")
-        for name in self._features:
-            self._moments.setdefault(name, Moments()).add(np.stack([arrays[name] for arrays in values]))
-
-    def _complete_windows(self, rows: list[dict[str, Any]], name: str) -> None:
-        """Give the windows one length, that of the longest in the first episode; one of a row is left out."""
-        windows = [row.pop(WINDOW_ROWS) for row in rows]
-        if not self._features:
-            self._window_length = max(map(len, windows))
-        if self._window_length > 1:
-            columns = len(windows[0][0])
-            for row, window in zip(rows, windows, strict=True):
-                row[name] = padded_window(window, self._window_length, columns)
-
-    def _write_rows(self, rows: list[dict[str, Any]], path: Path) -> None:
+    def _write_rows(self, rows: list[Row], path: Path) -> None:
         import pyarrow as pa
 
         types: dict[str, Any] = {}
-        for name, feature in self._features.items():
+        features = self._features()
+        for name, feature in features.items():
             value = pa.bool_() if feature["dtype"] == "bool" else getattr(pa, feature["dtype"])()
             length, *columns = feature["shape"]
             types[name] = pa.list_(pa.list_(value)) if columns else pa.list_(value, length)
-        if not self._is_video:
-            types[self._camera] = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        for sensor in () if self._is_video else self._sensors.values():
+            types[sensor.camera] = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
         types |= {"timestamp": pa.float32(), **dict.fromkeys(INTEGERS, pa.int64())}
         for row in rows:
-            row |= {name: np.asarray(row[name]).tolist() for name in self._features}
+            row |= {name: np.asarray(row[name]).tolist() for name in features}
         _write(pa.Table.from_pylist(rows, pa.schema(types)), path)
 
     def _episode(self, episode: int, frames: int) -> dict[str, Any]:
@@ -261,30 +203,14 @@ class DatasetWriter:
             "meta/episodes/file_index": 0,
         }
         row |= {f"data/{key}": value for key, value in place.items()}
-        if self._is_video:
-            video = place | {"from_timestamp": 0.0, "to_timestamp": frames / self._fps}
-            row |= {f"videos/{self._camera}/{key}": value for key, value in video.items()}
+        video = place | {"from_timestamp": 0.0, "to_timestamp": frames / self._fps}
+        for sensor in self._sensors.values() if self._is_video else ():
+            row |= {f"videos/{sensor.camera}/{key}": value for key, value in video.items()}
         return row
 
     def _info(self) -> dict[str, Any]:
-        camera: dict[str, Any] = {
-            "dtype": "video" if self._is_video else "image",
-            "shape": list(self._shape),
-            "names": ["height", "width", "channels"],
-        }
-        if self._is_video:
-            camera["info"] = {
-                "video.height": self._shape[0],
-                "video.width": self._shape[1],
-                "video.codec": "h264",
-                "video.pix_fmt": "yuv420p",
-                "video.is_depth_map": False,
-                "video.fps": self._fps,
-                "video.channels": 3,
-                "has_audio": False,
-            }
-        features: dict[str, Any] = {self._camera: camera}
-        features |= self._features
+        features = {one.camera: one.picture_feature(self._fps) for one in self._sensors.values()}
+        features |= self._features()
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INTEGERS}
         video_path = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -305,17 +231,10 @@ class DatasetWriter:
             "features": features,
         }
 
-    def _statistics(self) -> dict[str, Any]:
-        """Statistics for normalisation: of each number, and of each color (in [0, 1], red first)."""
-        statistics: dict[str, dict[str, Any]] = {
-            name: {key: value.tolist() for key, value in moments.summary().items()}
-            | {"count": [self._frames]}
-            for name, moments in self._moments.items()
-        }
-        colors = self._colors.summary()
-        statistics[self._camera] = {key: value.reshape(3, 1, 1).tolist() for key, value in colors.items()}
-        statistics[self._camera]["count"] = [self._sampled]
-        return statistics
+
+def _file(episode: int) -> str:
+    """Chunk and file of an episode, without the suffix."""
+    return f"chunk-{episode // FILES_PER_FOLDER:03d}/file-{episode % FILES_PER_FOLDER:03d}"
 
 
 def _open_video(

@@ -183,7 +183,7 @@ def description(name: str, value: NDArray[Any], *, calibrated: bool) -> dict[str
     calibrated : whether the sensor has a calibration.
     """
     dtype = "float32" if value.dtype.kind == "f" else value.dtype.name
-    ending = name.removeprefix(f"{TACTILE_FEATURE}.")
+    ending = name.rpartition(".")[2]
     if ending in CALIBRATED_NUMBERS:
         return {"dtype": dtype, "shape": [len(value)], "names": CALIBRATED_NUMBERS[ending]}
     names = CALIBRATED_NUMBERS if calibrated else PIXEL_NUMBERS
@@ -193,5 +193,5 @@ def description(name: str, value: NDArray[Any], *, calibrated: bool) -> dict[str
         "points": [*(["dx_mm", "dy_mm"] if calibrated else ["dx_px", "dy_px"]), "dz_mm", *FORCES],
         "points_mask": ["known"],
         "window": ["known", "t_s", *(f"{part}.{number}" for part in names for number in names[part])],
-    }[ending.rpartition(".")[2]]
+    }[ending]
     return {"dtype": dtype, "shape": list(value.shape), "names": {"components": components}}

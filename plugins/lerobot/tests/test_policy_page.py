@@ -51,8 +51,9 @@ def test_the_commands_that_need_no_robot_give_both_data_sets(tmp_path: Path) -> 
     assert printed.count("good: 60 frames") == 2
     assert len(list((tmp_path / "recordings").glob("*.mcap"))) == 4
     assert (tmp_path / "results" / "index.html").exists()
-    info = json.loads((tmp_path / "datasets" / "left" / "meta" / "info.json").read_text())
+    info = json.loads((tmp_path / "datasets" / "both" / "meta" / "info.json").read_text())
     assert (info["total_episodes"], info["fps"]) == (2, 30)
+    assert {"observation.images.left", "observation.images.right"} <= info["features"].keys()
     buffer = tmp_path / "datasets" / "left-buffer" / "replay_buffer.zarr"
     assert json.loads((buffer / "meta" / "episode_ends" / ".zarray").read_text())["shape"] == [2]
 

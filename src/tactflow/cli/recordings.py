@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -26,12 +26,13 @@ from tactflow.system.spelling import did_you_mean
 from tactflow.system.terminal import notes, progress_bar, say
 
 if TYPE_CHECKING:
-    from tactflow.message.result import Result
+    from tactflow.message.episodes import Results
 
 EXPORTS = "tactflow.exports"
 """Group of entry points: name of a format -> function that writes a dataset. It is called with a folder to
 fill, `(name, results)` of each recording, and `fps`, `task` and `pictures` as keywords. One whose
-`fps` is None by default can keep every frame and its time."""
+`fps` is None by default can keep every frame and its time. One that has `sensors` takes episodes of several
+sensors, of which `results` is then a mapping."""
 frame_rate = number(int, 1, 1000, "1 to 1000 frames a second")
 """Parses the frame rate of a dataset."""
 
@@ -48,6 +49,15 @@ def add_arguments_export(parser: argparse.ArgumentParser) -> None:
         "recordings",
         "SRC",
         "each becomes an episode: whatever `tactflow run --source` takes, except live sources",
+    )
+    parser.add_argument(
+        "--sensor",
+        action="append",
+        nargs="+",
+        default=[],
+        metavar=("NAME", "SRC"),
+        help="instead of SRC, for lerobot: a sensor and its recordings; once for each sensor. The first "
+        "recordings of all become an episode, with frames of the same time, then the second ones, and so on",
     )
     parser.add_argument(
         "--out", required=True, type=Path, metavar="DATASET", help="folder; must not exist yet"
@@ -81,41 +91,68 @@ def run_export(args: argparse.Namespace) -> int:
     ConfigError : there is no such format, or the folder is there already. Nothing was written.
     TactflowError : as `tactflow run`, or another run is writing to the folder; nothing is left behind.
     """
+    from tactflow.cli.sessions import of_sensors
     from tactflow.streaming import stream
 
-    find_exporter(args.format)
-    recordings = listed_sources(args, "recordings")
+    exporter = find_exporter(args.format)
+    sensors = _sensors(args)
+    if sensors and "sensors" not in signature(exporter).parameters:
+        raise ConfigError(f"--sensor: {args.format} takes the recordings of one sensor")
+    recordings = next(iter(sensors.values())) if sensors else listed_sources(args, "recordings")
     if args.out.is_file() or (args.out.is_dir() and any(args.out.iterdir())):
         raise ConfigError(f"--out: {args.out} already exists; give another folder")
 
-    def results(recording: str) -> Iterable[Result]:
+    sessions = iter([dict(zip(sensors, own, strict=True)) for own in zip(*sensors.values(), strict=True)])
+
+    def results(recording: str) -> Results:
+        if sensors:
+            return of_sensors(args.pipeline, next(sessions))
         return stream(args.pipeline, source=recording, settings={"sinks": {}}, images=True)
 
-    options = {"fps": args.fps, "task": args.task, "pictures": args.pictures}
+    options = {"fps": args.fps, "task": args.task, "pictures": args.pictures, "sensors": list(sensors)}
     say(write_dataset(args.format, recordings, results, args.out, **options))
     return 0
+
+
+def _sensors(args: argparse.Namespace) -> dict[str, list[str]]:
+    """Sensor -> its recordings. Raises ConfigError unless each is named once, with as many recordings."""
+    sensors = {name: recordings for name, *recordings in args.sensor}
+    counts = {len(recordings) for recordings in sensors.values()}
+    if not sensors:
+        return {}
+    if args.recordings or args.source:
+        raise ConfigError("--sensor: name the sensor of every recording, or of none")
+    if len(sensors) < max(2, len(args.sensor)) or len(counts) > 1 or 0 in counts:
+        found = ", ".join(f"{name} with {len(recordings)}" for name, *recordings in args.sensor)
+        raise ConfigError(
+            f"--sensor: required two or more, each once and with as many recordings, such as --sensor left "
+            f"left-1.mcap left-2.mcap --sensor right right-1.mcap right-2.mcap; got {found}"
+        )
+    return sensors
 
 
 def write_dataset(
     format_: str,
     recordings: Sequence[str],
-    results: Callable[[str], Iterable[Result]],
+    results: Callable[[str], Results],
     out: Path,
     *,
     fps: int | None = None,
     task: str = "touch",
     pictures: str = "video",
+    sensors: Sequence[str] = (),
 ) -> str:
     """Write a dataset with an episode for each recording; returns a line about it.
 
     Parameters
     ----------
     format_ : name of an export.
-    recordings : sources.
-    results : gives the results of a recording, with pictures.
+    recordings : sources; of several sensors, those of the first.
+    results : gives the results of a recording, with pictures, or those of each sensor.
     out : folder; replaced if it exists.
     fps : frame rate of the dataset, Hz; None: that of the first recording, or every frame if the format can.
     task, pictures : as for `tactflow export`.
+    sensors : names of several sensors, which only some formats take.
 
     Raises
     ------
@@ -128,14 +165,15 @@ def write_dataset(
     fps = fps if fps or keeps_every_frame else _rate(recordings[0])
     started: list[str] = []
 
-    def episodes() -> Iterator[tuple[str, Iterable[Result]]]:
+    def episodes() -> Iterator[tuple[str, Results]]:
         for recording in recordings:
             started.append(recording)
             yield recording, results(recording)
 
     try:
         with notes(), writing(out), locked_folder(out), completed(out.resolve()) as folder:
-            exporter(folder, episodes(), fps=fps, task=task, pictures=pictures)
+            several = {"sensors": sensors} if sensors else {}
+            exporter(folder, episodes(), fps=fps, task=task, pictures=pictures, **several)
     except StageError as error:
         raise StageError(f"{started[-1]}: {error}" if started else str(error)) from error
     count = len(recordings)

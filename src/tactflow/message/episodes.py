@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import chain
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,35 @@ if TYPE_CHECKING:
     from tactflow.message.result import Result
 
 
-def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
-    """The result nearest in time for each multiple of 1 / fps since the first result.
+Results: TypeAlias = "Iterable[Result] | Mapping[str, Iterable[Result]]"
+"""Of a recording, or sensor -> those of its recording, with times of one clock."""
+
+
+def aligned(sensors: Mapping[str, Iterable[Result]], fps: int) -> Iterator[dict[str, Result]]:
+    """The results of all sensors at each multiple of 1 / fps, from the first to the last that all have.
+
+    sensors : with times of one clock. Of each, the result nearest in time is taken.
+
+    >>> from types import SimpleNamespace
+    >>> def results(times): return [SimpleNamespace(t=t) for t in times]
+    >>> found = aligned({"left": results([1.0, 1.1, 1.2, 1.3]), "right": results([1.12, 1.18, 1.31])}, 10)
+    >>> [(moment["left"].t, moment["right"].t) for moment in found]
+    [(1.1, 1.12), (1.2, 1.18), (1.3, 1.31)]
+    """
+    streams = {name: iter(results) for name, results in sensors.items()}
+    first = {name: next(stream, None) for name, stream in streams.items()}
+    started = {name: result for name, result in first.items() if result is not None}
+    if len(started) < len(streams):
+        return
+    begin = max(result.t for result in started.values())
+    paced = [at_rate(chain([started[name]], stream), fps, begin) for name, stream in streams.items()]
+    # The shortest ends the episode.
+    for moment in zip(*paced, strict=False):
+        yield dict(zip(streams, moment, strict=True))
+
+
+def at_rate(results: Iterable[Result], fps: int, begin: float | None = None) -> Iterator[Result]:
+    """The result nearest in time for each multiple of 1 / fps since `begin`, s; by default the first result.
 
     >>> from types import SimpleNamespace
     >>> times = [5.0, 5.02, 5.21, 5.3]
@@ -26,16 +54,17 @@ def at_rate(results: Iterable[Result], fps: int) -> Iterator[Result]:
     [5.0, 5.02, 5.21, 5.3]
     """
     before: Result | None = None
-    begin, index = 0.0, 0
+    index = 0
     for result in results:
         if before is None:
-            before, begin = result, result.t
+            before, begin = result, result.t if begin is None else begin
+        assert begin is not None
         # In a tie, take the earlier one.
         while begin + index / fps < (before.t + result.t) / 2:
             yield before
             index += 1
         before = result
-    if before is not None and index <= round((before.t - begin) * fps):
+    if before is not None and begin is not None and index <= round((before.t - begin) * fps):
         yield before
 
 
