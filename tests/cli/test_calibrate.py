@@ -209,3 +209,40 @@ def test_a_recording_that_no_force_can_be_learned_from_is_left_out_by_name(termi
     Path("forces/good.csv").unlink()
     assert terminal("calibrate", "force", "gel.yaml", "--from", "forces", "--overwrite") == 2
     assert "none of the 2 recordings can be used" in terminal.err
+
+
+def test_weights_on_the_gel_give_newtons_without_a_gauge(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = open_scene("ball?frames=100")
+    firm = (12, 18, 40, 62)
+    newtons = [float(scene.truth(index).force[2]) for index in firm]
+    rest = scene.frame(0)[::2, ::2]
+    frames = [rest] * 4
+    for index in firm:
+        frames += [scene.frame(index)[::2, ::2]] * 31 + [rest] * 2
+    np.save("loads.npy", np.array(frames))
+    source = ["markerless", "--source", "loads.npy"]
+    assert terminal("calibrate", *source, "--area", "15", "20", "--out", "gel.yaml") == 0
+    grams = [f"{force / 9.80665e-3:.2f}" for force in newtons]
+    weigh = ["force", "gel.yaml", *source, "--weights"]
+    assert terminal("calibrate", *weigh, *grams[:-1]) == 2
+    assert f"got {len(firm) - 1} weights, and found {len(firm)} loads" in terminal.err
+    assert terminal("calibrate", *weigh, *grams) == 0
+    assert f"Put {float(grams[1]):.0f} g on the gel" in terminal.err
+    assert f"{len(firm)} loads: RMS error" in terminal.err
+    stored = yaml.safe_load(Path("gel.yaml").read_text())["force"]
+    assert stored["left_out"] == "load"
+    assert stored["press"]["range"] == pytest.approx([min(newtons), max(newtons)], rel=1e-3)
+    assert terminal("calibrate", *weigh) == 2
+    assert "has a force already" in terminal.err
+    assert terminal("calibrate", *weigh[:-1], "--overwrite", "--weights") == 2
+    assert "required the weights in g" in terminal.err
+    # Readings of a scale are asked for in the end; without one, a load is left out.
+    readings = iter([grams[0], "heavy", grams[1], "", grams[3]])
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda _: next(readings))
+    assert terminal("calibrate", *weigh[:-1], "--overwrite", "--weights") == 0
+    assert "write down what the scale reads" in terminal.err
+    assert "got 'heavy'" in terminal.err
+    assert "3 loads: RMS error" in terminal.err

@@ -263,7 +263,9 @@ def _quality(
     spread = float(((force - force.mean()) ** 2).sum())
     sums = np.array([residual[groups == group].sum() for group in np.unique(groups)])
     independent = len(residual) * float(residual @ residual) / max(float(sums @ sums), 1e-30)
-    few = float(t.ppf(norm.cdf(1), max(independent, len(sums)) - 1))
+    independent = max(independent, len(sums))
+    # One degree of freedom goes into the ratio of the two parts of the error.
+    few = float(t.ppf(norm.cdf(1), independent - 1)) * math.sqrt(independent / (independent - 1))
     absolute, relative = error_parts(residual, predicted if length is None else length)
     return {
         "error": (few * absolute, few * relative),

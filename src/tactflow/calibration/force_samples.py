@@ -63,11 +63,12 @@ class Watcher:
         self._light: LightChange | None = None
         self._once = Once()
 
-    def add(self, result: Result) -> None:
-        """Add one result."""
+    def add(self, result: Result) -> tuple[int, float, float] | None:
+        """Add one result. Returns its index, its time, s, and how much the gel shows: the RMS motion of the
+        dots, mm, or without dots the change of the light, mm^2. None for a result without pictures."""
         scale, unmarked, contact = result.scale, result.get("unmarked", result.image), result.contact
         if scale is None or unmarked is None:
-            return
+            return None
         if self._light is None or self._light.untouched is not result["untouched"]:
             self._light = LightChange(result["untouched"])
         change = scale.area(self._light(unmarked))
@@ -81,6 +82,12 @@ class Watcher:
         if markers is not None and len(markers.origin) >= MIN_MARKERS:
             moved = displacement(self._once(FieldModel, markers.origin, size), markers, scale, size)
         self._fields.append(moved)
+        level = change if moved is None else math.sqrt(float(np.square(moved).sum()) / len(moved))
+        return len(self._frames) - 1, result.t, level
+
+    def time(self, index: int) -> float:
+        """When a frame was taken, s."""
+        return self._frames[index][1]
 
     def watched(self) -> Watched:
         """The features of all results. Raises ConfigError if there were none."""

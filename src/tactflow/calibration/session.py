@@ -23,6 +23,7 @@ from tactflow.calibration.presses import NEEDED, PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference
 from tactflow.calibration.refine import apparent_radius, refine_photometry
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
+from tactflow.calibration.weights import WeightGuide
 from tactflow.calibration.words import darkness_words, force_words, photometric_words
 from tactflow.engine.contract import Source
 from tactflow.engine.errors import ConfigError, TactflowError
@@ -256,6 +257,24 @@ def watch(play: Play, calibration: Path) -> force_samples.Watched:
 
     play(take, force_samples.NEEDED, calibration)
     return watcher.watched()
+
+
+def weigh(play: Play, calibration: Path, guide: WeightGuide) -> None:
+    """Find the loads that a source shows; of a live one until all were put on. calibration : the file.
+
+    Raises ConfigError for pictures that were taken one by one.
+    """
+
+    def take(result: Result, source: Source) -> bool:
+        if source.pictures:
+            raise ConfigError(
+                "calibrate force --weights: pictures that were taken one by one do not show whether a load "
+                "lies still; name the force of each in a CSV instead, with the columns file and fz (--csv)"
+            )
+        guide.live = source.live
+        return not (guide(result) and source.live)
+
+    play(take, force_samples.NEEDED, calibration)
 
 
 def learn_force(

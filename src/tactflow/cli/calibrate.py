@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -26,8 +28,10 @@ from tactflow.calibration.session import (
     learn,
     learn_force,
     watch,
+    weigh,
 )
-from tactflow.calibration.words import core_words
+from tactflow.calibration.weights import WeightGuide, read_weights
+from tactflow.calibration.words import core_words, force_words
 from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
 from tactflow.engine.collect import with_collector
 from tactflow.engine.contract import Source
@@ -90,6 +94,12 @@ OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
         "metavar": "FILE",
         "help": "for force and check: readings of the gauge, if not beside the recording; columns t (s) or "
         "frame, fz (N), and optionally fx and fy",
+    },
+    "--weights": {
+        "nargs": "*",
+        "metavar": "G",
+        "help": "for force: weights that are put on the gel one after the other, g, in their order, or a CSV "
+        "with a column g, kg or fz; without a number, the readings of a scale are asked for in the end",
     },
     "--offset": {
         "type": float,
@@ -256,6 +266,8 @@ def _force(args: argparse.Namespace) -> int:
     calibration = Calibration.load(path)
     if calibration.force is not None and not args.overwrite:
         raise ConfigError(f"calibrate force: {path} has a force already; give --overwrite to replace it")
+    if args.weights is not None:
+        return _weigh(args, path, pipeline, calibration)
     if args.source is None:
         raise ConfigError(
             "calibrate force: required --source, a recording with a CSV of the same name beside it"
@@ -270,6 +282,40 @@ def _force(args: argparse.Namespace) -> int:
     return 0
 
 
+def _weigh(args: argparse.Namespace, path: Path, pipeline: str | None, calibration: Calibration) -> int:
+    """Fit the force to known weights, and write it into the calibration file."""
+    forces = read_weights(args.weights)
+    if not forces and not sys.stdin.isatty():
+        raise ConfigError(
+            "calibrate force --weights: required the weights in g, as nobody can be asked for them"
+        )
+    guide = WeightGuide(forces, say)
+    loaded = _load(args, pipeline)
+    weigh(_player(loaded, _page(args, pipeline, guide) if args.view else {}), path, guide)
+    fit = guide.finish(_reading)
+    for words in force_words(fit, {}):
+        say(words)
+    source = str(args.source or loaded.source.params.model_dump().get("source", ""))
+    entry = fit.entry.model_copy(update={"recordings": {source: 0.0}})
+    calibration.model_copy(update={"force": entry, "field_force": fit.field}).save(path)
+    say(f"the force is added to {path}")
+    return 0
+
+
+def _reading(time: float) -> float:
+    """The force of a load, N, by the reading of a scale; NaN without one."""
+    while True:
+        answer = input(f"reading of the scale at {time:.1f} s, g (Enter leaves this load out): ").strip()
+        if not answer:
+            return math.nan
+        try:
+            (force,) = read_weights([answer])
+        except ConfigError as problem:
+            say(str(problem))
+        else:
+            return force
+
+
 def _file_and_pipeline(args: argparse.Namespace, verb: str) -> tuple[Path, str | None]:
     if len(args.words) not in (1, 2):
         raise ConfigError(f"calibrate {verb}: required a calibration file, and a pipeline if wanted")
@@ -282,7 +328,7 @@ VERBS: Final[Mapping[str, tuple[Callable[[argparse.Namespace], int], str, str, S
         _make,
         "PIPELINE",
         "calibrate the sensor of a pipeline; the word make can be left out",
-        [name for name in OPTIONS if name not in ("--csv", "--offset")],
+        [name for name in OPTIONS if name not in ("--csv", "--offset", "--weights")],
     ),
     "check": (
         _check,
@@ -294,7 +340,7 @@ VERBS: Final[Mapping[str, tuple[Callable[[argparse.Namespace], int], str, str, S
         _force,
         "FILE [PIPELINE]",
         "fit the force, and add it to a calibration",
-        ("--realtime", "--csv", "--offset"),
+        ("--realtime", "--csv", "--offset", "--weights", "--view"),
     ),
 }
 """Verb -> what it does, its words, its description, and the options that matter to it."""
@@ -348,7 +394,7 @@ def _load(
     return load(pipeline, source=source, sensor=args.sensor, settings=settings, realtime=args.realtime)
 
 
-def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide) -> dict[str, Node]:
+def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide | WeightGuide) -> dict[str, Node]:
     """The live page of the pipeline, or else one with defaults, showing the guided session."""
     own, added = _load(args, pipeline), _load(args, pipeline, {"sinks.view": {}})
     node = next(node for node in (*own.sinks, *added.sinks) if node.component.name == "view")

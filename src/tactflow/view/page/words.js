@@ -62,9 +62,10 @@ export function pose({ pose }) {
 }
 
 // Progress of a session: [count, fraction, result of the last press, whether it is good].
-export function guide({ done, good, wanted, presses, lasts }) {
-  const count = `${done} of ${wanted} presses${good < done ? `, ${good} good` : ""}`;
+export function guide({ done, good, wanted, presses, lasts, noun = "presses", note }) {
+  const count = `${done} of ${wanted} ${noun}${good < done ? `, ${good} good` : ""}`;
   const share = Math.min(1, done / wanted);
+  if (note !== undefined) return [count, share, note, true];
   const last = presses[presses.length - 1];
   if (!last || lasts) return [count, share, "", true];
   return [count, share, `Press ${done}: ${last.fault ?? "good"}.`, last.fault === null];
