@@ -557,6 +557,11 @@ def test_a_session_of_presses_is_guided(staged: Callable[..., Stage], open_page:
     assert shows(page, "picture", lambda seen: seen != plain)
     stage.send(guided(3, lasts=True, now="Lift the ball.", presses=[]))
     until(page, "() => document.getElementById('guide-now').textContent === 'Lift the ball.'")
+    weights = {"now": "Take it off.", "note": "Load 2 is measured.", "noun": "loads", "good": 2, "next": None}
+    stage.send(guided(4, presses=[], **weights))
+    until(page, "() => document.getElementById('guide-now').textContent === 'Take it off.'")
+    assert page.inner_text("#guide-count") == "2 of 4 loads"
+    assert page.inner_text("#guide-last") == "Load 2 is measured."
     stage.send(state("main", end="signal"))
     until(page, "() => document.getElementById('empty-title').textContent === 'All presses are recorded'")
 

@@ -241,7 +241,7 @@ class WeightGuide:
             errors = self._fit(self._forces[:done]).entry.pressing
             share = errors.rmse / errors.range[1]
             words = f"RMS error on loads left out {errors.rmse:.2f} N, {100 * share:.0f} % of the largest"
-            enough = f": enough for up to {errors.range[1]:.1f} N, Ctrl-C ends"
+            enough = f": enough for up to {errors.range[1]:.1f} N{'' if self.is_enough else ', Ctrl-C ends'}"
             self._error = f"{words}{enough if share <= WANTED_ERROR else ''}."
 
     def _tell(self) -> None:
