@@ -260,7 +260,7 @@ class ContactDetector:
         assert self._background is not None
         assert self._before is not None
         heights = self._heights(self._background.signed_change(change))
-        mask, inner = np.zeros((2, *shape), np.uint8)
+        mask, inner = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
         regions = self._contacts(heights, self._before)
         for rows, columns, inside, core in regions:
             window = self._background.window_change(change, rows, columns, inside)

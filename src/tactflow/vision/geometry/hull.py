@@ -188,7 +188,8 @@ def _describe(
 def _core_area(core: Mask, region: Region) -> float | None:
     """Area of the convex hull of the core inside a region, px^2; None if there is none."""
     window = core[region.top : region.top + region.height, region.left : region.left + region.width]
-    contours = measure_region(np.asarray(cv2.bitwise_and(window, region.window), np.uint8)).contours()
+    inside = cv2.bitwise_and(window, region.window)
+    contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     return _hull(contours)[1] if contours else None
 
 
