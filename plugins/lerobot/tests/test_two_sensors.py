@@ -202,6 +202,10 @@ def test_recordings_without_unix_times_are_taken_to_begin_together(
     assert terminal("export", "lerobot", *sensors, *options) == 0
     assert "no Unix times; all recordings are taken to begin together" in terminal.err
     assert len(pq.read_table(tmp_path / "pinch" / "data")) == 4
+    for camera in (LEFT, RIGHT):
+        reader = open_source(f"lerobot:{tmp_path / 'pinch'}?camera={camera}&episode=0")
+        assert len(list(iter(reader.read, None))) == 4
+        reader.close()
 
 
 @pytest.mark.parametrize(
