@@ -4,10 +4,12 @@
     python -m lab.judges.judge --data RECORDINGS --labels mine.json default mine.yaml
     python -m lab.judges.judge --data RECORDINGS --set stages.difference.use=otsu --set stages.fusion=null
     python -m lab.judges.judge --data RECORDINGS --fit stages.difference.border=0.55,0.7,0.85
+    python -m lab.judges.judge --data RECORDINGS --gray --every 2
 
 A person outlined the contacts (`python -m lab.judges.label`); `outlines.json` beside this file has
 outlines of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of
-separate presses run one after the other, after their reference.
+separate presses run one after the other, after their reference. `--gray` judges as if all cameras recorded no
+colours.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -38,6 +40,7 @@ from tactflow.tools.bench import metrics
 from tactflow.tools.bench.score import MIN_DIRECTED_AXIS_RATIO
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
+from tactflow.vision.markers.detection import to_gray
 
 OUTLINES: Final = Path(__file__).with_name("outlines.json")
 """Outlines drawn for the package, and frames at rest, see `label_file`."""
@@ -118,12 +121,13 @@ def judge(
     data: Path,
     report: Callable[[str], None] = say,
     settings: Mapping[str, Any] = MappingProxyType({}),
+    gray: bool = False,
 ) -> Iterator[Judged]:
     """Run each recording, and compare its labelled frames; arguments and errors as for `labelled`.
 
     Frames that a failing pipeline did not reach count as missed contacts.
     """
-    for label, result in labelled(pipeline, labels, data, report, settings=settings):
+    for label, result in labelled(pipeline, labels, data, report, settings=settings, gray=gray):
         if result is None:
             yield Judged(label.lab, label.recording, bool(label.contact), False, hull=0.0, region=0.0)
         else:
@@ -137,13 +141,15 @@ def labelled(
     report: Callable[[str], None] = say,
     images: bool = False,
     settings: Mapping[str, Any] = MappingProxyType({}),
+    gray: bool = False,
 ) -> Iterator[tuple[FrameLabel, Result | None]]:
     """Run each recording that exists, and return its labels and the results of these frames.
 
     pipeline : a file or the name of a shipped pipeline; see `PLAIN` for "default". labels : those with
     `contact` None are left out. data : folder that holds the recordings. report : called with what could not
     be judged, and why; frames that a failing pipeline did not reach have no result. images : whether the
-    results hold the pictures. settings : of the pipeline, as for `tactflow.stream`.
+    results hold the pictures. settings : of the pipeline, as for `tactflow.stream`. gray : whether to remove
+    the colours of all pictures first.
 
     Raises
     ------
@@ -164,7 +170,7 @@ def labelled(
         else:
             missing = {label.index: label for label in wanted}
         try:
-            for result in _results(chosen, source, max(missing), images, settings):
+            for result in _results(chosen, source, max(missing), images, settings, gray):
                 if result.seq in missing and not result.frame.reference:
                     yield missing.pop(result.seq), result
         except ConfigError:
@@ -176,16 +182,21 @@ def labelled(
 
 
 def draw_worst(
-    pipeline: str, labels: Sequence[FrameLabel], data: Path, path: Path, blank: bool = False
+    pipeline: str,
+    labels: Sequence[FrameLabel],
+    data: Path,
+    path: Path,
+    blank: bool = False,
+    gray: bool = False,
 ) -> None:
     """Draw the frames whose hulls (red) overlap least with the outlines (green).
 
-    blank : leave the frames themselves out.
+    blank : leave the frames themselves out. gray : as for `labelled`.
     Raises ConfigError if there are no outlined frames, or the file cannot be written.
     """
     worst: list[tuple[float, int, NDArray[np.uint8]]] = []
     outlined = [label for label in labels if label.outlines]
-    for number, (label, result) in enumerate(labelled(pipeline, outlined, data, images=True)):
+    for number, (label, result) in enumerate(labelled(pipeline, outlined, data, images=True, gray=gray)):
         if result is not None and result.image is not None:
             overlap = compare(label, result).hull
             worst.append((overlap, number, _tile(label, result, f"{label.lab} {overlap:.2f}", blank)))
@@ -246,22 +257,44 @@ def _picture(folder: Path, name: str) -> NDArray[np.uint8]:
 
 
 def _results(
-    pipeline: str, source: Path | Pictures, last: int, images: bool, changed: Mapping[str, Any]
+    pipeline: str,
+    source: Path | Pictures,
+    last: int,
+    images: bool,
+    changed: Mapping[str, Any],
+    gray: bool,
 ) -> Iterator[Result]:
+    still = {}
     if isinstance(source, Path):
         with closing(open_source(str(source))) as reader:
             first = reader.peek()
         size = max(first[0].shape) if first is not None else 0
     else:
         size = max(source[0].shape)
+        # The label says which picture is the reference.
+        still = {"stages.capture.settle": 0}
     geometry = {
         "stages.preprocess.rotate": 0,
         "stages.preprocess.downsample": 2 if size > MAX_WHOLE_SIDE_PX else 1,
     }
-    settings = geometry | dict(changed)
-    running = stream(pipeline, source=source, settings=settings, max_frames=last + 1, images=images)
+    settings = geometry | still | dict(changed)
+    pictures = _gray_pictures(source) if gray else source
+    running = stream(pipeline, source=pictures, settings=settings, max_frames=last + 1, images=images)
     with closing(running) as results:
         yield from results
+
+
+def _gray_pictures(source: Path | Pictures) -> Iterator[NDArray[np.uint8]]:
+    """(H, W) uint8 each: the brightness of the pictures."""
+    with ExitStack() as stack:
+        pictures: Iterable[NDArray[np.uint8]]
+        if isinstance(source, Path):
+            reader = stack.enter_context(closing(open_source(str(source))))
+            pictures = (frame for frame, *_ in iter(reader.read, None))
+        else:
+            pictures = source
+        for picture in pictures:
+            yield picture if picture.ndim == 2 else to_gray(picture)
 
 
 def summary(judged: Sequence[Judged]) -> Iterator[str]:
@@ -358,6 +391,12 @@ def fitted(runs: Mapping[str, Sequence[Judged]]) -> Iterator[str]:
     yield from table([("lab", "frames", "best", usual, "fit"), *rows, ("10 %", "", "", *worst)])
 
 
+def every(labels: Iterable[FrameLabel], count: int) -> list[FrameLabel]:
+    """Every `count`-th label of each lab."""
+    by_lab = groupby(sorted(labels, key=lambda label: label.lab), key=lambda label: label.lab)
+    return [label for _, group in by_lab for label in list(group)[::count]]
+
+
 def scatter(labels: Iterable[FrameLabel]) -> list[float]:
     """Overlap, 0..1, of the outlines of rounds 1 and 2 of each frame that has both."""
     rounds = {(label.recording, label.frame, label.round): label for label in labels if label.outlines}
@@ -423,26 +462,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="A.B=V,W,...",
         help="take the best value for each lab by every second outline, and judge it on the others",
     )
+    parser.add_argument("--gray", action="store_true", help="remove the colours of all pictures first")
+    parser.add_argument(
+        "--every",
+        type=int,
+        default=1,
+        metavar="N",
+        help="judge every N-th label of each recording, for a quick look",
+    )
     add_set(parser)
     options = parser.parse_args(arguments)
     try:
         settings = settings_of(options.set)
         labels = load_labels(options.labels)
-        first = [label for label in labels if label.round == 1]
+        first = every([label for label in labels if label.round == 1], options.every)
         if options.picture is not None:
-            draw_worst(options.pipelines[0], first, options.data, options.picture, options.blank)
+            draw_worst(
+                options.pipelines[0], first, options.data, options.picture, options.blank, options.gray
+            )
             return 0
         if options.fit is not None:
             key, _, values = options.fit.partition("=")
             choices = {f"{key.rpartition('.')[2]}={v}": {key: parse_value(v)} for v in values.split(",")}
             runs = {
-                name: list(judge(options.pipelines[0], first, options.data, settings=settings | choice))
+                name: list(
+                    judge(
+                        options.pipelines[0],
+                        first,
+                        options.data,
+                        settings=settings | choice,
+                        gray=options.gray,
+                    )
+                )
                 for name, choice in choices.items()
             }
             print(*fitted(runs), sep="\n")
             return 0
         results = {
-            name: list(judge(name, first, options.data, settings=settings)) for name in options.pipelines
+            name: list(judge(name, first, options.data, settings=settings, gray=options.gray))
+            for name in options.pipelines
         }
         if not any(results.values()):
             raise ConfigError(f"--data {options.data}: has none of the recordings of {options.labels}")

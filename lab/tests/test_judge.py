@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.judges.judge import OUTLINES, Judged, fitted, interval, judge, main, scatter
+from lab.judges.judge import OUTLINES, Judged, every, fitted, interval, judge, main, scatter
 from lab.judges.label_file import FrameLabel, load_labels, save_labels
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
@@ -50,6 +50,29 @@ def test_true_outlines_are_found(labelled: tuple[Path, list[FrameLabel]]) -> Non
             assert one.region > 0.85
             assert one.center < 1
             assert 0.85 < one.area < 1.15
+
+
+def test_true_outlines_are_found_without_colours(labelled: tuple[Path, list[FrameLabel]]) -> None:
+    data, labels = labelled
+    judged = list(judge("default", labels, data, gray=True))
+    assert [one.found for one in judged] == [label.contact for label in labels]
+    coloured = list(judge("default", labels, data))
+    for one, other in zip(judged, coloured, strict=True):
+        assert not one.touched or 0.8 < one.hull < other.hull
+
+
+def test_every_other_label_of_each_lab() -> None:
+    labels = [
+        FrameLabel(recording=lab, frame=frame, reference=0, lab=lab, contact=False)
+        for frame in range(3)
+        for lab in "ab"
+    ]
+    assert [(label.lab, label.frame) for label in every(labels, 2)] == [
+        ("a", 0),
+        ("a", 2),
+        ("b", 0),
+        ("b", 2),
+    ]
 
 
 def test_frames_that_a_failing_pipeline_does_not_reach_are_missed(

@@ -160,13 +160,14 @@ def test_a_brightened_contact_reaches_as_far_where_it_is_dim() -> None:
     assert 49.5 - np.flatnonzero(mask[50])[0] > 28
 
 
+@pytest.mark.parametrize("mixtures", [np.full((2, 3), 0.4, np.float32), WHITE], ids=["slope", "one"])
 @pytest.mark.parametrize("turn", [0, 30, 90, 135])
-def test_both_flanks_of_a_ball_lit_from_one_side_are_one_contact(turn: int) -> None:
+def test_both_flanks_of_a_ball_lit_from_one_side_are_one_contact(turn: int, mixtures: Float) -> None:
     rows, columns = np.mgrid[:SIZE, :SIZE].astype(np.float32) - np.float32(49.5)
     toward = columns * math.cos(math.radians(turn)) + rows * math.sin(math.radians(turn))
     slope = np.where(disc(24) < 0, toward / 24, np.float32(0)).astype(np.float32)
     change = np.repeat(cv2.GaussianBlur(slope, (0, 0), 0.8)[..., None], 3, axis=2)
-    mask = found(change, disc(16) < 0, np.full((2, 3), 0.4, np.float32))
+    mask = found(change, disc(16) < 0, mixtures)
     # One of the flanks alone has its centroid 14 px off.
     assert math.hypot(*(float(places[mask].mean()) for places in (rows, columns))) < 0.5
     # The slope vanishes where the light comes along the border, so that the outline is drawn in there.

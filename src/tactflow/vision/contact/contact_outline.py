@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats32, Mask
+from tactflow.vision.contact.heights import has_two_flanks
 
 BORDER_SLOPE_FRACTION: Final = 0.55
 """Slope at the border of a contact, as a fraction of its local maximum. Lower includes more of the
@@ -29,6 +30,8 @@ CORE_SLOPE_FRACTION: Final = 0.8
 """The same where the gel leaves the object. Pressed by balls of known size, cores on four Minis have 0.97 to
 0.99 of the radius at which the gel leaves the ball, on two DIGITs 1.04 and 1.09, and on a thick Wedge 1.27
 (`lab.judges.radius`)."""
+BORDER_ONE_SLOPE_FRACTION: Final = BORDER_SLOPE_FRACTION * math.sqrt(0.5)
+"""Slope at the border where one component of it shows: its root mean square over all directions."""
 BORDER_DEPTH_FRACTION: Final = 0.2
 """Depth at the border of a contact, as a fraction of its local maximum. Under a ball it is 0.32 on a
 half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 0.2 overlap equally well with
@@ -52,7 +55,8 @@ def relative_change(change: Floats32, mixtures: Floats32) -> RelativeChange:
     """The slope or depth of a gel over its local maximum.
 
     change : (h, w, 3) float32, in the window of the contact, standard deviations; 0 outside its region.
-    mixtures : (k, 3) float32, weights of the channels; one mixture gives depth, several give slopes.
+    mixtures : (k, 3) float32, weights of the channels; several give slopes. One gives a slope if the contact
+        brightens on one flank and darkens on the other, and depth if it does either as a whole.
     """
     shows, border = _what_shows(change, mixtures)
     return RelativeChange(np.asarray(shows / largest_nearby(shows), np.float32), border)
@@ -99,6 +103,8 @@ def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
     if len(mixtures) > 1:
         # OpenCV's lengths take a tenth of the time of NumPy's.
         return np.asarray(reduce(cv2.magnitude, cv2.split(shown)), np.float32), BORDER_SLOPE_FRACTION
+    if has_two_flanks(shown):
+        return np.abs(shown), BORDER_ONE_SLOPE_FRACTION
     more, less = np.maximum(shown, np.float32(0)), np.maximum(-shown, np.float32(0))
     return (
         less if cv2.norm(less, cv2.NORM_L2SQR) > cv2.norm(more, cv2.NORM_L2SQR) else more
