@@ -3,10 +3,11 @@
     python lab/load.py                       # 1 to 16 sensors, 1 to 128 subscribers; five minutes
     python lab/load.py --sensors 1 --rate 60
     python lab/load.py --sensors 16 --touched 2 --rate 60 --subscribers
+    taskset -c 0 python lab/load.py --sensors 1 --rate 1000 --size 320 240 --subscribers
     python lab/load.py --soak 1000000        # frames through all sinks as fast as possible; an hour
 
-Each sensor feeds pictures of 800 x 600 px, with intermittent contact or of an untouched gel, to the default
-pipeline. Subscribers run on the same machine. Tables are printed in Markdown.
+Each sensor feeds pictures of 800 x 600 px (or `--size`), with intermittent contact or of an untouched gel, to
+the default pipeline. Subscribers run on the same machine. Tables are printed in Markdown.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ SAMPLE_INTERVAL_S = 5.0
 """Interval between samples of a process's memory, s. Chosen by hand."""
 PORT = 5750
 """Port of the publisher; the page has the next one."""
+SIZE = (800, 600)
+"""Width and height of a picture, px."""
 SOAK_SIZE = (200, 150)
 """Width and height, px: small, so that a million frames take an hour; leaks per frame do not depend on the
 size."""
@@ -147,8 +150,13 @@ class Subscribers:
                             self.seqs[message["sensor"]].append(message["seq"])
 
 
-def measure(sensors: int, subscribers: int, rate: float, touched: int) -> list[str]:
-    """Measure one load; return the cells of its row. touched : sensors with contacts, the first ones."""
+def measure(
+    sensors: int, subscribers: int, rate: float, touched: int, size: tuple[int, int] = SIZE
+) -> list[str]:
+    """Measure one load; return the cells of its row.
+
+    touched : sensors with contacts, the first ones. size : width and height of the pictures, px.
+    """
     readers = Subscribers(subscribers)
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
@@ -156,8 +164,10 @@ def measure(sensors: int, subscribers: int, rate: float, touched: int) -> list[s
         several = {f"s{n}": {} if n < touched else idle for n in range(sensors)}
         names = {"sensors": several} if sensors > 1 else {"sensor": "s0"}
         sinks = {"zmq": {"endpoint": f"tcp://127.0.0.1:{PORT}"}}
-        write_pipeline(folder, (800, 600), {"rate": rate}, sinks=sinks, **names)
-        process = stack.enter_context(running(folder))
+        write_pipeline(folder, size, {"rate": rate}, sinks=sinks, **names)
+        # The dots of smaller pictures would be lost.
+        whole = ("--set", "stages.preprocess.downsample=1") if size < SIZE else ()
+        process = stack.enter_context(running(folder, *whole))
         stack.enter_context(readers.reading())
         while len(readers.seqs) < sensors:
             fail_if_ended(process, folder)
@@ -233,6 +243,9 @@ def main() -> None:
     parser.add_argument(
         "--soak", type=int, metavar="FRAMES", help="measure memory over this number of frames instead"
     )
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=SIZE, metavar=("WIDTH", "HEIGHT"), help="of the pictures, px"
+    )
     args = parser.parse_args()
     if args.soak:
         with tempfile.TemporaryDirectory() as folder:
@@ -247,7 +260,7 @@ def main() -> None:
     print_row([*heads, "growth, MB", "processors busy"])
     print_row(["---"] * 9)
     for sensors, subscribers in [(n, 1) for n in args.sensors] + [(1, n) for n in args.subscribers]:
-        print_row(measure(sensors, subscribers, args.rate, args.touched))
+        print_row(measure(sensors, subscribers, args.rate, args.touched, tuple(args.size)))
 
 
 if __name__ == "__main__":
