@@ -28,7 +28,8 @@ class Zmq(Sink):
     """Publishes one message per frame: `tactflow.<sensor>`, a space, the JSON of `tactflow.frame/1`.
 
     Without subscribers to this sensor, no frame is requested and nothing encoded. A slow subscriber loses
-    messages; it never slows the run.
+    messages; it never slows the run. Messages are encoded in the thread that computes them, which costs less
+    than to wake another one; `segment: zmq` gives the sink its own, for `pictures` at a high rate.
 
     Subscribers to the exact topic `tactflow.stats` get the statistics of the run every `stats_every` seconds:
     `tactflow.stats`, a space, the JSON of the statistics file with the sensor's name. A shorter prefix, such
@@ -51,9 +52,6 @@ class Zmq(Sink):
     36
     >>> sink.close()
     """
-
-    threaded = True
-    when_live = "latest"
 
     class Params(PublisherParams, MessageParams):
         """Address, queue, access of subscribers and of commands, and content."""
