@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
+import math
 
-from tactflow.calibration.file import Calibration
+from tactflow.calibration.file import UNLIKE, Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import Unmarked, Untouched
 from tactflow.vision.arrays import Floats
 from tactflow.vision.field_force import displacement
 from tactflow.vision.flow.displacement_field import MIN_MARKERS, FieldModel
-from tactflow.vision.force import LightChange, Seen, seen, seen_without_contact
+from tactflow.vision.force import LightChange, Seen, seen, seen_without_contact, widened
 from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 from tactflow.vision.types import Force as ForceOnGel
 
@@ -25,7 +26,9 @@ class Force(Stage):
     is that of a contact. A calibration with neither heights nor dots measures the change of the light of the
     whole gel. Where that is larger than it is ever at rest, it is a force, though no contact is found: a soft
     object that covers all of the gel has no outline. A contact or a force larger than those that the
-    calibration was fitted to is a warning, once.
+    calibration was fitted to is a warning, once. Where the gel at rest has another light than in the
+    calibration, or known loads have shown another force since (`tactflow calibrate check --weights`), the
+    standard errors are wider by this difference.
 
     >>> import numpy as np
     >>> import tactflow
@@ -41,6 +44,7 @@ class Force(Stage):
     def __init__(self, params: StageParams, calibration: Calibration | None = None) -> None:
         """Prepare. calibration : of the sensor."""
         super().__init__(params)
+        self._calibration = calibration
         self._entry = None if calibration is None else calibration.force
         field = None if calibration is None else calibration.field_force
         self._model = None if self._entry is None else self._entry.model(field)
@@ -65,7 +69,7 @@ class Force(Stage):
         features = self._features(contact, scale, unmarked, untouched, depth, flow)
         if isinstance(features, Absent):
             return features
-        force = self._model.force(features, moved)
+        force = widened(self._model.force(features, moved), self._drift(untouched))
         if not force.in_range and not self._warned:
             self._warned = True
             logger.warning(
@@ -75,6 +79,13 @@ class Force(Stage):
                 *self._entry.pressing.range,
             )
         return force
+
+    def _drift(self, untouched: Untouched) -> float:
+        """Relative difference of the gel today from that of the calibration, beyond what is usual."""
+        if self._calibration is None or self._entry is None:
+            return 0.0
+        unlike = self.once(self._calibration.unlikeness, untouched)
+        return math.hypot(self._entry.drift, unlike if unlike > UNLIKE else 0.0)
 
     def _displacement(self, markers: Markers, scale: Scale, image: Unmarked) -> Floats | None:
         """(S, 2), mm, see `field_force`; None where it is unknown or not needed."""

@@ -309,7 +309,9 @@ def with_header(packet: bytes, heights: bytes = b"", **added: Any) -> bytes:
     return struct.pack("<I", len(header)) + header + heights + packet[4 + length :]
 
 
-def calibrated(number: int, *, slipping: bool = False, height: float = 0.5, in_range: bool = True) -> bytes:
+def calibrated(
+    number: int, *, slipping: bool = False, height: float = 0.5, in_range: bool = True, **force: Any
+) -> bytes:
     """A frame of a calibrated sensor with all that the page can show."""
     plain = frame("main", number, 120, contact=True, directed=True)
     length = struct.unpack_from("<I", plain)[0]
@@ -320,7 +322,7 @@ def calibrated(number: int, *, slipping: bool = False, height: float = 0.5, in_r
     message["flow"] |= {"stderr": [0.3, 0.4], "mean_mm": [0.4, -0.2], "mean_mm_stderr": [0.03, 0.04]}
     message["slip"] = {"slipping": slipping, "stick_ratio": 0.0 if slipping else 0.8}
     message["slip"] |= {"translation": [3.0, 4.0], "translation_mm": [0.3, 0.4], "rotation": 5.0}
-    message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": in_range}
+    message["force"] = {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": in_range} | force
     message["pose"] = {
         "status": "tracked",
         "since": 1,
@@ -432,6 +434,8 @@ def test_a_calibrated_sensor_is_shown_in_millimetres_with_force_slip_and_field(
     assert page.inner_text("#unit-pose") == "mm ± 0.02, turned 5.0 ± 57.0°"
     assert page.inner_text("#unit-flow").startswith("mm ± 0.032, 3 markers")
     assert page.inner_text("#unit-force") == "N ± 0.20"
+    stage.send(calibrated(3, as_calibrated=False))
+    until(page, "() => document.getElementById('unit-force').textContent === 'N ± 0.20, the gel has changed'")
     stage.send(calibrated(3, height=0.4, in_range=False))
     until(page, "() => document.getElementById('unit-force').textContent === 'N, outside the fit'")
     in_mm = {name: steady(page, name) for name in ("picture", "plot-area", "plot-flow")}

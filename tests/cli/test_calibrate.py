@@ -220,9 +220,13 @@ def test_weights_on_the_gel_give_newtons_without_a_gauge(
     rest = scene.frame(0)[::2, ::2]
     frames = [rest] * 4
     for index in firm:
-        frames += [scene.frame(index)[::2, ::2]] * 31 + [rest] * 2
+        frames += [scene.frame(index)[::2, ::2]] * 9 + [rest]
     np.save("loads.npy", np.array(frames))
-    source = ["markerless", "--source", "loads.npy"]
+    assert terminal("pipelines", "markerless") == 0
+    pipeline = yaml.safe_load(terminal.out)
+    pipeline["stages"]["capture"] |= {"source": "loads.npy", "fps": 8}
+    Path("slow.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
+    source = ["slow.yaml"]
     assert terminal("calibrate", *source, "--area", "15", "20", "--out", "gel.yaml") == 0
     grams = [f"{force / 9.80665e-3:.2f}" for force in newtons]
     weigh = ["force", "gel.yaml", *source, "--weights"]
@@ -234,6 +238,27 @@ def test_weights_on_the_gel_give_newtons_without_a_gauge(
     stored = yaml.safe_load(Path("gel.yaml").read_text())["force"]
     assert stored["left_out"] == "load"
     assert stored["press"]["range"] == pytest.approx([min(newtons), max(newtons)], rel=1e-3)
+    check = ["check", *weigh[1:]]
+    assert terminal("calibrate", *check, *grams) == 0
+    assert "it still fits" in terminal.out
+    twice = [str(2 * float(weight)) for weight in grams]
+    assert terminal("calibrate", *check, *twice, "--overwrite") == 3
+    assert "standard errors of the force are wider by as much" in terminal.out
+    assert yaml.safe_load(Path("gel.yaml").read_text())["force"]["drift"] == pytest.approx(1, abs=0.2)
+    settings = {"calibration": "gel.yaml", "sinks": {}}
+    felt = [r.force for r in tactflow.stream("slow.yaml", settings=settings) if r.force]
+    assert felt
+    assert not any(force.as_calibrated for force in felt)
+    assert terminal("calibrate", *source, "--area", "15", "20", "--out", "second.yaml") == 0
+    like = ["force", "second.yaml", *source, "--like", "gel.yaml"]
+    assert terminal("calibrate", *like) == 2
+    assert "required --weights, two or more" in terminal.err
+    assert terminal("calibrate", *like, "--weights", *twice) == 0
+    carried = yaml.safe_load(Path("second.yaml").read_text())["force"]
+    assert carried["press"]["range"] == pytest.approx(
+        [2 * limit for limit in stored["press"]["range"]], rel=0.1
+    )
+    assert carried["drift"] == 0
     assert terminal("calibrate", *weigh) == 2
     assert "has a force already" in terminal.err
     assert terminal("calibrate", *weigh[:-1], "--overwrite", "--weights") == 2

@@ -158,6 +158,11 @@ def test_a_force_has_its_errors_and_null_where_a_component_is_unknown() -> None:
     VALIDATOR.validate(message)
     assert message["force"] == {"value": [None, None, 2.5], "stderr": [None, None, 0.2], "in_range": True}
     assert "force" not in build_message(TICK, Results(PROCESSED, CONTACT))
+    drifted = build_message(TICK, Results(PROCESSED, CONTACT, force=replace(force, as_calibrated=False)))
+    VALIDATOR.validate(drifted)
+    assert drifted["force"]["as_calibrated"] is False
+    read = [Result.from_message(one).force for one in (message, drifted)]
+    assert [one.as_calibrated for one in read if one] == [True, False]
     endless = replace(force, value=(0.0, math.inf, 1.0))
     with pytest.raises(ValueError, match=r"force\.value"):
         build_message(TICK, Results(PROCESSED, CONTACT, force=endless))

@@ -42,6 +42,7 @@ def stage(
     drag: LinearForceEntry | None = None,
     least_change: float | None = None,
     dots: dict[Any, DotsForceEntry] | None = None,
+    drift: float = 0.0,
 ) -> Any:
     """The stage with a calibration that knows such a force."""
     force = ForceEntry(
@@ -53,6 +54,7 @@ def stage(
         recordings={"a": 0.0},
         presses=9,
         left_out="press",
+        drift=drift,
     )
     made = Calibration(
         sensor="main",
@@ -185,3 +187,21 @@ def test_dots_may_give_the_drag_and_heights_the_press(tmp_path: Path) -> None:
     found = force.process(CONTACT, SCALE, GEL, GEL, DEPTH, markers=dragged(3, 0))
     assert found.value == pytest.approx((0.6, 0, 2 * 1.5 + 0.5 * 4), rel=0.1, abs=0.01)
     assert force.process(None, SCALE, GEL, GEL, markers=dragged(3, 0)) == Absent("no_contact")
+
+
+def test_a_gel_that_is_not_as_it_was_calibrated_has_wider_errors(tmp_path: Path) -> None:
+    usual = stage(tmp_path, BY_DEPTH, DRAG).process(CONTACT, SCALE, GEL, GEL, DEPTH, Flow((3.0, 0.0), 4))
+    assert usual.as_calibrated
+    drifted = stage(tmp_path, BY_DEPTH, DRAG, drift=0.2).process(
+        CONTACT, SCALE, GEL, GEL, DEPTH, Flow((3.0, 0.0), 4)
+    )
+    assert not drifted.as_calibrated
+    assert drifted.value == usual.value
+    wider = [np.hypot(error, 0.2 * value) for value, error in zip(usual.value, usual.stderr, strict=True)]
+    assert drifted.stderr == pytest.approx(wider)
+    # The left half of the gel is brighter at rest than it was: each part by a fifth of the mean.
+    other = GEL.copy()
+    other[:, :16] = 135
+    found = stage(tmp_path, BY_DEPTH).process(CONTACT, SCALE, other, other, DEPTH)
+    assert not found.as_calibrated
+    assert found.stderr[2] == pytest.approx(np.hypot(usual.stderr[2], 0.2 * usual.value[2]), rel=0.01)

@@ -17,7 +17,15 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveFloat, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    ValidationError,
+)
 
 from tactflow import __version__
 from tactflow.engine.errors import ConfigError
@@ -159,7 +167,8 @@ class ForceEntry(_Entry):
     such columns, or the flow does not explain them. dots : component ("x", "y", "z") -> its errors; the terms
     are `field_force` of the `Calibration`. change_at_rest, least_change : see `ForceModel`. recordings :
     source -> offset of its frames' time against that of its CSV, s. presses : or loads, in all of them.
-    left_out : what the errors are cross-validated over.
+    left_out : what the errors are cross-validated over. drift : relative difference that known loads have
+    shown since, beyond the errors.
     """
 
     press: LinearForceEntry | None
@@ -170,6 +179,7 @@ class ForceEntry(_Entry):
     recordings: dict[str, float]
     presses: int
     left_out: LeftOut
+    drift: NonNegativeFloat = 0.0
 
     @property
     def pressing(self) -> LinearForceEntry | DotsForceEntry:

@@ -174,6 +174,14 @@ def fit_loads(watched: Watched, loads: Sequence[tuple[int, int]], forces: Sequen
     return fit_aligned([aligned], tuple(watched.press), watched.change_at_rest, sideways=False)
 
 
+class Weighed(NamedTuple):
+    """What a session with known loads shows. loads : see `LoadFinder`. forces : of each, N; NaN: unknown."""
+
+    watched: Watched
+    loads: Sequence[tuple[int, int]]
+    forces: Sequence[float]
+
+
 class WeightGuide:
     """Finds loads in results, and says what to do next, and when it is enough.
 
@@ -183,6 +191,7 @@ class WeightGuide:
     ----------
     forces : of the loads, N, in the order in which they are put on; empty if they are read from a scale.
     say : shows a line.
+    fits : whether to fit the loads, and say how good that is.
 
     Attributes
     ----------
@@ -190,8 +199,8 @@ class WeightGuide:
     is_enough : whether all loads were put on.
     """
 
-    def __init__(self, forces: Sequence[float], say: Callable[[str], None]) -> None:
-        self._forces, self._say = forces, say
+    def __init__(self, forces: Sequence[float], say: Callable[[str], None], fits: bool = True) -> None:
+        self._forces, self._say, self._fits = forces, say, fits
         self._watcher, self._finder = Watcher(), LoadFinder()
         self._error = ""
         self._shown = (0, False)
@@ -213,8 +222,8 @@ class WeightGuide:
             self._tell()
         return self.is_enough
 
-    def finish(self, ask: Callable[[float], float]) -> Fit:
-        """The fit to all loads. ask : gives the force, N, of a load that lay still at a time, s, if they are
+    def finish(self, ask: Callable[[float], float]) -> Weighed:
+        """All loads. ask : gives the force, N, of a load that lay still at a time, s, if they are
         read from a scale; NaN leaves it out.
 
         Raises ConfigError if a recording does not show as many loads as there are weights.
@@ -228,17 +237,17 @@ class WeightGuide:
                 f"calibrate force --weights: got {len(forces)} weights, and found {len(times)} loads that "
                 f"lie still for {HOLD_SECONDS:g} s ({found}); each must be taken off before the next"
             )
-        return self._fit(forces or [ask(time) for time in times])
+        return self._weighed(forces or [ask(time) for time in times])
 
-    def _fit(self, forces: Sequence[float]) -> Fit:
-        return fit_loads(self._watcher.watched(), self._finder.loads, forces)
+    def _weighed(self, forces: Sequence[float]) -> Weighed:
+        return Weighed(self._watcher.watched(), self._finder.loads, forces)
 
     def _judge(self) -> None:
         """Estimate the error so far, and whether all loads were put on."""
         done = len(self._finder.loads)
         self.is_enough = done >= (len(self._forces) or MOST_LOADS)
-        if FEWEST_LOADS <= done <= len(self._forces):
-            errors = self._fit(self._forces[:done]).entry.pressing
+        if self._fits and FEWEST_LOADS <= done <= len(self._forces):
+            errors = fit_loads(*self._weighed(self._forces[:done])).entry.pressing
             share = errors.rmse / errors.range[1]
             words = f"RMS error on loads left out {errors.rmse:.2f} N, {100 * share:.0f} % of the largest"
             enough = f": enough for up to {errors.range[1]:.1f} N{'' if self.is_enough else ', Ctrl-C ends'}"

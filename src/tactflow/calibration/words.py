@@ -7,6 +7,7 @@ from typing import Final
 
 from tactflow.calibration.file import DarknessEntry, DotsForceEntry, LinearForceEntry
 from tactflow.calibration.force import Fit
+from tactflow.calibration.known_loads import Gain
 from tactflow.calibration.reference import Reference
 from tactflow.calibration.samples import fitting_core
 
@@ -47,6 +48,15 @@ def core_words(ratio: float, core: float) -> str:
     if abs(ratio - 1) > CORE_TOLERANCE and better != core:
         words += f"; core: {better:.2f} below difference fits better"
     return words
+
+
+def gain_words(found: Gain, name: str) -> str:
+    """What a calibration says of known loads. name : of its file."""
+    loads = ", ".join(
+        f"{said:.2f} +- {error:.2f} N for {known:.2f} N"
+        for known, said, error in zip(found.known, found.said, found.errors, strict=True)
+    )
+    return f"{name} says {loads}: the loads are {found.value:.3f} +- {found.stderr:.3f} times what it says"
 
 
 def force_words(fit: Fit, readings: Mapping[str, Reference]) -> list[str]:

@@ -17,6 +17,7 @@ from tactflow.calibration.check import check, check_force
 from tactflow.calibration.file import Calibration
 from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.guide import Guide
+from tactflow.calibration.known_loads import carry, gain
 from tactflow.calibration.reference import read_reference, recordings_with_csv
 from tactflow.calibration.session import (
     ENOUGH_PRESSES,
@@ -30,8 +31,8 @@ from tactflow.calibration.session import (
     watch,
     weigh,
 )
-from tactflow.calibration.weights import WeightGuide, read_weights
-from tactflow.calibration.words import core_words, force_words
+from tactflow.calibration.weights import Weighed, WeightGuide, fit_loads, read_weights
+from tactflow.calibration.words import core_words, force_words, gain_words
 from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
 from tactflow.engine.collect import with_collector
 from tactflow.engine.contract import Source
@@ -98,8 +99,14 @@ OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
     "--weights": {
         "nargs": "*",
         "metavar": "G",
-        "help": "for force: weights that are put on the gel one after the other, g, in their order, or a CSV "
-        "with a column g, kg or fz; without a number, the readings of a scale are asked for in the end",
+        "help": "for force and check: weights, g, that are put on the gel one after the other in this order, "
+        "or a CSV of them with a column g, kg or fz; without any, the readings of a scale are asked for",
+    },
+    "--like": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "for force --weights: take the force of this calibration, of another sensor of the same "
+        "kind, and fit one factor to two weights or more",
     },
     "--offset": {
         "type": float,
@@ -233,6 +240,8 @@ def _check(args: argparse.Namespace) -> int:
     """Test how well a calibration still fits."""
     path, pipeline = _file_and_pipeline(args, "check")
     calibration = Calibration.load(path)
+    if args.weights is not None:
+        return _check_loads(args, path, pipeline, calibration)
     pressed = calibration.photometric or calibration.darkness
     presses = args.presses or ENOUGH_PRESSES["slopes" if calibration.darkness is None else "darkness"]
     say(instruction(None if pressed is None else pressed.ball_radius, presses))
@@ -260,6 +269,22 @@ def _check(args: argparse.Namespace) -> int:
     return 0 if fits else StageError.exit_code
 
 
+def _check_loads(args: argparse.Namespace, path: Path, pipeline: str | None, calibration: Calibration) -> int:
+    """Compare the force with known loads; with --overwrite, results tell from then on."""
+    found = gain(calibration, _weigh(args, path, pipeline, fits=False))
+    show([gain_words(found, str(path))])
+    fits = found.is_one
+    if args.overwrite and calibration.force is not None:
+        drift = 0.0 if fits else abs(found.value - 1)
+        force = calibration.force.model_copy(update={"drift": drift})
+        calibration.model_copy(update={"force": force}).save(path)
+        show([f"{path}: standard errors of the force are {'as fitted' if fits else 'wider by as much'}"])
+    elif not fits:
+        show(["with --overwrite, the standard errors of results become wider by as much"])
+    show(["it still fits" if fits else "it does not fit; calibrate the force again"])
+    return 0 if fits else StageError.exit_code
+
+
 def _force(args: argparse.Namespace) -> int:
     """Fit the force and write it into the calibration file."""
     path, pipeline = _file_and_pipeline(args, "force")
@@ -267,7 +292,11 @@ def _force(args: argparse.Namespace) -> int:
     if calibration.force is not None and not args.overwrite:
         raise ConfigError(f"calibrate force: {path} has a force already; give --overwrite to replace it")
     if args.weights is not None:
-        return _weigh(args, path, pipeline, calibration)
+        _force_by_weights(args, path, pipeline).save(path)
+        say(f"the force is added to {path}")
+        return 0
+    if args.like is not None:
+        raise ConfigError("calibrate force --like: required --weights, two or more that are put on the gel")
     if args.source is None:
         raise ConfigError(
             "calibrate force: required --source, a recording with a CSV of the same name beside it"
@@ -282,24 +311,30 @@ def _force(args: argparse.Namespace) -> int:
     return 0
 
 
-def _weigh(args: argparse.Namespace, path: Path, pipeline: str | None, calibration: Calibration) -> int:
-    """Fit the force to known weights, and write it into the calibration file."""
-    forces = read_weights(args.weights)
-    if not forces and not sys.stdin.isatty():
-        raise ConfigError(
-            "calibrate force --weights: required the weights in g, as nobody can be asked for them"
-        )
-    guide = WeightGuide(forces, say)
-    loaded = _load(args, pipeline)
-    weigh(_player(loaded, _page(args, pipeline, guide) if args.view else {}), path, guide)
-    fit = guide.finish(_reading)
+def _force_by_weights(args: argparse.Namespace, path: Path, pipeline: str | None) -> Calibration:
+    """The calibration with a force that is fitted to known weights, or carried from another sensor."""
+    calibration, weighed = Calibration.load(path), _weigh(args, path, pipeline, args.like is None)
+    if args.like is not None:
+        other = Calibration.load(args.like)
+        found = gain(other, weighed)
+        say(gain_words(found, str(args.like)))
+        return carry(calibration, other, found)
+    fit = fit_loads(*weighed)
     for words in force_words(fit, {}):
         say(words)
-    source = str(args.source or loaded.source.params.model_dump().get("source", ""))
-    entry = fit.entry.model_copy(update={"recordings": {source: 0.0}})
-    calibration.model_copy(update={"force": entry, "field_force": fit.field}).save(path)
-    say(f"the force is added to {path}")
-    return 0
+    entry = fit.entry.model_copy(update={"recordings": {str(args.source or "live"): 0.0}})
+    return calibration.model_copy(update={"force": entry, "field_force": fit.field})
+
+
+def _weigh(args: argparse.Namespace, path: Path, pipeline: str | None, fits: bool) -> Weighed:
+    """The loads of a session. path : of the calibration, for the scale. fits : see `WeightGuide`."""
+    forces = read_weights(args.weights)
+    if not forces and not sys.stdin.isatty():
+        raise ConfigError("calibrate --weights: required the weights in g, as nobody can be asked for them")
+    guide = WeightGuide(forces, say, fits)
+    page = _page(args, pipeline, guide) if args.view else {}
+    weigh(_player(_load(args, pipeline), page), path, guide)
+    return guide.finish(_reading)
 
 
 def _reading(time: float) -> float:
@@ -328,19 +363,19 @@ VERBS: Final[Mapping[str, tuple[Callable[[argparse.Namespace], int], str, str, S
         _make,
         "PIPELINE",
         "calibrate the sensor of a pipeline; the word make can be left out",
-        [name for name in OPTIONS if name not in ("--csv", "--offset", "--weights")],
+        [name for name in OPTIONS if name not in ("--csv", "--offset", "--weights", "--like")],
     ),
     "check": (
         _check,
         "FILE [PIPELINE]",
         "test how well a calibration still fits",
-        ("--realtime", "--presses", "--csv", "--offset"),
+        ("--realtime", "--presses", "--csv", "--offset", "--weights", "--view"),
     ),
     "force": (
         _force,
         "FILE [PIPELINE]",
         "fit the force, and add it to a calibration",
-        ("--realtime", "--csv", "--offset", "--weights", "--view"),
+        ("--realtime", "--csv", "--offset", "--weights", "--like", "--view"),
     ),
 }
 """Verb -> what it does, its words, its description, and the options that matter to it."""

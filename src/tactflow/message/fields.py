@@ -430,6 +430,10 @@ class Slip(Part):
     )
 
 
+def _unlike_calibration(force: types.Force, _result: Any) -> bool | None:
+    return None if force.as_calibrated else False
+
+
 class Force(Part):
     """The force on the gel."""
 
@@ -441,6 +445,12 @@ class Force(Part):
     in_range: bool = sent("whether the calibration was fitted to such contacts; stderr only holds there")
     torque: Finite | None = sent(
         "about z through the center of the contact, from x to y (absent if not known)", "N mm", if_known=True
+    )
+    as_calibrated: bool | None = sent(
+        "false where the gel at rest or a known load differs from the calibration, so that stderr is wider "
+        "(absent otherwise)",
+        if_known=True,
+        value=_unlike_calibration,
     )
 
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -209,7 +209,7 @@ class ForceModel:
 
     >>> model = ForceModel(LinearForce({"volume": 2.0}, {"volume": 1.0}, (0.1, 0.0)), None, 0.0)
     >>> model.force(Seen({"volume": 0.5, "area": 3.0}, {}))
-    Force(value=(None, None, 1.0), stderr=(None, None, 0.1), in_range=True, torque=None)
+    Force(value=(None, None, 1.0), stderr=(None, None, 0.1), in_range=True, torque=None, as_calibrated=True)
     """
 
     press: LinearForce | None
@@ -260,3 +260,18 @@ class ForceModel:
             None if accuracy is None else (value, accuracy.stderr(length), accuracy.knows(value))
             for value, accuracy in zip(values, self.dots.accuracy, strict=True)
         ]
+
+
+def widened(force: Force, drift: float) -> Force:
+    """A force by a gel that answers otherwise than in its calibration. drift : relative difference, 0: none.
+
+    >>> widened(Force((None, None, 4.0), (None, None, 0.3), True), 0.1).stderr
+    (None, None, 0.5)
+    """
+    if not drift:
+        return force
+    x, y, z = (
+        None if value is None or error is None else math.hypot(error, drift * value)
+        for value, error in zip(force.value, force.stderr, strict=True)
+    )
+    return replace(force, stderr=(x, y, math.nan if z is None else z), as_calibrated=False)

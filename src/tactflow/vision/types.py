@@ -311,6 +311,8 @@ class Force:
     torque : on the gel about z, through the middle of the contact, N mm, positive from x to y: what the
         elasticity of a round contact gives for the twist of the gel. None where that, or `value` of x and y,
         is not known.
+    as_calibrated : false where the gel at rest, or a known load, differs from the calibration; `stderr`
+        is wider then.
 
     Examples
     --------
@@ -322,6 +324,7 @@ class Force:
     stderr: tuple[float | None, float | None, float]
     in_range: bool
     torque: float | None = None
+    as_calibrated: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,10 +36,11 @@ export function depth({ contact }) {
 // The normal component is always present; tangential ones depend on the calibration.
 export function force({ force }) {
   if (!force) return NONE;
-  const { value, stderr, in_range } = force;
+  const { value, stderr, in_range, as_calibrated } = force;
   const along = ["x", "y"].flatMap((axis, i) => (value[i] === null ? [] : [`${axis} ${fixed(value[i], 2)}`]));
   // Outside the range of the calibration, the standard error is invalid.
-  const unit = in_range === false ? "N, outside the fit" : `N${error(stderr[2], 2)}`;
+  const changed = as_calibrated === false ? ", the gel has changed" : "";
+  const unit = in_range === false ? "N, outside the fit" : `N${error(stderr[2], 2)}${changed}`;
   return [fixed(value[2], 2), [unit, ...along].join(", ")];
 }
 

@@ -1,0 +1,139 @@
+"""What a force calibration says of known loads: on another sensor of its kind, or on another day.
+
+The elasticity of gels of one kind differs mostly by a factor, which known loads show.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from tactflow.calibration.file import Calibration
+from tactflow.calibration.weights import Weighed
+from tactflow.engine.errors import ConfigError
+from tactflow.vision.arrays import Floats
+from tactflow.vision.field_force import FieldForce
+from tactflow.vision.force import BY_CHANGE, Seen
+
+FEWEST_LOADS: Final = 2
+"""Loads from which a force part is carried to another sensor: their difference tests the factor."""
+ALIKE_STDERRS: Final = 2.0
+"""Standard errors up to which a factor counts as 1."""
+
+
+class Gain(NamedTuple):
+    """Known forces over those that a calibration says.
+
+    value : their ratio, by least squares. stderr : of it, by the stated errors of the calibration, or by the
+    scatter of the loads where that is larger. known, said, errors : (n,) N, of each load; errors
+    are stated.
+    """
+
+    value: float
+    stderr: float
+    known: Floats
+    said: Floats
+    errors: Floats
+
+    @property
+    def is_one(self) -> bool:
+        """Whether the gel answers as the calibration says."""
+        return abs(self.value - 1) <= ALIKE_STDERRS * self.stderr
+
+
+def gain(calibration: Calibration, weighed: Weighed) -> Gain:
+    """Compare a force calibration with known loads.
+
+    Raises ConfigError without a force part, or where what it needs is not seen.
+    """
+    found = [
+        (force, *_said(calibration, weighed, load))
+        for load, force in zip(weighed.loads, weighed.forces, strict=True)
+        if math.isfinite(force)
+    ]
+    if not found:
+        raise ConfigError("calibrate: no load of known force was found; each must lie still for a second")
+    known, said, errors = np.array(found).T
+    if said.min() <= 0:
+        raise ConfigError(
+            "calibrate: the calibration says no force for a load: it is of another kind of sensor"
+        )
+    square = float(said @ said)
+    value = float(known @ said) / square
+    stated = value * math.sqrt(float(np.square(said * errors).sum())) / square
+    scatter = math.sqrt(float(np.square(known - value * said).sum()) / max(len(known) - 1, 1) / square)
+    return Gain(value, max(stated, scatter), known, said, errors)
+
+
+def _said(calibration: Calibration, weighed: Weighed, load: tuple[int, int]) -> tuple[float, float]:
+    """The force of a load by a calibration, and its stated error, N: means over its frames."""
+    entry = calibration.force
+    if entry is None:
+        raise ConfigError("calibrate: the calibration has no force part")
+    model, watched = entry.model(calibration.field_force), weighed.watched
+    if entry.press is not None and not entry.press.stiffness.keys() <= watched.press.keys():
+        raise ConfigError(
+            "calibrate: heights are known here and not in the calibration, or the other way round"
+        )
+    forces = []
+    for index in range(load[0], load[1] + 1):
+        press = {name: float(values[index]) for name, values in watched.press.items()}
+        for name in BY_CHANGE:
+            if name in press:
+                press[name] = max(press[name] - watched.change_at_rest, 0.0)
+        moved = None if watched.field is None else watched.field[index]
+        if moved is not None and np.isnan(moved).any():
+            moved = None
+        if entry.press is None and moved is None:
+            raise ConfigError("calibrate: the calibration measures the force by dots, and too few are seen")
+        force = model.force(Seen(press, {}), moved)
+        forces.append((force.value[2], force.stderr[2]))
+    value, error = np.mean(forces, axis=0).tolist()
+    return value, error
+
+
+def carry(calibration: Calibration, other: Calibration, found: Gain) -> Calibration:
+    """A calibration with the force part of another sensor of its kind, times the gain.
+
+    found : of the other calibration on this sensor. Its error is added.
+
+    Raises ConfigError for fewer than `FEWEST_LOADS`.
+    """
+    if len(found.known) < FEWEST_LOADS:
+        raise ConfigError(
+            f"calibrate force --like: required {FEWEST_LOADS} loads or more, found {len(found.known)}"
+        )
+    assert other.force is not None
+    entry, factor, doubt = other.force, found.value, found.stderr / found.value
+    press, drag = (
+        None
+        if part is None
+        else part.model_copy(
+            update={
+                "stiffness": {name: factor * value for name, value in part.stiffness.items()},
+                **_scaled(part.error, part.range, part.rmse, factor, doubt),
+            }
+        )
+        for part in (entry.press, entry.drag)
+    )
+    dots = {
+        axis: part.model_copy(update=_scaled(part.error, part.range, part.rmse, factor, doubt))
+        for axis, part in entry.dots.items()
+    }
+    force = entry.model_copy(update={"press": press, "drag": drag, "dots": dots, "drift": 0.0})
+    field = other.field_force
+    scaled = None if field is None else FieldForce(field.modes, factor * field.weights)
+    return calibration.model_copy(update={"force": force, "field_force": scaled})
+
+
+def _scaled(
+    error: tuple[float, float], limits: tuple[float, float], rmse: float, factor: float, doubt: float
+) -> dict[str, object]:
+    """Errors of a force times a factor with a relative standard error."""
+    return {
+        "error": (factor * error[0], math.hypot(error[1], doubt)),
+        "range": (factor * limits[0], factor * limits[1]),
+        "rmse": factor * rmse,
+    }
