@@ -114,6 +114,17 @@ def test_what_the_core_does_not_reach_is_no_part_of_the_contact() -> None:
     assert np.array_equal(found(speck, disc(10) < 0), found(clean, disc(10) < 0))
 
 
+def test_every_part_that_the_core_reaches_belongs_to_the_contact() -> None:
+    change = np.zeros((SIZE, SIZE, 3), np.float32)
+    change[10:30, 20:80] = change[50:70, 20:80] = 1
+    core = np.zeros((SIZE, SIZE), np.bool_)
+    core[15:25, 40:60] = core[55:65, 40:60] = True
+    mask = found(change, core)
+    assert mask[20, 50]
+    assert mask[60, 50]
+    assert not mask[40, 50]
+
+
 def test_masks_are_left_as_they_are() -> None:
     change, core = tilted(disc()), (disc() < -4).astype(np.uint8)
     kept = change.copy(), core.copy()

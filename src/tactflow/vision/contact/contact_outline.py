@@ -68,7 +68,7 @@ def contact_level(change: RelativeChange, core: Mask, border: float = BORDER_SLO
     Parameters
     ----------
     change : in the window of the contact.
-    core : (h, w) uint8, 1 where the contact certainly is, else 0; connected.
+    core : (h, w) uint8, 1 where the contact certainly is, else 0.
     border : slope at the outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
         fraction of the local depth is in proportion.
 
@@ -133,14 +133,16 @@ def largest_nearby(values: Floats32) -> Floats32:
 
 
 def _around(changed: Flags, core: Mask) -> Flags:
-    """(h, w): the changed component around the core, with its holes filled."""
+    """(h, w): changed components that overlap the core, with their holes filled."""
     inside = np.zeros(core.shape, np.uint8)
     outlines, _ = cv2.findContours(changed.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    y, x = divmod(int(core.argmax()), core.shape[1])
     for outline in outlines:
-        if cv2.pointPolygonTest(outline, (x, y), False) >= 0:
-            cv2.drawContours(inside, [outline], -1, 1.0, cv2.FILLED)
-            break
+        left, top, width, height = cv2.boundingRect(outline)
+        box = slice(top, top + height), slice(left, left + width)
+        part = np.zeros((height, width), np.uint8)
+        cv2.drawContours(part, [outline], -1, 1.0, cv2.FILLED, offset=(-left, -top))
+        if (part & core[box]).any():
+            inside[box] |= part
     return inside.view(np.bool_)
 
 
