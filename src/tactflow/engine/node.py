@@ -66,7 +66,7 @@ class RunningNode:
     ----------
     instance : of the class; `sink` or `stage` is the same object, the other is None.
     slots : of its outputs.
-    gates : each with the slot of its signal.
+    gates : each with the slot of its signal, and the value of its outputs while it is closed.
     signals : boolean output port -> (slot, counts of true values).
     presences : the same for outputs that may be absent, counting the present values.
     makers, signal_makers : nodes of the same segment that produce its inputs and the signals of its gates.
@@ -90,7 +90,9 @@ class RunningNode:
         self._shown = [(name, slots[ref.node, ref.port]) for name, ref in shown.items() if ref]
         self.slots = [slots[node.id, port.name] for port in ports.outputs]
         gates = node.gates if skipping else ()
-        self.gates = [(gate, slots[gate.signal.node, gate.signal.port]) for gate in gates]
+        self.gates = [
+            (gate, slots[gate.signal.node, gate.signal.port], Absent(gate.reason)) for gate in gates
+        ]
         self.signals: dict[str, tuple[int, SignalStats]] = {}
         self.presences: dict[str, tuple[int, SignalStats]] = {}
         for slot, port in zip(self.slots, ports.outputs, strict=True):
@@ -112,7 +114,7 @@ class RunningNode:
             skipping
             and node.component.memory == "pure"
             and self.sink is None
-            and all(gate.otherwise == "absent" for gate, _ in self.gates)
+            and all(gate.otherwise == "absent" for gate, *_ in self.gates)
         )
         self.last: Sequence[Any] | None = None
         self._last_inputs: Sequence[Any] | None = None
@@ -128,17 +130,17 @@ class RunningNode:
         """Discard the last outputs, so that they are not repeated."""
         self.last = self._last_inputs = None
 
-    def closed_gate(self, table: Sequence[Any]) -> tuple[Gate, int] | None:
-        """The closed gate that decides about the outputs in this tick, with the slot of its signal, or None.
+    def closed_gate(self, table: Sequence[Any]) -> tuple[Gate, int, Absent] | None:
+        """The closed gate that decides about the outputs in this tick, as in `gates`, or None.
 
         A gate that makes the outputs absent takes precedence over one that repeats them.
         """
-        closed: tuple[Gate, int] | None = None
-        for gate, slot in self.gates:
-            if table[slot] is not True:
-                if gate.otherwise == "absent":
-                    return gate, slot
-                closed = closed or (gate, slot)
+        closed: tuple[Gate, int, Absent] | None = None
+        for found in self.gates:
+            if table[found[1]] is not True:
+                if found[0].otherwise == "absent":
+                    return found
+                closed = closed or found
         return closed
 
     def inputs(self, tick: TickState) -> Sequence[Any] | Absent:

@@ -184,13 +184,13 @@ class Segment:
                     self._pull(maker, tick)
             closed = node.closed_gate(tick.values)
             if closed is not None:
-                gate, slot = closed
+                gate, slot, absent = closed
                 repeat = gate.otherwise == "repeat"
                 if not repeat:
                     # Earlier outputs must not be repeated after absent ones.
                     node.forget()
                 signal = tick.values[slot]
-                absent = signal if isinstance(signal, Absent) else Absent(gate.reason)
+                absent = signal if isinstance(signal, Absent) else absent
                 node.skip(tick, DAMAGED if tick.frame.damaged else absent, repeat=repeat)
                 return
         if node.disabled:

@@ -25,6 +25,9 @@ _Plan = tuple[Callable[[Any, str], Any], Sequence[_Step], "list[tuple[Any, orjso
 """How a part is encoded: the function for values without one of their own, and its keys; for a part that
 often repeats, also its last value with the text for it."""
 
+NUMBERS: frozenset[Any] = frozenset({float, int})
+"""Types of numbers that need no conversion."""
+
 
 def encode(result: Result, detail: bool, field: bool) -> dict[str, Any]:
     """The message of a result, for `to_json`.
@@ -83,7 +86,7 @@ def _encoded(value: Any, plan: _Plan, result: Result) -> Any:
 def _finite(value: Any, path: str) -> Any:
     """Check and convert for the encoder. NaN is allowed in standard errors and probabilities (null)."""
     if isinstance(value, tuple):
-        if not (len(value) == 2 and value[0].__class__ is value[1].__class__ is float):
+        if len(value) != 2 or not (value[0].__class__ in NUMBERS and value[1].__class__ in NUMBERS):
             return [_finite(part, path) for part in value]
         # Points. The differences are 0 or NaN.
         total = (value[0] - value[0]) + (value[1] - value[1])
