@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from tactflow.calibration.file import Calibration, ScaleEntry
+from tactflow.calibration.force import fit_force
 from tactflow.calibration.known_loads import Gain, carry, gain
+from tactflow.calibration.session import learn_weights
 from tactflow.calibration.weights import Weighed, fit_loads
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.force import Seen
@@ -63,8 +65,6 @@ def test_two_presses_carry_a_force_to_a_stiffer_gel_with_an_honest_error() -> No
 
 def test_what_is_carried_is_scaled_in_all_its_parts() -> None:
     seen, known = fitted(1, 12)
-    from tactflow.calibration.force import fit_force
-
     fit = fit_force({"a": seen}, {"a": known})
     other = plain().model_copy(update={"force": fit.entry, "field_force": fit.field})
     found = Gain(2.0, 0.2, np.ones(2), np.ones(2), np.ones(2))
@@ -88,6 +88,15 @@ def test_a_gel_that_answers_otherwise_is_noticed_and_one_that_does_not_passes() 
     softer = [gain(calibrated(seed), today(300 + seed, [5.0, 10, 15], 0.6)) for seed in range(40)]
     assert np.mean([found.is_one for found in softer]) < 0.2
     assert np.median([found.value for found in softer]) == pytest.approx(0.6, abs=0.05)
+
+
+def test_the_address_of_a_camera_is_stored_without_its_password() -> None:
+    lines: list[str] = []
+    weighed = today(1, [2.0, 5.0, 12.0])
+    made = learn_weights(plain(), weighed, "rtsp://me:secret@camera:554/1", lines.append)
+    assert made.force is not None
+    assert list(made.force.recordings) == ["rtsp://camera:554/..."]
+    assert lines[0].startswith("force, 3 loads: RMS error")
 
 
 def test_loads_that_cannot_be_compared_are_refused() -> None:

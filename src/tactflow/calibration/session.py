@@ -23,11 +23,12 @@ from tactflow.calibration.presses import NEEDED, PressFinder, Session
 from tactflow.calibration.reference import Reference, read_reference
 from tactflow.calibration.refine import apparent_radius, refine_photometry
 from tactflow.calibration.scale import scale_from_area, scale_from_pitch
-from tactflow.calibration.weights import WeightGuide
+from tactflow.calibration.weights import Weighed, WeightGuide, fit_loads
 from tactflow.calibration.words import darkness_words, force_words, photometric_words
 from tactflow.engine.contract import Source
 from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.message.result import Result
+from tactflow.system.redaction import public_address
 from tactflow.vision.types import Scale
 
 LARGEST_SCALE_ERROR: Final = 0.02
@@ -311,3 +312,15 @@ def learn_force(
     for words in force_words(fit, readings):
         say(words)
     return calibration.model_copy(update={"force": fit.entry, "field_force": fit.field})
+
+
+def learn_weights(calibration: Calibration, weighed: Weighed, source: str, say: Say) -> Calibration:
+    """A calibration with the force, from known weights. source : of the session.
+
+    Raises ConfigError if there are too few loads.
+    """
+    fit = fit_loads(*weighed)
+    for words in force_words(fit, {}):
+        say(words)
+    entry = fit.entry.model_copy(update={"recordings": {public_address(source): 0.0}})
+    return calibration.model_copy(update={"force": entry, "field_force": fit.field})

@@ -28,11 +28,12 @@ from tactflow.calibration.session import (
     instruction,
     learn,
     learn_force,
+    learn_weights,
     watch,
     weigh,
 )
-from tactflow.calibration.weights import Weighed, WeightGuide, fit_loads, read_weights
-from tactflow.calibration.words import core_words, force_words, gain_words
+from tactflow.calibration.weights import Weighed, WeightGuide, read_weights
+from tactflow.calibration.words import core_words, gain_words
 from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
 from tactflow.engine.collect import with_collector
 from tactflow.engine.contract import Source
@@ -314,16 +315,12 @@ def _force(args: argparse.Namespace) -> int:
 def _force_by_weights(args: argparse.Namespace, path: Path, pipeline: str | None) -> Calibration:
     """The calibration with a force that is fitted to known weights, or carried from another sensor."""
     calibration, weighed = Calibration.load(path), _weigh(args, path, pipeline, args.like is None)
-    if args.like is not None:
-        other = Calibration.load(args.like)
-        found = gain(other, weighed)
-        say(gain_words(found, str(args.like)))
-        return carry(calibration, other, found)
-    fit = fit_loads(*weighed)
-    for words in force_words(fit, {}):
-        say(words)
-    entry = fit.entry.model_copy(update={"recordings": {str(args.source or "live"): 0.0}})
-    return calibration.model_copy(update={"force": entry, "field_force": fit.field})
+    if args.like is None:
+        return learn_weights(calibration, weighed, str(args.source or "live"), say)
+    other = Calibration.load(args.like)
+    found = gain(other, weighed)
+    say(gain_words(found, str(args.like)))
+    return carry(calibration, other, found)
 
 
 def _weigh(args: argparse.Namespace, path: Path, pipeline: str | None, fits: bool) -> Weighed:
