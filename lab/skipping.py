@@ -1,6 +1,6 @@
 """What skipping saves on real recordings, and whether it changes a result.
 
-    python lab/skipping.py [--data ../shared/data] [NAME ...]
+    python -m lab.skipping [--data ../shared/data] [NAME ...]
 
 Every recording runs with skipping and without, a few frames each in turn, on one core. A frame at rest is one
 without a contact in the run that skips nothing; `far` are those more than 8 frames away from any contact.

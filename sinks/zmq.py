@@ -53,6 +53,8 @@ class Zmq(Sink):
     >>> sink.close()
     """
 
+    when_live = "latest"
+
     class Params(PublisherParams, MessageParams):
         """Address, queue, access of subscribers and of commands, and content."""
 

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 import zmq
 
+import tactflow
 from tactflow.engine.errors import StageError
 from tactflow.engine.frame import Frame
+from tactflow.engine.plan import make_plan
 from tactflow.message.result import Result
 from tactflow.sinks.zmq import Zmq
 from tactflow.vision.types import Depth, Markers
@@ -253,3 +255,11 @@ def test_pictures_have_their_rate_and_are_off_unless_asked_for(opened: Open, sub
     silent = opened()
     subscribe(silent, b"tactflow_picture.main")
     assert not silent.wants()
+
+
+def test_it_runs_where_the_results_are_and_drops_old_ones_in_a_thread_of_its_own() -> None:
+    sinks: dict[str, Any] = {"zmq": {"endpoint": "tcp://127.0.0.1:*"}}
+    for own, expected in ((None, []), ("publishing", ["latest"])):
+        pipeline = tactflow.load(settings={"sinks": sinks | {"zmq": sinks["zmq"] | {"segment": own}}})
+        links = make_plan(pipeline, live=True).links
+        assert [link.when_full for link in links if link.producer == "compute"] == expected
