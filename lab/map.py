@@ -15,6 +15,8 @@ import argparse
 import pickle
 import tempfile
 import time
+from collections import Counter
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,19 +28,29 @@ import tactflow
 from lab.pose import inputs, simulated_calibration
 from tactflow.plugins.map.closure import mapped
 from tactflow.plugins.map.graph import Graph
-from tactflow.plugins.map.keyframes import Contact, Touch, contacts_of
+from tactflow.plugins.map.joining import bridge, joined
+from tactflow.plugins.map.keyframes import Contact, Touch, contacts_of, overlap
 from tactflow.plugins.map.surface import Points, merged
 from tactflow.sim.gel import MM_PER_PX, reached
-from tactflow.vision.pose.rigid import inverse
+from tactflow.vision.pose.rigid import inverse, vector
 
 FRAMES = 300
 SCENARIOS = {
     "medal larger than the gel, slid": "medal",
+    "the same, lifted three times": "lifts",
     "bumpy ball, rolled around": "orbit",
     "the same, no dots": "orbit&markers=none",
     "threaded rod, rolled around": "thread",
     "coin, slid": "scrape&markers=none",
 }
+OBJECTS = ("lifts", "orbit&markers=none", "thread", "scrape&markers=none")
+"""Recordings of different objects."""
+PIECE_KEYFRAMES = 3
+"""Keyframes of the parts of contacts that are joined."""
+SHARED = 0.7
+"""Share of a patch that another part shows, above which not joining them is a miss."""
+WRONG_MM_RADIANS = np.repeat([0.3, 0.1], 3)
+"""Error of the motion between parts that were joined, above which that is wrong."""
 PROCESSED_MM = 2 * MM_PER_PX
 """Millimetres per processed pixel of the simulated sensor, whose pipelines halve the picture."""
 
@@ -55,7 +67,7 @@ class Recording(NamedTuple):
 def recorded(query: str, calibration: Path, keep: Path) -> Recording:
     """A simulated recording."""
     name, _, more = query.partition("&")
-    more = more or ("markers=none" if name == "medal" else "")
+    more = more or ("markers=none" if name in ("medal", "lifts") else "")
     spec = f"{name}?frames={FRAMES}&{more}".rstrip("&")
     kept = keep / f"{query}.pickle"
     if not kept.exists():
@@ -108,7 +120,7 @@ def drift(contact: Contact, graph: Graph, recording: Recording) -> tuple[float, 
 def judged(recording: Recording) -> str:
     """The columns of a row."""
     before = time.thread_time()
-    contact = max(contacts_of(recording.touches), key=lambda one: len(one.keyframes))
+    contact, _ = joined(contacts_of(recording.touches))
     plain = mapped(contact.keyframes, contact.edges, loops=False)
     graph = mapped(contact.keyframes, contact.edges)
     points = merged(contact.keyframes, graph)
@@ -124,6 +136,48 @@ def judged(recording: Recording) -> str:
     return " ".join([*columns, f"{spent:6.1f}"])
 
 
+def pieces(recording: Recording) -> list[Contact]:
+    """Parts of the contacts of a recording, a few keyframes each."""
+    found = []
+    for contact in contacts_of(recording.touches):
+        for start in range(0, len(contact.keyframes) - PIECE_KEYFRAMES + 1, PIECE_KEYFRAMES):
+            end = start + PIECE_KEYFRAMES
+            edges = [
+                edge._replace(before=edge.before - start, now=edge.now - start)
+                for edge in contact.edges[start : end - 1]
+            ]
+            found.append(Contact(contact.keyframes[start:end], edges))
+    return found
+
+
+def judged_joins(recordings: dict[str, Recording]) -> str:
+    """How often parts of contacts are joined rightly, wrongly, or not although they show the same."""
+    parts = [(name, part) for name, recording in recordings.items() for part in pieces(recording)]
+    counts: Counter[str] = Counter()
+    for (name, one), (other_name, other) in combinations(parts, 2):
+        edge = bridge(one, other)
+        if name != other_name:
+            counts["wrong, other object" if edge else "refused, other object"] += 1
+            continue
+        true = recordings[name].true
+        motions = {
+            (i, k): true[now.seq] @ inverse(true[before.seq])
+            for i, before in enumerate(one.keyframes)
+            for k, now in enumerate(other.keyframes)
+        }
+        if edge is None:
+            shared = max(
+                overlap(one.keyframes[i].imprint, other.keyframes[k].template, inverse(motion))
+                for (i, k), motion in motions.items()
+            )
+            counts["missed" if shared > SHARED else "refused, another part"] += 1
+            continue
+        error = vector(motions[edge.before, edge.now] @ inverse(edge.motion))
+        near = (np.abs(error) < WRONG_MM_RADIANS).all()
+        counts["right" if near else "wrong, same object"] += 1
+    return ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="judge maps of objects")
@@ -136,6 +190,9 @@ def main() -> None:
     for label, query in SCENARIOS.items():
         if not args.only or args.only in label:
             print(f"{label:32} {judged(recorded(query, calibration, keep))}", flush=True)
+    if not args.only or args.only == "joins":
+        kept = {query: recorded(query, calibration, keep) for query in OBJECTS}
+        print(f"joins: {judged_joins(kept)}")
 
 
 if __name__ == "__main__":

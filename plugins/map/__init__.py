@@ -1,1 +1,1 @@
-"""`tactflow map`: the surface of an object, from one contact in which it moves over the gel."""
+"""`tactflow map`: the surface of an object that moves over the gel."""

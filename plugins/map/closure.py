@@ -20,7 +20,7 @@ from tactflow.vision.pose.imprint import Template
 from tactflow.vision.pose.rigid import adjoint, inverse, rigid, vector
 from tactflow.vision.pose.tracker import MAX_MISFIT, MAX_RESIDUAL, SLOPE_ERROR_PARTS
 
-from .graph import Graph, chained, optimised, twist
+from .graph import Graph, optimised, spanning, twist
 from .keyframes import Edge, Keyframe, about_origin, overlap, turned
 
 MIN_OVERLAP: Final = 0.5
@@ -40,7 +40,7 @@ MAX_MISFIT_RATIO: Final = float(f.isf(0.05, MISFIT_FREEDOM, MISFIT_FREEDOM))
 MAX_LOOPS: Final = 5
 """Earlier keyframes with which one is registered in a round, at most: those that show most of its patch."""
 MAX_ROUNDS: Final = 5
-"""Rounds of finding loops; each may show more, since poses are more accurate after the last one."""
+"""Rounds of finding loops, and of joining contacts; each may find more, as more is known after the last."""
 
 
 def mapped(keyframes: Sequence[Keyframe], edges: Sequence[Edge], *, loops: bool = True) -> Graph:
@@ -51,7 +51,7 @@ def mapped(keyframes: Sequence[Keyframe], edges: Sequence[Edge], *, loops: bool 
     """
     anchor = int(np.argmax([keyframe.imprint.area for keyframe in keyframes]))
     slope_stderr = float(np.sqrt(np.mean([keyframe.imprint.error**2 for keyframe in keyframes])))
-    graph = optimised(chained(edges, anchor), edges, anchor, slope_stderr)
+    graph = optimised(spanning(edges, anchor), edges, anchor, slope_stderr)
     tried: set[tuple[int, int]] = set()
     accepted: list[Edge] = []
     for _ in range(MAX_ROUNDS if loops else 0):

@@ -26,8 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording",
         metavar="RECORDING",
-        help="of one object that is rolled, turned or slid over the gel without lifting it: whatever "
-        "`tactflow run --source` takes, except live sources",
+        help="of one object that is rolled, turned or slid over the gel: whatever `tactflow run --source` "
+        "takes, except live sources",
     )
     parser.add_argument(
         "--pipeline",
@@ -40,7 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--contact",
         type=positive,
         metavar="N",
-        help="which contact of the recording, from 1; default: the one that shows most",
+        help="only this contact of the recording, from 1; default: the one that shows most, and those that "
+        "show parts of the same surface again",
     )
     parser.add_argument(
         "--out",
@@ -69,9 +70,10 @@ def run(args: argparse.Namespace) -> int:
     refuse_output("--out", args.out, overwrite=args.overwrite, suffixes=(".ply",))
     refuse_output("--out", page_file, overwrite=args.overwrite)
     contacts = _contacts(args)
-    contact = chosen(contacts, args.contact, args.recording)
-    graph = mapped(contact.keyframes, contact.edges)
-    points = merged(contact.keyframes, graph)
+    with progress_bar(f"mapping {len(contacts)} contacts"):
+        contact, count = chosen(contacts, args.contact, args.recording)
+        graph = mapped(contact.keyframes, contact.edges)
+        points = merged(contact.keyframes, graph)
     cell = float(contact.keyframes[0].imprint.cell.mean())
     written = map_page(args.recording, points, contact, graph, cell)
     with writing(args.out), completed(args.out) as partial:
@@ -79,31 +81,31 @@ def run(args: argparse.Namespace) -> int:
     with writing(page_file), completed(page_file) as partial:
         partial.write_text(written, encoding="utf-8")
     if len(contacts) > 1:
-        number = [one is contact for one in contacts].index(True) + 1
-        say(
-            f"Contact {number} of {len(contacts)}; one ends where the object is lifted, or cannot be tracked."
-        )
+        others = "" if count == len(contacts) else "; the others do not show where they belong"
+        say(f"{count} of {len(contacts)} contacts{others}.")
     for line in (summary(points, contact), *unseen(contact, graph)):
         say(line)
     say(f"tactflow: wrote {args.out} and {page_file}")
     return 0
 
 
-def chosen(contacts: list[Contact], number: int | None, recording: str) -> Contact:
-    """A contact, by default that with most keyframes.
+def chosen(contacts: list[Contact], number: int | None, recording: str) -> tuple[Contact, int]:
+    """A contact, by default that with most keyframes and all that show the same object, and their number.
 
     number : from 1. Raises StageError if there is none, ConfigError for a number that does not exist.
     """
+    from .joining import joined
+
     if not contacts:
         raise StageError(
             f"{recording}: no contact is large enough to be mapped; `tactflow report` shows what was found. "
             "Begin with the untouched gel, then press the object on it and roll it on"
         )
     if number is None:
-        return max(contacts, key=lambda contact: len(contact.keyframes))
+        return joined(contacts)
     if number > len(contacts):
         raise ConfigError(f"--contact: required 1 to {len(contacts)}, got {number}")
-    return contacts[number - 1]
+    return contacts[number - 1], 1
 
 
 def _contacts(args: argparse.Namespace) -> list[Contact]:

@@ -106,13 +106,23 @@ def twist(motion: Floats) -> Floats:
     return np.concatenate([(np.eye(3) - cross / 2 + part * cross @ cross) @ found[:3], found[3:]])
 
 
-def chained(edges: Sequence[Edge], anchor: int) -> list[Floats]:
-    """Poses from the motions between neighbours alone: edge k leads from keyframe k to k + 1."""
-    poses = [np.eye(4)]
+def spanning(edges: Sequence[Edge], anchor: int) -> list[Floats]:
+    """First guesses of the poses: each from a neighbour's by one edge, beginning with the anchor.
+
+    edges : N - 1 at least, that connect N keyframes.
+    """
+    steps: dict[int, list[tuple[int, Floats]]] = {anchor: []}
     for edge in edges:
-        poses.append(edge.motion @ poses[-1])
-    back = inverse(poses[anchor])
-    return [pose @ back for pose in poses]
+        steps.setdefault(edge.before, []).append((edge.now, edge.motion))
+        steps.setdefault(edge.now, []).append((edge.before, inverse(edge.motion)))
+    poses, pending = {anchor: np.eye(4)}, [anchor]
+    while pending:
+        here = pending.pop()
+        for there, motion in steps[here]:
+            if there not in poses:
+                poses[there] = motion @ poses[here]
+                pending.append(there)
+    return [poses[index] for index in range(len(poses))]
 
 
 def optimised(

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from tactflow.vision.arrays import Floats, Mask
+from tactflow.vision.arrays import Flags, Floats, Mask
 from tactflow.vision.flow.displacement_field import DisplacementField
 from tactflow.vision.pose.imprint import Imprint, Template, imprint_of, template_of
 from tactflow.vision.pose.rigid import adjoint, inverse, rigid, vector
@@ -176,7 +176,12 @@ def about_origin(
 
 
 def overlap(shown: Imprint, template: Template, motion: Floats) -> float:
-    """Share of the points of a template that an imprint shows, from the same side.
+    """Share of the points of a template that an imprint shows; arguments as for `shared_points`."""
+    return float(np.mean(shared_points(shown, template, motion)))
+
+
+def shared_points(shown: Imprint, template: Template, motion: Floats) -> Flags:
+    """(N,): whether an imprint shows each point of a template, from the same side.
 
     motion : (4, 4), from the frame of the template to that of the imprint, about the origin.
     """
@@ -184,7 +189,8 @@ def overlap(shown: Imprint, template: Template, motion: Floats) -> float:
     across, down = template.points[:, 3:5].T
     upright = np.sqrt(np.maximum(1 - across**2 - down**2, 0))
     facing = np.column_stack([across, down, upright]) @ motion[2, :3]
-    cells = np.rint((points - shown.first) / shown.cell).astype(int)
+    columns, rows = np.rint((points - shown.first) / shown.cell).astype(int).T
     high, wide = shown.planes.shape[:2]
-    inside = ((cells >= 0) & (cells < (wide, high))).all(axis=1) & (facing > MIN_COSINE)
-    return float((shown.planes[cells[inside, 1], cells[inside, 0], 3] > 0).sum() / len(points))
+    inside = (columns >= 0) & (columns < wide) & (rows >= 0) & (rows < high) & (facing > MIN_COSINE)
+    inside[inside] = shown.planes[rows[inside], columns[inside], 3] > 0
+    return np.asarray(inside, np.bool_)

@@ -217,7 +217,7 @@ def summary(points: Points, contact: Contact) -> str:
     size = " x ".join(f"{side:.1f}" for side in np.ptp(points.place, axis=0))
     median, most = np.quantile(points.error, (0.5, 0.9))
     return (
-        f"A surface of {size} mm, {len(points)} points, from {contact.frames} frames of one contact: "
+        f"A surface of {size} mm, {len(points)} points, from {contact.frames} frames: "
         f"standard error {median:.3f} mm (median), {most:.3f} mm (90 %)."
     )
 
@@ -260,7 +260,7 @@ def _facts(points: Points, contact: Contact, graph: Graph) -> Html:
     loops = len(graph.edges) - len(contact.edges)
     stderr = float(np.sqrt(graph.covariance()[0, 0]))
     rows: Sequence[Sequence[object]] = [
-        ["frames of the contact", contact.frames],
+        ["frames in contact", contact.frames],
         ["keyframes", len(contact.keyframes)],
         ["loops closed", loops],
         ["all slopes are too small by", f"{100 * graph.slope_error:.1f} ± {100 * stderr:.1f} %"],

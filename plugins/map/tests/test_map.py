@@ -14,7 +14,8 @@ import pytest
 from tactflow.engine.frame import Frame
 from tactflow.message.result import Result
 from tactflow.plugins.map.closure import mapped, registered, weakened
-from tactflow.plugins.map.graph import chained, optimised, twist
+from tactflow.plugins.map.graph import optimised, spanning, twist
+from tactflow.plugins.map.joining import joined
 from tactflow.plugins.map.keyframes import Contact, Edge, Touch, contacts_of, keyframe_of
 from tactflow.plugins.map.page import unseen
 from tactflow.plugins.map.ply import read_ply
@@ -98,6 +99,41 @@ def test_loops_of_the_same_patch_count_as_one() -> None:
     assert [loop.covariance[0, 0] for loop in weakened(loops)] == [2, 2, 1]
 
 
+def turned(number: int, degrees: float, way: Floats) -> Iterator[Touch]:
+    """The plate, put down again after a turn, that moves along a way (N, 2), mm."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    for seq, place in enumerate(way):
+        x, y = X - place[0], Y - place[1]
+        heights = relief(cos * x + sin * y, cos * y - sin * x).astype(np.float32)
+        yield Touch(100 * number + seq, SCALE, Depth(heights, 0.4, 0.003, 1.0, None), MASK)
+
+
+def test_contacts_that_show_the_same_part_after_a_turn_are_joined() -> None:
+    way = STEP_MM * np.column_stack([np.arange(12), np.zeros(12)])
+    (one,), (other,) = (contacts_of(turned(n, degrees, way)) for n, degrees in ((0, 0.0), (1, 110.0)))
+    contact, count = joined([other, one])
+    assert count == 2
+    assert contact.frames == 24
+    graph = mapped(contact.keyframes, contact.edges)
+    motion = graph.motion(0, len(one.keyframes), graph.covariance(0, len(one.keyframes))).motion
+    assert abs(np.degrees(np.arctan2(motion[1, 0], motion[0, 0]))) == pytest.approx(110, abs=0.5)
+    np.testing.assert_allclose(motion[:3, 3], 0, atol=0.05)
+
+
+def test_contacts_that_show_nothing_in_common_are_not_joined() -> None:
+    near, far = (np.array([[x, 0.0], [x + 0.25, 0.0]]) for x in (0.0, 31.0))
+    (one,), (other,) = (contacts_of(turned(n, 0.0, way)) for n, way in enumerate((near, far)))
+    contact, count = joined([one, other])
+    assert (count, contact) == (1, one)
+
+
+def test_smooth_domes_are_not_joined_wherever_they_fit() -> None:
+    heights = np.maximum(0.5 - 0.05 * (X**2 + Y**2), 0).astype(np.float32)
+    mask = np.where(heights > 0, 255, 0).astype(np.uint8)
+    dome = Touch(0, SCALE, Depth(heights, 0.5, 0.01, 1.0, None), mask)
+    assert joined([*contacts_of([dome]), *contacts_of([dome])])[1] == 1
+
+
 def test_another_plate_at_the_predicted_place_closes_no_loop(plate: Contact) -> None:
     *keyframes, _ = plate.keyframes
     (other,) = contacts_of([touch(99, np.array([31.0, 17.0]))])
@@ -116,7 +152,7 @@ def test_a_smooth_dome_says_that_its_turns_are_not_seen(plate: Contact) -> None:
     edge = registration[1]
     assert edge.motion[0, 3] == pytest.approx(1, abs=0.05)
     dome = Contact(frames, [edge])  # type: ignore[arg-type]
-    said = " ".join(unseen(dome, optimised(chained([edge], 0), [edge], 0, 0.02)))
+    said = " ".join(unseen(dome, optimised(spanning([edge], 0), [edge], 0, 0.02)))
     assert "Turns are not well seen: in frame 1" in said
     assert not list(unseen(plate, mapped(plate.keyframes, plate.edges)))
 
@@ -148,7 +184,7 @@ def test_a_closed_loop_shows_how_wrong_all_slopes_are() -> None:
     forward = np.eye(4)
     forward[0, 3] = 6 * np.pi
     loop = Edge(0, 24, forward, edges[0].covariance, np.zeros(6))
-    before = optimised(chained(edges, 0), edges, 0, 0.1)
+    before = optimised(spanning(edges, 0), edges, 0, 0.1)
     after = optimised(before.poses, [*edges, loop], 0, 0.1)
     assert before.slope_error == pytest.approx(0)
     assert before.contradiction(loop, before.covariance(0, 24)) < 6
@@ -160,7 +196,7 @@ def test_a_closed_loop_shows_how_wrong_all_slopes_are() -> None:
 
 def test_the_pose_of_the_anchor_is_known_and_far_ones_are_less_so() -> None:
     edges = rolled(0.0)
-    graph = optimised(chained(edges, 7), edges, 7, 0.1)
+    graph = optimised(spanning(edges, 7), edges, 7, 0.1)
     assert graph.covariance(7).shape == (7, 7)
     assert not graph.covariance(7)[:6].any()
     both = graph.covariance(3, 20)
@@ -188,14 +224,16 @@ def results(frames: list[Touch | None]) -> Iterator[Result]:
 @pytest.fixture
 def streamed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pipeline that finds the plate."""
-    monkeypatch.setattr("tactflow.streaming.stream", lambda _: results([None, *square()]))
+    far = touch(99, np.array([31.0, 17.0]))
+    monkeypatch.setattr("tactflow.streaming.stream", lambda _: results([None, *square(), None, far]))
 
 
 @pytest.mark.usefixtures("streamed")
 def test_the_command_writes_points_and_a_page(terminal: Terminal) -> None:
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     assert terminal("map", "sim:press", "--out", "plate.ply") == 0, terminal.err
-    assert "frames of one contact: standard error" in terminal.err
+    assert "frames: standard error" in terminal.err
+    assert "1 of 2 contacts; the others do not show where they belong." in terminal.err
     table = read_ply(Path("plate.ply"))
     assert table.dtype.names[:3] == ("x", "y", "z")
     assert len(table) > 1000
@@ -209,8 +247,10 @@ def test_the_command_writes_points_and_a_page(terminal: Terminal) -> None:
     assert len(base64.b64decode(data[1])) == 12 * len(table)
     assert terminal("map", "sim:press", "--out", "plate.ply") == 2
     assert "--overwrite" in terminal.err
-    assert terminal("map", "sim:press", "--contact", "2", "--out", "other.ply") == 2
-    assert "--contact: required 1 to 1, got 2" in terminal.err
+    assert terminal("map", "sim:press", "--contact", "3", "--out", "other.ply") == 2
+    assert "--contact: required 1 to 2, got 3" in terminal.err
+    assert terminal("map", "sim:press", "--contact", "2", "--out", "other.ply") == 0
+    assert len(read_ply(Path("other.ply"))) < len(table)
 
 
 def test_without_a_calibration_it_says_what_to_do(terminal: Terminal) -> None:

@@ -50,8 +50,9 @@ class Programme:
     travel : distance the indenter slides during a hold, px.
     partial : whether a ball slips at the edge of the contact first.
     rolls : whether a ball turns as it travels, without slip.
-    path : places, px from the start, to which the contact moves over the object one after the other during a
-        hold. With `rolls` it moves over the gel alike; without, the object slides round in place.
+    path : places on the object, px from its middle, to which the contact moves one after the other, by equal
+        shares during the holds of all `contacts`. With `rolls` (and without
+        `angles`) it moves over the gel alike; else the object slides round in place.
     jumps : whether the gel is dragged to a new position every third frame.
     creep : its drag, px per frame.
     tilts : rotation about the direction of motion and across it, from 0 to this and back during a hold,
@@ -160,7 +161,7 @@ def _dragged(
     """Displacements (2,), px, of the gel and of the indenter; `stick` and `sliding` of `Press`."""
     farthest = settings.shear * pitch
     if programme.path:
-        place, _ = _rolled(programme.path, timing.progress, 1.0)
+        place, _ = _rolled(programme.path, _share(programme, timing), 1.0)
         return np.zeros(2), place * programme.rolls, None, not programme.rolls and 0 < timing.progress < 1
     if programme.jumps:
         draw = np.random.default_rng([settings.seed, timing.cycle, int(timing.phase // 3), 0x6A75])
@@ -202,22 +203,33 @@ def _rolled(
     return place, rotation
 
 
-def _turned(
+def _share(programme: Programme, timing: _Timing) -> float:
+    """Share of the path that the object has passed: each contact goes on where the last one ended."""
+    return (timing.cycle + timing.progress) / max(programme.contacts, 1)
+
+
+def _tilt(
     programme: Programme,
     timing: _Timing,
+    angle: float,
     ahead: NDArray[np.float64],
     travelled: NDArray[np.float64],
     arm: float,
-) -> NDArray[np.float64]:
-    """Rotation vector (3,) of an indenter about its centre. arm : radius with which it rolls, px."""
+) -> tuple[float, float, float]:
+    """Rotation vector of an indenter before it is turned by its angle, radians. arm : radius with which it
+    rolls, px."""
     if programme.path:
-        rotation = _rolled(programme.path, timing.progress, arm)[1]
-    elif programme.rolls:
-        rotation = _rolled(((float(travelled[0]), float(travelled[1])),), 1.0, arm)[1]
+        rotation = _rolled(programme.path, _share(programme, timing), arm)[1]
+        x, y, z = cv2.Rodrigues(rotation)[0].ravel().tolist()
+        return x, y, z
+    if programme.rolls:
+        about = cv2.Rodrigues(_rolled(((float(travelled[0]), float(travelled[1])),), 1.0, arm)[1])[0].ravel()
     else:
         axes = np.stack([ahead, np.array([-ahead[1], ahead[0]])])
-        return np.append(np.radians(programme.tilts) @ axes * timing.swing, 0.0)
-    return np.asarray(cv2.Rodrigues(rotation)[0].ravel(), np.float64)
+        about = np.append(np.radians(programme.tilts) @ axes * timing.swing, 0.0)
+    x, y, z = about.tolist()
+    cos, sin = float(np.cos(angle)), float(np.sin(angle))
+    return x * cos + y * sin, y * cos - x * sin, z
 
 
 def presses(
@@ -248,13 +260,11 @@ def presses(
     full = programme.depths[timing.cycle % len(programme.depths)] * settings.depth
     depth = timing.envelope * full
     angle += turn
-    cos, sin = float(np.cos(angle)), float(np.sin(angle))
 
     def indenter(shape: Shape, offset_x: float, offset_y: float) -> Press:
         # Rolling without slip: the mean of the surface in contact does not move.
         arm = shape.center - full * shape.depth * (1 - settings.sink) / 2
-        about = _turned(programme, timing, ahead, travelled, arm).tolist()
-        tilt = about[0] * cos + about[1] * sin, about[1] * cos - about[0] * sin, about[2]
+        tilt = _tilt(programme, timing, angle, ahead, travelled, arm)
         if any(tilt):
             shape = shape.rotated(np.asarray(cv2.Rodrigues(np.array(tilt))[0], np.float64))
         return Press(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,6 +22,12 @@ class Recipe(NamedTuple):
 _SPHERE = (shapes.sphere,)
 _PRESS = Programme(_SPHERE)
 _CABLE = Programme((shapes.cable,), wander=(60.0, 60.0), angles=(-75.0, 75.0), dilation=0.25)
+_MEDAL = Programme(
+    (shapes.medal,), wander=(0.0, 0.0), contacts=1, period=280, rise=20, hold=240, depths=(1.0,),
+    path=((300.0, 0.0), (300.0, 200.0), (-300.0, 200.0), (-300.0, 0.0), (300.0, 0.0),
+          (300.0, -200.0), (-300.0, -200.0), (-300.0, 0.0), (0.0, 0.0)),
+    dilation=0.01,
+)  # fmt: skip
 """Programmes shared by several scenes; lengths in raw px, angles in degrees."""
 SCENES: dict[str, Recipe] = {
     "press": Recipe("a ball is pressed in several places, at several depths", _PRESS),
@@ -77,13 +84,12 @@ SCENES: dict[str, Recipe] = {
         {"shear": 0.0},
     ),
     "medal": Recipe(
-        "a medal larger than the gel slides round over it, and back to where it began",
-        Programme(
-            (shapes.medal,), wander=(0.0, 0.0), contacts=1, period=280, rise=20, hold=240, depths=(1.0,),
-            path=((300.0, 0.0), (300.0, 200.0), (-300.0, 200.0), (-300.0, 0.0), (300.0, 0.0),
-                  (300.0, -200.0), (-300.0, -200.0), (-300.0, 0.0), (0.0, 0.0)),
-            dilation=0.01,
-        ),
+        "a medal larger than the gel slides round over it, and back to where it began", _MEDAL,
+        {"shear": 0.0, "markers": (0, 0)},
+    ),
+    "lifts": Recipe(
+        "the same medal, lifted and turned three times on its way",
+        replace(_MEDAL, contacts=4, angles=(-90.0, 90.0)),
         {"shear": 0.0, "markers": (0, 0)},
     ),
     "rock": Recipe(
