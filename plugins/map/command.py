@@ -165,9 +165,10 @@ def _pipeline(args: argparse.Namespace) -> Pipeline:
     with closing(open_source(args.recording)) as opened:
         if opened.live:
             raise ConfigError(f"{args.recording}: required a recording, not a camera or a stream")
-    pipeline = load(args.overrides)
+    own = [text for text in args.overrides if text.partition("=")[0].startswith("stages.slip")]
+    pipeline = load([text for text in args.overrides if text not in own])
     if "depth" not in pipeline.nodes:
         raise ConfigError(f"{file}: a map in mm needs the stages scale and depth, and a calibration")
-    if "field" in pipeline.nodes and "slip" not in pipeline.nodes:
-        pipeline = load(["stages.slip={}", *args.overrides])
-    return pipeline
+    if "slip" in pipeline.nodes:
+        return load(args.overrides)
+    return load(["stages.slip={}", *args.overrides]) if "field" in pipeline.nodes else pipeline

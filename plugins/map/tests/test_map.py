@@ -253,6 +253,22 @@ def test_the_command_writes_points_and_a_page(terminal: Terminal) -> None:
     assert len(read_ply(Path("other.ply"))) < len(table)
 
 
+@pytest.mark.parametrize(
+    ("pipeline", "override", "has_slip"),
+    [("default", [], True), ("default", ["stages.slip=null"], False), ("markerless", [], False)],
+)
+def test_slip_is_asked_for_where_dots_show_it(
+    pipeline: str, override: list[str], has_slip: bool, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used = []
+    monkeypatch.setattr(
+        "tactflow.streaming.stream", lambda pipeline: used.append(pipeline) or results([None])
+    )
+    sets = [word for text in override for word in ("--set", text)]
+    assert terminal("map", "sim:press", "--pipeline", pipeline, *sets) == 3
+    assert ("slip" in used[0].nodes) is has_slip
+
+
 def test_without_a_calibration_it_says_what_to_do(terminal: Terminal) -> None:
     assert terminal("map", "sim:press?frames=40") == 2
     assert "tactflow calibrate" in terminal.err
