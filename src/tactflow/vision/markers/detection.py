@@ -14,7 +14,15 @@ from scipy.spatial.distance import cdist
 
 from tactflow.vision.arrays import Floats, check_mask
 from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, Lattice, nearest, neighbour_graph, pitch_of
-from tactflow.vision.markers.selection import Candidate, Polarity, candidates, evidence, marks_of, probability
+from tactflow.vision.markers.selection import (
+    Candidate,
+    Polarity,
+    at_own_scale,
+    candidates,
+    evidence,
+    marks_of,
+    probability,
+)
 from tactflow.vision.markers.spots import SAME_SIZE_RATIO, Spots, find_spots, sigmas
 
 PolarityOption = Literal["auto", "dark", "bright"]
@@ -139,9 +147,9 @@ def detect_markers(
     """Detect the marks of a gel: of one size or many, of any shape, in one lattice or several.
 
     Differences of Gaussians over a range of scales give spots of every size. Those of one scale with the most
-    contrast in the best lattice are marks; a random texture forms no lattice. Spots of other scales are added
-    where the lattice predicts a mark. Weak spots, spots between others and spots cut by the border are
-    rejected.
+    contrast in the best lattice are marks, at the scale at which they respond most; a random texture forms no
+    lattice. Spots of other scales are added where the lattice predicts a mark. Weak spots, spots between
+    others and spots cut by the border are rejected.
 
     Parameters
     ----------
@@ -197,8 +205,8 @@ def _in_lattice(
 
     by_scale : the spots of its polarity for each scale, px. least : minimum probability of a mark.
     """
-    best = found[0]
     _require_lattice(found)
+    best = at_own_scale(found[0], found)
     _require_gel_between(gray, best, best.lattice)
     marks = marks_of(gray, best, by_scale)
     _require_gel_between(gray, best, Lattice(marks.points))
@@ -206,12 +214,12 @@ def _in_lattice(
     marks = marks.at(~(probability(evidence(gray, marks)) < least))
     if not len(marks.points):
         raise NoMarkersError(_NO_MARKERS + _FEW_MARKERS, best)
-    detection = _detection(gray, best, marks, found[1:])
+    detection = _detection(gray, best, marks, [other for other in found if other is not best])
     rival = detection.rival
     if (
         rival is not None
         and rival.polarity != best.polarity
-        and rival.score > MAX_POLARITY_SCORE_RATIO * best.score
+        and rival.score > MAX_POLARITY_SCORE_RATIO * found[0].score
     ):
         raise NoMarkersError(
             f"{_NO_MARKERS} ({best} are as regular as {rival}, as in a texture; if either are "

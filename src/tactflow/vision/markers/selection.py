@@ -43,6 +43,9 @@ MAX_STRENGTH_RATIO: Final = 3.2
 """Maximum ratio of the responses of a spot and of the marks around, either way, where the lattice predicts a
 mark: uneven light and dirt weaken marks."""
 
+MAX_LOST_SPOTS: Final = 1
+"""Maximum number of spots of a candidate that a finer scale of the same marks lacks: a scrap beside them."""
+
 MAX_SIZE_RATIO: Final = 1.5
 """Maximum ratio of the radii of a spot and of the marks around, either way; and of their responses, where
 only clearance supports it."""
@@ -98,6 +101,11 @@ class Candidate(NamedTuple):
         """(N, 2) float64, px."""
         return self.spots.points
 
+    @property
+    def contrast(self) -> float:
+        """Sum of the responses, if all were typical: six lamps must not beat a hundred faint dots."""
+        return float(np.median(self.spots.strength)) * len(self.spots.points)
+
     def __str__(self) -> str:
         return f"{len(self.centers)} {self.polarity} ones of radius {self.radius:.1f} px"
 
@@ -113,11 +121,25 @@ def candidates(scales: Mapping[Polarity, Mapping[float, Spots]]) -> list[Candida
             members = _alike(spots.at(spots.clear > MIN_CLEARANCE))
             if len(members.points):
                 lattice = Lattice(members.points)
-                # More contrast is more evidence, but six lamps must not beat a hundred faint dots.
-                total = float(np.median(members.strength)) * len(members.points)
-                score = max(lattice.closed_share - RANDOM_CLOSED_SHARE, 0.0) * total**0.5
-                found.append(Candidate(members, sigma * RADIUS_PER_SIGMA, polarity, score, lattice))
+                candidate = Candidate(members, sigma * RADIUS_PER_SIGMA, polarity, 0.0, lattice)
+                score = max(lattice.closed_share - RANDOM_CLOSED_SHARE, 0.0) * candidate.contrast**0.5
+                found.append(candidate._replace(score=score))
     return sorted(found, key=lambda one: (one.score, float(one.spots.strength.sum())), reverse=True)
+
+
+def at_own_scale(chosen: Candidate, found: list[Candidate]) -> Candidate:
+    """The candidate of the finer scale that has the marks of a chosen one, further ones, and more contrast.
+
+    A lattice is the more regular the fewer marks it has, so the first candidate may have a scale that is too
+    wide for its marks, and lack the small and faint ones at the rim. found : all candidates, the best first.
+    """
+    for other in found:
+        more = len(other.centers) > len(chosen.centers) and other.contrast > chosen.contrast
+        if more and other.polarity == chosen.polarity and other.radius < chosen.radius:
+            near = cdist(chosen.centers, other.centers) < chosen.radius
+            if np.count_nonzero(near.sum(axis=1) != 1) <= MAX_LOST_SPOTS:
+                return at_own_scale(other, found)
+    return chosen
 
 
 def marks_of(gray: NDArray[np.float32], chosen: Candidate, by_scale: Mapping[float, Spots]) -> Spots:
