@@ -114,6 +114,24 @@ def test_no_dot_can_be_known_better_than_noise_allows(default: Subject) -> None:
     assert bounds[1] < error < 4 * bounds[1]
 
 
+def test_dirt_lies_on_the_lens_after_the_reference() -> None:
+    plain = clip(Case("press", 44))
+    dirty = PERTURBATIONS["dirt on the lens"].perturb(plain, 3, np.random.default_rng(0))
+    assert all(np.array_equal(*pair) for pair in zip(plain.frames[:2], dirty.frames[:2], strict=True))
+    for before, after in zip(plain.frames[2:], dirty.frames[2:], strict=True):
+        assert (after <= before).all()
+        share = (after + 1.0) / (before + 1.0)
+        # Three specks, of which each takes more than half of the light within 4 px.
+        assert 50 < np.count_nonzero(share.max(axis=2) < 0.5) < 3 * np.pi * 6**2
+
+
+def test_a_picture_that_has_lost_its_colours_keeps_its_brightness() -> None:
+    plain = clip(Case("press", 44))
+    faded = PERTURBATIONS["less colour"].perturb(plain, 1.0, np.random.default_rng(0)).frames[2]
+    assert np.ptp(faded, axis=2).max() == 0
+    assert abs(faded[..., 0] - plain.frames[2].astype(float) @ (0.114, 0.587, 0.299)).max() < 0.6
+
+
 def test_loops_are_strict_within_the_block_only() -> None:
     assert compiled.kernels()
     before = [loop.compiled for loop in compiled.kernels()]

@@ -58,6 +58,11 @@ def _contrast(frame: NDArray[np.float32], level: float, _: Random) -> NDArray[An
     return np.asarray(128 + (frame - 128) * (1 - level))
 
 
+def _faded(frame: NDArray[np.float32], level: float, _: Random) -> NDArray[Any]:
+    gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)[..., None]
+    return np.asarray(frame + level * (gray - frame))
+
+
 def _moved(plain: Clip, matrices: list[Matrix], size: tuple[int, int] | None = None) -> Clip:
     """The clip with pictures moved by (3, 3) matrices; what comes into the picture repeats its border."""
     height, width = plain.frames[0].shape[:2]
@@ -122,6 +127,24 @@ COVER_RADIUS_PX: Final = 13
 """Radius of what covers a dot, px: twice that of the dot."""
 
 
+DIRT_SIGMA_PX: Final = 4.0
+DIRT_DARKNESS: Final = 0.8
+"""Standard deviation of a speck before the lens, which is out of focus, px; and share of the light that it
+takes in its middle. Specks are of the size of dots."""
+
+
+def _dirty(plain: Clip, level: float, random: Random) -> Clip:
+    """So many specks lie on the lens after the first two frames."""
+    height, width = plain.frames[0].shape[:2]
+    specks = np.zeros((height, width), np.float32)
+    for x, y in random.uniform(0, 1, (int(level), 2)) * (width - 1, height - 1):
+        specks[round(y), round(x)] = 1
+    blurred = cv2.GaussianBlur(specks, (0, 0), DIRT_SIGMA_PX) * (2 * np.pi * DIRT_SIGMA_PX**2)
+    passes = 1 - DIRT_DARKNESS * np.minimum(blurred, 1)[..., None]
+    dirty = [np.rint(frame * passes).astype(np.uint8) for frame in plain.frames[2:]]
+    return plain.changed([*plain.frames[:2], *dirty])
+
+
 def _dropped(plain: Clip, level: float, random: Random) -> Clip:
     kept = random.random(len(plain.frames)) >= level
     kept[:2] = True
@@ -160,9 +183,11 @@ PERTURBATIONS: Final[Mapping[str, Perturbation]] = {
     "blur": Perturbation(each(_blur), "px, sigma", (0, 0.7, 1.5, 3, 5, 8)),
     "JPEG": Perturbation(each(_jpeg), "100 - quality", (0, 10, 30, 60, 80, 95)),
     "gamma": Perturbation(each(_gamma), "exponent - 1", (0, 0.3, 0.7, 1.2, 2)),
+    "less colour": Perturbation(each(_faded), "share lost", (0, 0.3, 0.6, 0.9, 1)),
     "rotation": Perturbation(_rotated, "degrees", (0, 2, 7, 20, 45)),
     "smaller scale": Perturbation(_scaled, "share lost", (0, 0.2, 0.4, 0.6, 0.75, 0.85)),
     "occluded dots": Perturbation(_occluded, "share", (0, 0.05, 0.1, 0.2, 0.4, 0.6)),
+    "dirt on the lens": Perturbation(_dirty, "specks", (0, 1, 3, 10, 30)),
     "displacement a frame": Perturbation(_shifted, "px", (0, 2, 5, 10, 20, 30)),
     "dropped frames": Perturbation(_dropped, "share", (0, 0.2, 0.4, 0.6, 0.8)),
 }
