@@ -19,8 +19,8 @@ def test_the_table_has_a_line_for_every_stage_and_sink(terminal: Terminal) -> No
     assert heading.split() == ["NAME", "KIND", "INPUTS", "OUTPUTS", "ORIGIN", "WHAT", "IT", "DOES"]
     assert sorted(row.split()[:2] for row in rows) == sorted([c.name, c.kind] for c in catalogue()[0])
     hull = next(row for row in rows if row.startswith("hull "))
-    ports = ["contact_mask,", "evidence?,", "deviations?", "contact"]
-    assert hull.split()[:7] == ["hull", "stage", *ports, "built-in"]
+    ports = ["contact_mask,", "evidence?,", "deviations?,", "core_mask?", "contact"]
+    assert hull.split()[:8] == ["hull", "stage", *ports, "built-in"]
 
 
 def test_alternatives_stand_below_the_stage_that_they_can_replace(terminal: Terminal) -> None:

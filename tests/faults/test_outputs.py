@@ -88,9 +88,11 @@ def test_something_happens_to_an_output_in_mid_run(
     kind: str, fault: str, code: int, said: str, kept: str, tmp_path: Path
 ) -> None:
     with ExitStack() as stack:
-        place = stack.enter_context(small_disk()) if fault == "disk full" else tmp_path
+        is_full = fault == "disk full"
+        place = stack.enter_context(small_disk()) if is_full else tmp_path
         output = place / KINDS[kind].output
-        sinks, source = settings_of(kind, output), str(array(tmp_path))
+        # More rows than fit into what is left of the last page of a file on a full disk, 4 KiB.
+        sinks, source = settings_of(kind, output), str(array(tmp_path, 3 * FRAMES if is_full else FRAMES))
         _, seen = run(tmp_path, sinks, lambda _: IN_MID_RUN[fault](output), source=source)
         if fault == "removed":
             left = "something" if output.exists() else "nothing"
