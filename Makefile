@@ -34,8 +34,11 @@ SYSTEM_DEPS := chromium ffmpeg
 run: $(VENV)/.installed
 	$(VENV)/bin/tactflow run pipeline.yaml --realtime --source "sim:press?frames=3600"
 
+# Many tests wait for other processes: half as many again as there are cores keep all of them busy.
+WORKERS := $(shell python3 -c "import os; print(3 * os.cpu_count() // 2)")
+
 test: lint types
-	$(PY) -m pytest -m "not slow" --numprocesses auto --dist loadfile --no-loadscope-reorder
+	$(PY) -m pytest -m "not slow" --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	$(PY) -m tactflow stress --quick --json build/stress.json --page build/stress.html
 
 # One at a time: what is measured or stopped at a moment shall not compete with its neighbours.
