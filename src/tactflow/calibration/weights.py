@@ -233,9 +233,10 @@ class WeightGuide:
         forces = self._forces[: len(times)] if self.live else self._forces
         if self._forces and len(forces) != len(times):
             found = ", ".join(f"{time:.1f} s" for time in times) or "none"
+            weights = "1 weight" if len(forces) == 1 else f"{len(forces)} weights"
             raise ConfigError(
-                f"calibrate force --weights: got {len(forces)} weights, and found {len(times)} loads that "
-                f"lie still for {HOLD_SECONDS:g} s ({found}); each must be taken off before the next"
+                f"--weights: got {weights}, and found {len(times)} loads that lie still for "
+                f"{HOLD_SECONDS:g} s ({found}); each must be taken off before the next"
             )
         return self._weighed(forces or [ask(time) for time in times])
 
