@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -50,8 +50,12 @@ LAYER_MM: Final = 1.0
 """Points farther than this behind the foremost one are hidden by it, mm."""
 UNKNOWN_STDERRS: Final = (0.3, 5.0)
 """Standard errors, mm and degrees, above which a place or a turn counts as not seen."""
-SMALL_VIEW, LARGE_VIEW = (360, 300), (720, 560)
-"""Sizes of plots, CSS pixels: of several views, and of a single one."""
+SMALL_VIEW = 360, 300
+"""Size of a plot of one of several views, CSS pixels."""
+LARGE_VIEW = 540, 510
+"""Largest size of the picture of a single view, CSS pixels."""
+AROUND_VIEW = 190, 50
+"""What the plot of a single view has beside its picture, for labels and colours, and below it, CSS pixels."""
 
 
 class View(NamedTuple):
@@ -71,6 +75,9 @@ class View(NamedTuple):
     shade: Floats
     error: Floats
     path: Floats
+
+
+Draw: TypeAlias = "Callable[[Figure, View], None]"
 
 
 def views(points: Points, contact: Contact, graph: Graph, cell: float) -> dict[str, View]:
@@ -176,6 +183,23 @@ def draw_error(figure: Figure, view: View) -> None:
     _labelled(axes)
 
 
+def _plot(draw: Draw, view: View, what: str, seen: str, *, alone: bool) -> Html:
+    """A plot. what : it shows. seen : name of the view. alone : the only one."""
+    left, right, bottom, top = view.extent
+    size = np.array([right - left, bottom - top])
+    picture = size * np.min(np.array(LARGE_VIEW) / size)
+    width, height = np.rint(picture + AROUND_VIEW).astype(int).tolist() if alone else SMALL_VIEW
+    label = f"{what} {seen}".strip()
+    return plot(
+        lambda figure: draw(figure, view),
+        caption=seen,
+        label=label,
+        width=width,
+        height=height,
+        shrinks=alone,
+    )
+
+
 def _labelled(axes: Axes) -> None:
     axes.grid(visible=False)
     axes.set(xlabel="mm", ylabel="mm", aspect="equal")
@@ -185,25 +209,23 @@ def map_page(name: str, points: Points, contact: Contact, graph: Graph, cell: fl
     """The page, HTML. name : of the recording. cell : distance of points, mm."""
     shown, axes = views(points, contact, graph, cell), facing(points)
 
-    def plots(draw: Callable[[Figure, View], None]) -> list[Html]:
-        wide, high = LARGE_VIEW if len(shown) == 1 else SMALL_VIEW
-        drawn = [
-            plot(lambda figure, view=view: draw(figure, view), caption=label, width=wide, height=high)  # type: ignore[misc]
-            for label, view in shown.items()
-        ]
-        return drawn if len(shown) == 1 else [multiples(drawn)]
+    alone = len(shown) == 1
+
+    def plots(draw: Draw, what: str) -> list[Html]:
+        drawn = [_plot(draw, view, what, seen, alone=alone) for seen, view in shown.items()]
+        return drawn if alone else [multiples(drawn)]
 
     sections = [
         Section(
             "Surface",
             "Colour is the relief: the height towards the gel, less the smooth shape. Light comes from the "
             "upper left. The line is the way of the middle of the contact, with a dot for each keyframe.",
-            plots(draw_relief),
+            plots(draw_relief, "relief"),
         ),
         Section(
             "Errors",
             "Standard error of the surface along its normal, from heights, calibration and poses.",
-            plots(draw_error),
+            plots(draw_error, "standard errors"),
         ),
         Section("Turn it", body=[viewer(points, cell, np.eye(3) if axes is None else axes)]),
         Section("What was measured", body=[_facts(points, contact, graph)]),
@@ -258,12 +280,12 @@ def _vector(axis: Floats) -> str:
 
 def _facts(points: Points, contact: Contact, graph: Graph) -> Html:
     loops = len(graph.edges) - len(contact.edges)
-    stderr = float(np.sqrt(graph.covariance()[0, 0]))
+    too_small, stderr = 100 * graph.slope_error, 100 * float(np.sqrt(graph.covariance()[0, 0]))
     rows: Sequence[Sequence[object]] = [
         ["frames in contact", contact.frames],
         ["keyframes", len(contact.keyframes)],
         ["loops closed", loops],
-        ["all slopes are too small by", f"{100 * graph.slope_error:.1f} ± {100 * stderr:.1f} %"],
+        ["all slopes are too small by", f"{too_small:z.1f} ± {stderr:.1f} %"],
         ["standard error along the surface, median, mm", f"{np.median(points.shift):.3f}"],
     ]
     return table(["", ""], rows)

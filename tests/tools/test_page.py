@@ -68,6 +68,13 @@ def test_without_matplotlib_the_page_says_once_how_to_install_it(monkeypatch: py
     )
     written = page("Stability", [Section("Noise", body=[multiples([plot(draw)]), multiples([plot(draw)])])])
     assert written.count("pip install &#x27;tactflow[plot]&#x27;") == 1
+    assert "tactflow[plot]" in page("Map", [Section("Surface", body=[plot(draw)])])
+    assert "tactflow[plot]" not in page("Map", [Section("Surface", "no plots here")])
+
+
+def test_a_plot_may_shrink_with_the_screen_instead_of_being_scrolled() -> None:
+    assert plot(draw, width=500).startswith('<figure class="wide">')
+    assert plot(draw, width=500, shrinks=True).startswith('<figure style="max-width: 500px">')
 
 
 def test_a_plot_can_be_saved_for_the_docs(tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ light or dark colours.
     path.write_text(page("Stability", sections), encoding="utf-8")
 
 `draw` takes a `matplotlib.figure.Figure` that has the style already: `axes = figure.subplots()`, and
-`axes.plot(x, y, color=series(0))` for the colour of the first name of a `key`. Without matplotlib, `plot` is
-empty, and the page says once how to install it. `save_plot` writes the same drawing as a picture of the docs.
+`axes.plot(x, y, color=series(0))` for the colour of the first name of a `key`. Without matplotlib, plots are
+omitted, and the page says once how to install it. `save_plot` writes the same drawing as a picture of the
+docs.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ class Html(str):
 
 WIDTH, HEIGHT = 360, 240
 """Size of a small plot, CSS pixels."""
+OMITTED = Html("<!-- a plot, without matplotlib -->")
+"""Stands for a plot that cannot be drawn."""
 DECADES_FROM = 30
 """Range of an axis, highest over lowest value, from which powers of ten are marks enough."""
 
@@ -70,7 +73,7 @@ def page(title: str, sections: Sequence[Section], lead: str = "") -> str:
     for id_, section in zip(ids, sections, strict=True):
         heading = f'<h2 id="{id_}">{escape(section.title)}</h2>' if section.title else ""
         parts.append(f"<section>{heading}{paragraphs(section.text)}{''.join(section.body)}</section>")
-    remedy = missing("plots", "plot", ["matplotlib"]) if any("multiples" in part for part in parts) else None
+    remedy = missing("plots", "plot", ["matplotlib"]) if any(OMITTED in part for part in parts) else None
     note = f'<p class="warn">{escape(remedy[0].upper() + remedy[1:])}</p>' if remedy else ""
     template = Template(files("tactflow.tools").joinpath("page.html").read_text(encoding="utf-8"))
     light, dark = ("; ".join(f"--{name}: {pair[i]}" for name, pair in COLOURS.items()) for i in (0, 1))
@@ -144,14 +147,16 @@ def plot(
     label: str = "",
     width: int = WIDTH,
     height: int = HEIGHT,
+    shrinks: bool = False,
 ) -> Html:
-    """A plot as SVG in the page; empty without matplotlib.
+    """A plot as SVG in the page; without matplotlib `OMITTED`, for which `page` says what is missing.
 
     draw : draws on a figure. caption : below it. label : for readers who cannot see it.
-    width, height : CSS pixels; one wider than `WIDTH` scrolls on narrow screens.
+    width, height : CSS pixels. shrinks : on narrow screens, one wider than `WIDTH` is made narrower instead
+    of being scrolled; elsewhere it has this width.
     """
     if missing("plots", "plot", ["matplotlib"]):
-        return Html("")
+        return OMITTED
     written = StringIO()
     with styled_figure(width, height) as figure:
         draw(figure)
@@ -166,6 +171,8 @@ def plot(
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
     svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
     wide = ' class="wide"' if width > WIDTH else ""
+    if shrinks:
+        wide = f' style="max-width: {width}px"'
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     return Html(f"<figure{wide}>{svg}{below}</figure>")
 
