@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tactflow.calibration.field_force import fit_field
-from tactflow.calibration.file import Calibration, ScaleEntry
-from tactflow.calibration.force import fit_force
+from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry, ScaleEntry
+from tactflow.calibration.force import fit_force, try_force
 from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.reference import Reference, read_reference
 from tactflow.engine.errors import ConfigError
@@ -19,6 +20,21 @@ from tactflow.vision.types import Scale
 CELLS = 12
 SCATTER = 0.05
 """Standard deviation, mm, with which the gel answers the same load otherwise."""
+LIGHT = ForceEntry(
+    press=LinearForceEntry(
+        stiffness={"root_change": 0.5},
+        greatest={"root_change": 40.0},
+        error=(0.1, 0.0),
+        range=(0.0, 20.0),
+        rmse=0.1,
+        r2=0.9,
+    ),
+    change_at_rest=0.0,
+    recordings={},
+    presses=4,
+    left_out="press",
+)
+"""A force by the light of contacts."""
 
 
 def pattern() -> np.ndarray:
@@ -148,5 +164,43 @@ def test_a_csv_may_name_pictures_instead_of_frames(tmp_path: Path) -> None:
     (tmp_path / "loads.csv").write_text("\n".join([*lines, "12.png,4"]))
     with pytest.raises(ConfigError, match=r"line 14: file: .* has no picture '12\.png'"):
         read_reference(tmp_path / "loads.csv", str(tmp_path))
+    (tmp_path / "loads.csv").write_text("\n".join([*lines, "", "12.png,4"]))
+    with pytest.raises(ConfigError, match=r"line 15: file: .* has no picture '12\.png'"):
+        read_reference(tmp_path / "loads.csv", str(tmp_path))
     with pytest.raises(ConfigError, match="the source has no picture"):
         read_reference(tmp_path / "loads.csv")
+
+
+def test_pictures_cannot_be_told_by_times() -> None:
+    seen, known = fitted(1, 12)
+    with pytest.raises(ConfigError, match=r"have no times; name them in loads\.csv in a column file"):
+        fit_force({"a": seen}, {"a": replace(known, by_frame=False)})
+
+
+def test_dots_that_are_never_seen_under_a_load_do_not_count() -> None:
+    seen, known = fitted(1, 12)
+    assert seen.field is not None
+    pressed = known.force[:, 2] > 0
+    hidden = replace(
+        seen,
+        field=np.where(pressed[:, None, None], np.nan, seen.field),
+        touched=pressed,
+        press={"root_change": 2 * known.force[:, 2]},
+    )
+    fit = fit_force(dict.fromkeys("abc", hidden), dict.fromkeys("abc", known))
+    assert fit.entry.dots == {}
+    assert fit.field is None
+    assert fit.entry.press is not None
+
+
+def test_a_force_is_not_compared_where_nothing_presses() -> None:
+    seen, known = fitted(1, 12)
+    by_dots, by_light = fit_force({"a": seen}, {"a": known}), LIGHT
+    idle = replace(known, force=0 * known.force)
+    for entry, field, reference in (
+        (by_dots.entry, by_dots.field, idle),
+        (by_light, None, known),
+        (by_dots.entry, by_dots.field, replace(known, time=known.time + 1000)),
+    ):
+        with pytest.raises(ConfigError, match="a: no frame has both a press and a force"):
+            try_force(entry, "a", seen, reference, field)

@@ -10,7 +10,7 @@ import pytest
 
 from tactflow.calibration.file import Calibration, ScaleEntry
 from tactflow.calibration.force import fit_force
-from tactflow.calibration.known_loads import Gain, carry, gain
+from tactflow.calibration.known_loads import Gain, at_rest_of, carry, gain
 from tactflow.calibration.session import learn_weights
 from tactflow.calibration.weights import Weighed, fit_loads
 from tactflow.engine.errors import ConfigError
@@ -63,6 +63,24 @@ def test_two_presses_carry_a_force_to_a_stiffer_gel_with_an_honest_error() -> No
     assert 0.9 < np.mean(np.abs(ratios) < 2) < 1
 
 
+def test_what_a_gel_shows_at_rest_is_not_carried_to_another_sensor() -> None:
+    other, weighed = calibrated(1), today(500, [5.0, 15.0])
+    seen = weighed.watched
+    brighter = {"root_change": seen.press["root_change"] + 2.0 * seen.touched}
+    noisy = weighed._replace(
+        watched=replace(seen, press=brighter, change=seen.change + 2, change_at_rest=2.5)
+    )
+    plain_gel, noisy_gel = (
+        carry(plain(), here, gain(here, loads))
+        for loads in (weighed, noisy)
+        for here in [at_rest_of(loads, other)]
+    )
+    assert plain_gel.force is not None
+    assert noisy_gel.force is not None
+    assert noisy_gel.force.change_at_rest == 2.5
+    assert noisy_gel.force.pressing.range == pytest.approx(plain_gel.force.pressing.range)
+
+
 def test_what_is_carried_is_scaled_in_all_its_parts() -> None:
     seen, known = fitted(1, 12)
     fit = fit_force({"a": seen}, {"a": known})
@@ -105,6 +123,13 @@ def test_loads_that_cannot_be_compared_are_refused() -> None:
         gain(calibrated(1), weighed._replace(forces=[math.nan]))
     with pytest.raises(ConfigError, match="has no force part"):
         gain(plain(), weighed)
+    seen, known = fitted(1, 12)
+    fit = fit_force({"a": seen}, {"a": known})
+    by_dots = plain().model_copy(update={"force": fit.entry, "field_force": fit.field})
+    assert seen.field is not None
+    wide = Weighed(replace(seen, field=seen.field[:, :-4]), [(8, 9)], [1.0])
+    with pytest.raises(ConfigError, match="for pictures of another aspect ratio"):
+        gain(by_dots, wide)
     heights = replace(weighed.watched, press={"volume": weighed.watched.change})
     with pytest.raises(ConfigError, match="heights are known here and not in the calibration"):
         gain(calibrated(1), weighed._replace(watched=heights))

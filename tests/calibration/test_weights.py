@@ -71,7 +71,8 @@ def test_weights_are_grams_or_the_column_of_a_csv(tmp_path: Path) -> None:
     assert read_weights([str(path)]) == [2.5, 4.0]
     for text, words in (
         ("weight\n3\n", "must name a column g, fz, kg"),
-        ("g\n-3\n", "line 2: required a number"),
+        ("g\n100\n\n-3\n", "line 4: required a number"),
+        ("g\n", "required one line for each load, found none"),
     ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=words):

@@ -253,6 +253,22 @@ def test_weights_on_the_gel_give_newtons_without_a_gauge(
     like = ["force", "second.yaml", *source, "--like", "gel.yaml"]
     assert terminal("calibrate", *like) == 2
     assert "required --weights, two or more" in terminal.err
+    # What cannot work is said before anything is put on the gel.
+    for words, problem in (
+        (["force", "second.yaml", *source, "--like", "second.yaml", "--weights", *twice], "has no force"),
+        (["check", "second.yaml", *source, "--weights", *twice], "second.yaml has no force"),
+        ([*like, "--weights", "100"], "required 2 weights or more, got 1"),
+        (["force", "second.yaml", *source, "--weights", "100", "200"], "required 3 weights or more, got 2"),
+        ([*like, "--csv", "a.csv", "--weights", *twice], "--weights and --csv both give the forces"),
+    ):
+        assert terminal("calibrate", *words) == 2
+        assert problem in terminal.err
+        assert "on the gel, and let go" not in terminal.err
+    Path("pictures").mkdir()
+    for number, frame in enumerate(frames[:2]):
+        cv2.imwrite(f"pictures/{number}.png", frame)
+    assert terminal("calibrate", *like, "--from", "pictures", "--weights", *twice) == 2
+    assert "tactflow: calibrate --weights: pictures that were taken one by one" in terminal.err
     assert terminal("calibrate", *like, "--weights", *twice) == 0
     carried = yaml.safe_load(Path("second.yaml").read_text())["force"]
     assert carried["press"]["range"] == pytest.approx(
@@ -270,4 +286,15 @@ def test_weights_on_the_gel_give_newtons_without_a_gauge(
     assert terminal("calibrate", *weigh[:-1], "--overwrite", "--weights") == 0
     assert "write down what the scale reads" in terminal.err
     assert "got 'heavy'" in terminal.err
+    assert "3 loads: RMS error" in terminal.err
+    # The end of the input leaves out the rest.
+    readings = iter(grams[:3])
+
+    def read(_: str) -> str:
+        for reading in readings:
+            return reading
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", read)
+    assert terminal("calibrate", *weigh[:-1], "--overwrite", "--weights") == 0
     assert "3 loads: RMS error" in terminal.err

@@ -157,10 +157,13 @@ def _by_dots(
     fields = [part.field for part in aligned if part.field is not None]
     if len(np.unique(groups)) < FEWEST_GROUPS or len(fields) < len(aligned):
         return {}, None
+    loaded = np.concatenate([part.loaded for part in fields])
+    if len(np.unique(groups[loaded])) < 2:
+        return {}, None
     force = np.concatenate([part.force for part in fields])
     force = np.column_stack([np.full((len(force), 2), np.nan), force[:, 2]]) if turn is None else turn(force)
     fit = fit_field(np.concatenate([part.moved for part in fields]), force, groups)
-    loaded = np.concatenate([part.loaded for part in fields])[fit.kept]
+    loaded = loaded[fit.kept]
     length = np.sqrt(np.nansum(np.square(fit.predicted[loaded]), axis=1))
     entries = {
         axis: DotsForceEntry(
@@ -212,20 +215,25 @@ def try_force(
 ) -> float:
     """RMS error of the force z in another recording, N. field : of the force by dots.
 
-    Raises ConfigError if the reference is of another recording, heights are known in one of the two only, or
-    dots are needed and not seen.
+    Raises ConfigError if the reference is of another recording, nothing presses, heights are known in one of
+    the two only, or dots are needed and not seen.
     """
+    nothing = f"{name}: no frame has both a press and a force; it is of another recording, or nothing pressed"
     if entry.press is not None and watched.press.keys() != entry.press.stiffness.keys():
         raise ConfigError(
             f"{name}: heights are known here and not in the calibration, or the other way round"
         )
     aligned = align(name, watched, reference, entry.change_at_rest)
     if entry.press is not None:
+        if not len(aligned.force):
+            raise ConfigError(nothing)
         stiffness = np.array([entry.press.stiffness[feature] for feature in watched.press])
         return float(np.sqrt(np.mean((aligned.press @ stiffness - aligned.force[:, 2]) ** 2)))
     if field is None or aligned.field is None:
         raise ConfigError(f"{name}: the calibration measures the force by dots, and none are seen here")
     loaded = aligned.field.loaded
+    if not loaded.any():
+        raise ConfigError(nothing)
     said = np.array([field(moved)[2] for moved in aligned.field.moved[loaded]])
     return float(np.sqrt(np.mean((said - aligned.field.force[loaded, 2]) ** 2)))
 

@@ -173,8 +173,14 @@ class Aligned:
 def align(name: str, watched: Watched, reference: Reference, change_at_rest: float) -> Aligned:
     """Interpolate the force at the frames of a recording. change_at_rest : of the sensor, see `ForceModel`.
 
-    Raises ConfigError if nothing touches, or the reference is of another recording.
+    Raises ConfigError if nothing touches, or the reference is of another recording, or has times for pictures
+    that were taken one by one.
     """
+    if watched.pictures and not reference.by_frame:
+        raise ConfigError(
+            f"{name}: pictures that were taken one by one have no times; name them in {reference.name} in a "
+            "column file or frame instead of t"
+        )
     if not watched.touched.any() and watched.field is None:
         raise ConfigError(
             f"{name}: nothing touches the gel in {len(watched.times)} frames; the first must show it "

@@ -10,14 +10,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from tactflow.calibration.file import Calibration
+from tactflow.calibration.file import Calibration, ForceEntry
+from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.weights import Weighed
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.arrays import Floats
 from tactflow.vision.field_force import FieldForce
-from tactflow.vision.force import BY_CHANGE, Seen
+from tactflow.vision.force import BY_CHANGE, ForceModel, Seen
 
-FEWEST_LOADS: Final = 2
+FEWEST_LOADS_TO_CARRY: Final = 2
 """Loads from which a force part is carried to another sensor: their difference tests the factor."""
 ALIKE_STDERRS: Final = 2.0
 """Standard errors up to which a factor counts as 1."""
@@ -48,8 +49,10 @@ def gain(calibration: Calibration, weighed: Weighed) -> Gain:
 
     Raises ConfigError without a force part, or where what it needs is not seen.
     """
+    entry = _comparable_force(calibration, weighed.watched)
+    model = entry.model(calibration.field_force)
     found = [
-        (force, *_said(calibration, weighed, load))
+        (force, *_said(model, weighed.watched, load))
         for load, force in zip(weighed.loads, weighed.forces, strict=True)
         if math.isfinite(force)
     ]
@@ -67,26 +70,34 @@ def gain(calibration: Calibration, weighed: Weighed) -> Gain:
     return Gain(value, max(stated, scatter), known, said, errors)
 
 
-def _said(calibration: Calibration, weighed: Weighed, load: tuple[int, int]) -> tuple[float, float]:
-    """The force of a load by a calibration, and its stated error, N: means over its frames."""
-    entry = calibration.force
+def _comparable_force(calibration: Calibration, watched: Watched) -> ForceEntry:
+    """The force part of a calibration. Raises ConfigError if there is none, or it needs what is not seen."""
+    entry, field = calibration.force, calibration.field_force
     if entry is None:
         raise ConfigError("calibrate: the calibration has no force part")
-    model, watched = entry.model(calibration.field_force), weighed.watched
     if entry.press is not None and not entry.press.stiffness.keys() <= watched.press.keys():
         raise ConfigError(
             "calibrate: heights are known here and not in the calibration, or the other way round"
         )
+    if field is not None and watched.field is not None and watched.field[0].size != field.modes.shape[1]:
+        raise ConfigError(
+            "calibrate: the calibration measures the force by dots, for pictures of another aspect ratio"
+        )
+    return entry
+
+
+def _said(model: ForceModel, watched: Watched, load: tuple[int, int]) -> tuple[float, float]:
+    """The force of a load by a model, and its stated error, N: means over its frames."""
     forces = []
     for index in range(load[0], load[1] + 1):
         press = {name: float(values[index]) for name, values in watched.press.items()}
         for name in BY_CHANGE:
             if name in press:
-                press[name] = max(press[name] - watched.change_at_rest, 0.0)
+                press[name] = max(press[name] - model.change_at_rest, 0.0)
         moved = None if watched.field is None else watched.field[index]
         if moved is not None and np.isnan(moved).any():
             moved = None
-        if entry.press is None and moved is None:
+        if model.press is None and moved is None:
             raise ConfigError("calibrate: the calibration measures the force by dots, and too few are seen")
         force = model.force(Seen(press, {}), moved)
         forces.append((force.value[2], force.stderr[2]))
@@ -94,16 +105,26 @@ def _said(calibration: Calibration, weighed: Weighed, load: tuple[int, int]) -> 
     return value, error
 
 
+def at_rest_of(weighed: Weighed, other: Calibration) -> Calibration:
+    """The calibration of another sensor, with the change of the light that this one shows at rest."""
+    if other.force is None:
+        return other
+    force = other.force.model_copy(update={"change_at_rest": weighed.watched.change_at_rest})
+    return other.model_copy(update={"force": force})
+
+
 def carry(calibration: Calibration, other: Calibration, found: Gain) -> Calibration:
     """A calibration with the force part of another sensor of its kind, times the gain.
 
-    found : of the other calibration on this sensor. Its error is added.
+    other : with the change at rest of this sensor, see `at_rest_of`. found : of it on this sensor; its error
+    is added.
 
-    Raises ConfigError for fewer than `FEWEST_LOADS`.
+    Raises ConfigError for fewer than `FEWEST_LOADS_TO_CARRY`.
     """
-    if len(found.known) < FEWEST_LOADS:
+    if len(found.known) < FEWEST_LOADS_TO_CARRY:
         raise ConfigError(
-            f"calibrate force --like: required {FEWEST_LOADS} loads or more, found {len(found.known)}"
+            f"calibrate force --like: required {FEWEST_LOADS_TO_CARRY} loads or more, "
+            f"found {len(found.known)}"
         )
     assert other.force is not None
     entry, factor, doubt = other.force, found.value, found.stderr / found.value

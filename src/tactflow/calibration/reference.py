@@ -99,7 +99,8 @@ def read_reference(path: Path, source: str = "") -> Reference:
         if name != "file"
     }
     if not {"t", "frame"} & {*table}:
-        names = [row[columns["file"]].strip() if columns["file"] < len(row) else "" for _, row in rows]
+        column = columns["file"]
+        names = [(line, row[column].strip() if column < len(row) else "") for line, row in rows]
         table["frame"] = _frames_of_files(path, names, source)
     clock = "t" if "t" in table else "frame"
     back = np.flatnonzero(np.diff(table[clock]) <= 0)
@@ -135,18 +136,21 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
     return columns
 
 
-def _frames_of_files(path: Path, names: Sequence[str], source: str) -> Floats:
-    """(N,): the numbers of the frames that are named by their pictures in the folder `source`."""
+def _frames_of_files(path: Path, names: Sequence[tuple[int, str]], source: str) -> Floats:
+    """(N,): the numbers of the frames that are named by their pictures in the folder `source`.
+
+    names : line of the CSV and picture.
+    """
     folder = expanded(source)
     pictures = sorted(filter(is_image, folder.iterdir()), key=_natural) if folder.is_dir() else []
     numbers = {picture.name: float(number) for number, picture in enumerate(pictures)}
-    for line, name in enumerate(names, 2):
+    for line, name in names:
         if name not in numbers:
             raise ConfigError(
                 f"{path}, line {line}: file: {source or 'the source'} has no picture {name!r}; for a "
                 "recording that is not a folder of pictures, give t (s) or frame instead"
             )
-    return np.array([numbers[name] for name in names])
+    return np.array([numbers[name] for _, name in names])
 
 
 def _natural(picture: Path) -> list[tuple[int, int, str]]:

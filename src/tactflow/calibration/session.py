@@ -266,16 +266,19 @@ def weigh(play: Play, calibration: Path, guide: WeightGuide) -> None:
     Raises ConfigError for pictures that were taken one by one.
     """
 
+    taken_singly = False
+
     def take(result: Result, source: Source) -> bool:
-        if source.pictures:
-            raise ConfigError(
-                "calibrate force --weights: pictures that were taken one by one do not show whether a load "
-                "lies still; name the force of each in a CSV instead, with the columns file and fz (--csv)"
-            )
-        guide.live = source.live
-        return not (guide(result) and source.live)
+        nonlocal taken_singly
+        taken_singly, guide.live = source.pictures, source.live
+        return not (taken_singly or (guide(result) and source.live))
 
     play(take, force_samples.NEEDED, calibration)
+    if taken_singly:
+        raise ConfigError(
+            "calibrate --weights: pictures that were taken one by one do not show whether a load lies still; "
+            "name the force of each in a CSV instead, with the columns file and fz (--csv)"
+        )
 
 
 def learn_force(

@@ -54,7 +54,8 @@ def read_weights(words: Sequence[str]) -> list[float]:
 def _read_csv(path: Path) -> list[float]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *rows = [row for row in csv.reader(file, skipinitialspace=True) if row] or [[]]
+            reader = csv.reader(file, skipinitialspace=True)
+            (_, header), *rows = [(reader.line_num, row) for row in reader if row] or [(1, [])]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"--weights: {path} cannot be read: {error}") from None
     names = [cell.strip().lower() for cell in header]
@@ -64,10 +65,12 @@ def _read_csv(path: Path) -> list[float]:
             f"--weights: {path}: the first line must name a column {', '.join(COLUMNS)}, then one line for "
             "each load, in the order in which they were put on"
         )
+    if not rows:
+        raise ConfigError(f"--weights: {path}: required one line for each load, found none")
     column, unit = names.index(found[0]), COLUMNS[found[0]]
     return [
         _force(row[column] if column < len(row) else "", unit, f"--weights: {path}, line {line}")
-        for line, row in enumerate(rows, 2)
+        for line, row in rows
     ]
 
 

@@ -17,7 +17,7 @@ from tactflow.calibration.check import check, check_force
 from tactflow.calibration.file import Calibration
 from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.guide import Guide
-from tactflow.calibration.known_loads import carry, gain
+from tactflow.calibration.known_loads import FEWEST_LOADS_TO_CARRY, at_rest_of, carry, gain
 from tactflow.calibration.reference import read_reference, recordings_with_csv
 from tactflow.calibration.session import (
     ENOUGH_PRESSES,
@@ -32,7 +32,7 @@ from tactflow.calibration.session import (
     watch,
     weigh,
 )
-from tactflow.calibration.weights import Weighed, WeightGuide, read_weights
+from tactflow.calibration.weights import FEWEST_LOADS, Weighed, WeightGuide, read_weights
 from tactflow.calibration.words import core_words, gain_words
 from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
 from tactflow.engine.collect import with_collector
@@ -272,7 +272,8 @@ def _check(args: argparse.Namespace) -> int:
 
 def _check_loads(args: argparse.Namespace, path: Path, pipeline: str | None, calibration: Calibration) -> int:
     """Compare the force with known loads; with --overwrite, results tell from then on."""
-    found = gain(calibration, _weigh(args, path, pipeline, fits=False))
+    _require_force(calibration, path)
+    found = gain(calibration, _weigh(args, path, pipeline, fewest=1))
     show([gain_words(found, str(path))])
     fits = found.is_one
     if args.overwrite and calibration.force is not None:
@@ -314,18 +315,35 @@ def _force(args: argparse.Namespace) -> int:
 
 def _force_by_weights(args: argparse.Namespace, path: Path, pipeline: str | None) -> Calibration:
     """The calibration with a force that is fitted to known weights, or carried from another sensor."""
-    calibration, weighed = Calibration.load(path), _weigh(args, path, pipeline, args.like is None)
+    calibration = Calibration.load(path)
     if args.like is None:
+        weighed = _weigh(args, path, pipeline, FEWEST_LOADS, fits=True)
         return learn_weights(calibration, weighed, str(args.source or "live"), say)
     other = Calibration.load(args.like)
+    _require_force(other, args.like)
+    weighed = _weigh(args, path, pipeline, FEWEST_LOADS_TO_CARRY)
+    other = at_rest_of(weighed, other)
     found = gain(other, weighed)
     say(gain_words(found, str(args.like)))
     return carry(calibration, other, found)
 
 
-def _weigh(args: argparse.Namespace, path: Path, pipeline: str | None, fits: bool) -> Weighed:
-    """The loads of a session. path : of the calibration, for the scale. fits : see `WeightGuide`."""
+def _require_force(calibration: Calibration, path: Path) -> None:
+    """Raise ConfigError if a calibration has no force part. path : of it."""
+    if calibration.force is None:
+        raise ConfigError(f"calibrate --weights: {path} has no force; add it with `tactflow calibrate force`")
+
+
+def _weigh(
+    args: argparse.Namespace, path: Path, pipeline: str | None, fewest: int, fits: bool = False
+) -> Weighed:
+    """The loads of a session. path : of the calibration, for the scale. fewest : loads that are needed.
+    fits : see `WeightGuide`."""
+    if args.csv is not None:
+        raise ConfigError("calibrate: --weights and --csv both give the forces; leave one of them out")
     forces = read_weights(args.weights)
+    if 0 < len(forces) < fewest:
+        raise ConfigError(f"calibrate --weights: required {fewest} weights or more, got {len(forces)}")
     if not forces and not sys.stdin.isatty():
         raise ConfigError("calibrate --weights: required the weights in g, as nobody can be asked for them")
     guide = WeightGuide(forces, say, fits)
@@ -337,7 +355,10 @@ def _weigh(args: argparse.Namespace, path: Path, pipeline: str | None, fits: boo
 def _reading(time: float) -> float:
     """The force of a load, N, by the reading of a scale; NaN without one."""
     while True:
-        answer = input(f"reading of the scale at {time:.1f} s, g (Enter leaves this load out): ").strip()
+        try:
+            answer = input(f"reading of the scale at {time:.1f} s, g (Enter leaves this load out): ").strip()
+        except EOFError:
+            return math.nan
         if not answer:
             return math.nan
         try:

@@ -58,8 +58,11 @@ def to_json(message: dict[str, Any]) -> bytes:
 
 def _encoded(value: Any, plan: _Plan, result: Result) -> Any:
     source, steps, kept = plan
-    if kept is not None and kept[0][0] is value:
-        return kept[0][1]
+    if kept is not None:
+        # Read as a whole, and replaced as a whole: sinks of several threads encode the same value.
+        last, text = kept[0]
+        if last is value:
+            return text
     message: dict[str, Any] = {}
     for name, path, value_of, if_known, inner in steps:
         found = source(value, name) if value_of is None else value_of(value, result)
@@ -78,7 +81,6 @@ def _encoded(value: Any, plan: _Plan, result: Result) -> Any:
     if kept is None:
         return message
     text = orjson.Fragment(to_json(message))
-    # Replaced as a whole: sinks of several threads encode the same value.
     kept[0] = value, text
     return text
 
