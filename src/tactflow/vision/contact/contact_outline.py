@@ -133,17 +133,14 @@ def largest_nearby(values: Floats32) -> Floats32:
 
 
 def _around(changed: Flags, core: Mask) -> Flags:
-    """(h, w): changed components that overlap the core, with their holes filled."""
-    inside = np.zeros(core.shape, np.uint8)
+    """(h, w): changed components that overlap the core, which is part of them, with their holes filled."""
     outlines, _ = cv2.findContours(changed.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    for outline in outlines:
-        left, top, width, height = cv2.boundingRect(outline)
-        box = slice(top, top + height), slice(left, left + width)
-        part = np.zeros((height, width), np.uint8)
-        cv2.drawContours(part, [outline], -1, 1.0, cv2.FILLED, offset=(-left, -top))
-        if (part & core[box]).any():
-            inside[box] |= part
-    return inside.view(np.bool_)
+    filled = np.zeros(core.shape, np.uint8)
+    cv2.drawContours(filled, outlines, -1, 1.0, cv2.FILLED)
+    count, components = cv2.connectedComponents(filled, connectivity=8)
+    overlaps = np.zeros(count, np.bool_)
+    overlaps[components[core > 0]] = True
+    return np.asarray(overlaps[components])
 
 
 def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) -> None:
