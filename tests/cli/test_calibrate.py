@@ -220,7 +220,7 @@ def test_weights_on_the_gel_give_newtons_without_a_gauge(
     rest = scene.frame(0)[::2, ::2]
     frames = [rest] * 4
     for index in firm:
-        frames += [scene.frame(index)[::2, ::2]] * 9 + [rest]
+        frames += [scene.frame(index)[::2, ::2]] * 9 + [rest] * 3
     np.save("loads.npy", np.array(frames))
     assert terminal("pipelines", "markerless") == 0
     pipeline = yaml.safe_load(terminal.out)

@@ -24,6 +24,9 @@ GRAVITY: Final = 9.80665e-3
 """N per g."""
 HOLD_SECONDS: Final = 1.0
 """How long a load must lie still, s: longer than the gel takes to settle, short enough for a hand."""
+RELEASE_SECONDS: Final = 0.15
+"""Time without contact after which a load is off the gel, s: a light one is missed in single frames, and a
+hand takes longer to put on the next."""
 SETTLING: Final = 0.05
 """Largest change of what the gel shows within that time, relative: half of the error that is wanted."""
 WANTED_ERROR: Final = 0.1
@@ -110,7 +113,8 @@ class LoadFinder:
     def add(self, touched: bool, moment: Moment) -> None:
         """Look at a frame."""
         if not touched:
-            self.lasts, self._recent = False, []
+            if self._recent and moment.time - self._recent[-1].time > RELEASE_SECONDS:
+                self.lasts, self._recent = False, []
             return
         self._recent.append(moment)
         while moment.time - self._recent[0].time > HOLD_SECONDS:
@@ -123,7 +127,8 @@ class LoadFinder:
         """The second half of the time to hold, if it shows the same as the first; else none."""
         first, last = self._recent[0].time, self._recent[-1].time
         step = (last - first) / max(len(self._recent) - 1, 1)
-        if last - first + step < HOLD_SECONDS:
+        # Half a frame less will do: times of frames are not exact.
+        if last - first + 1.5 * step < HOLD_SECONDS:
             return []
         parts = [
             [moment for moment in self._recent if (2 * moment.time > first + last) is after]

@@ -8,7 +8,7 @@ from typing import Final
 from tactflow.calibration.file import DarknessEntry, DotsForceEntry, LinearForceEntry
 from tactflow.calibration.force import Fit
 from tactflow.calibration.known_loads import Gain
-from tactflow.calibration.reference import Reference
+from tactflow.calibration.reference import LEAST_EXPLAINED, Reference
 from tactflow.calibration.samples import fitting_core
 
 CORE_TOLERANCE: Final = 0.03
@@ -74,6 +74,11 @@ def force_words(fit: Fit, readings: Mapping[str, Reference]) -> list[str]:
         f"force{by_dots if entry.press is None else ''}, {entry.presses} {kind}: "
         f"{_quality(entry.pressing, entry.left_out)}"
     )
+    if entry.pressing.r2 < LEAST_EXPLAINED:
+        words.append(
+            f"what the gel shows explains less than {100 * LEAST_EXPLAINED:.0f} % of the force: do not rely "
+            "on it; press harder or with other loads, and see that these were the forces"
+        )
     if entry.press is not None and "volume" not in entry.press.stiffness:
         words.append(
             "heights are not known, so the force is fitted to the change of light and the area: it is valid "
