@@ -274,7 +274,8 @@ class WeightGuide:
         else:
             now = "Press with a steady load, and write down what the scale reads."
         last = f"Load {done} is measured. {self._error}".strip() if self._finder.lasts else ""
-        self._say(f"{last} {now}".strip())
+        if last or not self.is_enough:
+            self._say(f"{last} {now}".strip())
         self.state = {
             "now": now,
             "done": done,
