@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactflow.calibration.force_samples import Watched
+from tactflow.calibration.force_samples import Moment, Watched
 from tactflow.calibration.weights import (
     GRAVITY,
     LoadFinder,
-    Moment,
     WeightGuide,
     fit_loads,
     read_weights,

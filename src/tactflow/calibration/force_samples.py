@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,15 @@ class Watched:
     pictures: bool = False
 
 
+class Moment(NamedTuple):
+    """What the gel shows in a frame. number : of the frame. time : s. level : RMS motion of the dots, mm, or
+    without dots the change of the light, mm^2."""
+
+    number: int
+    time: float
+    level: float
+
+
 class Watcher:
     """Collects the features of results with pictures, from a pipeline with a scale (`NEEDED`) that skips
     nothing. pictures : see `Watched`."""
@@ -63,9 +72,8 @@ class Watcher:
         self._light: LightChange | None = None
         self._once = Once()
 
-    def add(self, result: Result) -> tuple[int, float, float] | None:
-        """Add one result. Returns its index, its time, s, and how much the gel shows: the RMS motion of the
-        dots, mm, or without dots the change of the light, mm^2. None for a result without pictures."""
+    def add(self, result: Result) -> Moment | None:
+        """Add one result. Returns how much the gel shows, None for a result without pictures."""
         scale, unmarked, contact = result.scale, result.get("unmarked", result.image), result.contact
         if scale is None or unmarked is None:
             return None
@@ -82,8 +90,8 @@ class Watcher:
         if markers is not None and len(markers.origin) >= MIN_MARKERS:
             moved = displacement(self._once(FieldModel, markers.origin, size), markers, scale, size)
         self._fields.append(moved)
-        level = change if moved is None else math.sqrt(float(np.square(moved).sum()) / len(moved))
-        return len(self._frames) - 1, result.t, level
+        level = change if moved is None else float(_motion(moved))
+        return Moment(len(self._frames) - 1, result.t, level)
 
     def time(self, index: int) -> float:
         """When a frame was taken, s."""
@@ -190,7 +198,9 @@ def align(name: str, watched: Watched, reference: Reference, change_at_rest: flo
     seconds = reference.seconds(watched.frames, watched.times)
     offset = TimeOffset(0.0, 0.0)
     if not watched.pictures:
-        shown = press if watched.touched.any() else motion(watched)
+        shown = press
+        if watched.field is not None and not watched.touched.any():
+            shown = np.nan_to_num(_motion(watched.field))[:, None]
         offset = time_offset(reference, seconds, watched.times, shown)
     now = watched.times - offset.seconds
     known_force = (now >= seconds[0]) & (now <= seconds[-1])
@@ -223,11 +233,9 @@ def features_of_press(watched: Watched, change_at_rest: float) -> Floats:
     return np.stack(list(known.values()), axis=1)
 
 
-def motion(watched: Watched) -> Floats:
-    """(n, 1), mm, RMS of the displacement field; 0 where it is not known."""
-    assert watched.field is not None
-    rms = np.sqrt(np.square(watched.field).sum(axis=2).mean(axis=1))
-    return np.asarray(np.nan_to_num(rms)[:, None])
+def _motion(field: Floats) -> Floats:
+    """(...,), mm, RMS of displacement fields (..., S, 2)."""
+    return np.asarray(np.sqrt(np.square(field).sum(axis=-1).mean(axis=-1)))
 
 
 def _constant_loads(force: Floats) -> NDArray[np.intp]:

@@ -11,12 +11,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from tactflow.calibration.file import Calibration, ForceEntry
-from tactflow.calibration.force_samples import Watched
+from tactflow.calibration.force_samples import Watched, features_of_press
 from tactflow.calibration.weights import Weighed
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.arrays import Floats
 from tactflow.vision.field_force import FieldForce
-from tactflow.vision.force import BY_CHANGE, ForceModel, Seen
+from tactflow.vision.force import ForceModel, Seen
 
 FEWEST_LOADS_TO_CARRY: Final = 2
 """Loads from which a force part is carried to another sensor: their difference tests the factor."""
@@ -89,11 +89,9 @@ def _comparable_force(calibration: Calibration, watched: Watched) -> ForceEntry:
 def _said(model: ForceModel, watched: Watched, load: tuple[int, int]) -> tuple[float, float]:
     """The force of a load by a model, and its stated error, N: means over its frames."""
     forces = []
+    features = features_of_press(watched, model.change_at_rest)
     for index in range(load[0], load[1] + 1):
-        press = {name: float(values[index]) for name, values in watched.press.items()}
-        for name in BY_CHANGE:
-            if name in press:
-                press[name] = max(press[name] - model.change_at_rest, 0.0)
+        press = dict(zip(watched.press, features[index].tolist(), strict=True))
         moved = None if watched.field is None else watched.field[index]
         if moved is not None and np.isnan(moved).any():
             moved = None

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from tactflow.engine.errors import ConfigError
-from tactflow.sources.files import is_image, natural_key
+from tactflow.sources.files import images_of
 from tactflow.system.files import expanded
 from tactflow.system.spelling import joined
 from tactflow.vision.arrays import Floats
@@ -142,7 +142,7 @@ def _frames_of_files(path: Path, names: Sequence[tuple[int, str]], source: str) 
     names : line of the CSV and picture.
     """
     folder = expanded(source)
-    pictures = sorted(filter(is_image, folder.iterdir()), key=_natural) if folder.is_dir() else []
+    pictures = images_of(folder) if folder.is_dir() else []
     numbers = {picture.name: float(number) for number, picture in enumerate(pictures)}
     for line, name in names:
         if name not in numbers:
@@ -151,10 +151,6 @@ def _frames_of_files(path: Path, names: Sequence[tuple[int, str]], source: str) 
                 "recording that is not a folder of pictures, give t (s) or frame instead"
             )
     return np.array([numbers[name] for _, name in names])
-
-
-def _natural(picture: Path) -> list[tuple[int, int, str]]:
-    return natural_key(picture.name)
 
 
 def _number(what: str, row: Sequence[str], column: int) -> float:

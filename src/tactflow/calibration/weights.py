@@ -15,7 +15,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from tactflow.calibration.force import Fit, fit_aligned
-from tactflow.calibration.force_samples import Aligned, FieldSamples, Watched, Watcher, features_of_press
+from tactflow.calibration.force_samples import (
+    Aligned,
+    FieldSamples,
+    Moment,
+    Watched,
+    Watcher,
+    features_of_press,
+)
 from tactflow.calibration.reference import TimeOffset
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
@@ -85,15 +92,6 @@ def _force(word: str, unit: float, what: str) -> float:
     if not 0 < value < math.inf:
         raise ConfigError(f"{what}: required a number above 0, got {word!r}")
     return value * unit
-
-
-class Moment(NamedTuple):
-    """What the gel shows in a frame. number : of the frame. time : s. level : RMS motion of the dots, mm, or
-    without dots the change of the light, mm^2."""
-
-    number: int
-    time: float
-    level: float
 
 
 class LoadFinder:
@@ -221,7 +219,7 @@ class WeightGuide:
         """Look at one result with its pictures; returns whether all loads were put on."""
         moment = self._watcher.add(result)
         if moment is not None:
-            self._finder.add(result.contact is not None, Moment(*moment))
+            self._finder.add(result.contact is not None, moment)
         shown = len(self._finder.loads), self._finder.lasts
         if shown != self._shown:
             if shown[0] > self._shown[0]:

@@ -294,7 +294,7 @@ def _force(args: argparse.Namespace) -> int:
     if calibration.force is not None and not args.overwrite:
         raise ConfigError(f"calibrate force: {path} has a force already; give --overwrite to replace it")
     if args.weights is not None:
-        _force_by_weights(args, path, pipeline).save(path)
+        _force_by_weights(args, path, pipeline, calibration).save(path)
         say(f"the force is added to {path}")
         return 0
     if args.like is not None:
@@ -313,9 +313,10 @@ def _force(args: argparse.Namespace) -> int:
     return 0
 
 
-def _force_by_weights(args: argparse.Namespace, path: Path, pipeline: str | None) -> Calibration:
+def _force_by_weights(
+    args: argparse.Namespace, path: Path, pipeline: str | None, calibration: Calibration
+) -> Calibration:
     """The calibration with a force that is fitted to known weights, or carried from another sensor."""
-    calibration = Calibration.load(path)
     if args.like is None:
         weighed = _weigh(args, path, pipeline, FEWEST_LOADS, fits=True)
         return learn_weights(calibration, weighed, str(args.source or "live"), say)

@@ -126,19 +126,28 @@ class ImageFiles(FrameReader):
 
 def open_folder(folder: Path, fps: float | None = None) -> ImageFiles:
     """All images of a folder in natural order, without hidden files."""
-    try:
-        entries = sorted(folder.iterdir(), key=lambda entry: natural_key(entry.name))
-    except OSError as error:
-        raise damaged(str(folder), error) from error
-    files = [entry for entry in entries if is_image(entry) and entry.is_file()]
-    if files:
+    if files := images_of(folder):
         return ImageFiles(files, str(folder), fps)
+    entries = _entries(folder)
     if not entries:
         raise SourceError(f"{folder}: no images in this folder; it is empty")
     names = ", ".join(entry.name + ("/" if entry.is_dir() else "") for entry in entries[:5])
     more = f" and {len(entries) - 5} more" if len(entries) > 5 else ""
     hint = "; name one of its folders" if any(entry.is_dir() for entry in entries) else ""
     raise SourceError(f"{folder}: no images in this folder; it holds {names}{more}{hint}")
+
+
+def images_of(folder: Path) -> list[Path]:
+    """The images of a folder, in the order in which `open_folder` gives them. Raises SourceError if it cannot
+    be read."""
+    return [entry for entry in _entries(folder) if is_image(entry) and entry.is_file()]
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir(), key=lambda entry: natural_key(entry.name))
+    except OSError as error:
+        raise damaged(str(folder), error) from error
 
 
 def is_image(path: Path) -> bool:
