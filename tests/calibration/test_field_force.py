@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from tactflow.calibration.field_force import fit_field
-from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry, ScaleEntry
+from tactflow.calibration.file import Calibration, ForceEntry, LinearForceEntry
 from tactflow.calibration.force import fit_force, try_force
 from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.reference import Reference, read_reference
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.force import Seen
-from tactflow.vision.types import Scale
+from tests.calibrations import bare_calibration
 
 CELLS = 12
 SCATTER = 0.05
@@ -130,17 +130,7 @@ def test_a_gauge_that_is_nearly_parallel_counts_as_parallel_and_a_turned_one_doe
 def test_the_force_by_dots_survives_the_calibration_file(tmp_path: Path) -> None:
     seen, known = fitted(1, 12)
     fit = fit_force({"a": seen}, {"a": known})
-    made = Calibration(
-        sensor="main",
-        made_from="a.mcap",
-        raw_size=(32, 24),
-        size=(32, 24),
-        corners=[(0.0, 0.0)] * 4,
-        scale=ScaleEntry.of(Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0)), "pitch"),
-        look=np.full((12, 16, 3), 90, np.float32),
-        force=fit.entry,
-        field_force=fit.field,
-    )
+    made = bare_calibration(force=fit.entry, field_force=fit.field)
     made.save(tmp_path / "a.yaml")
     loaded = Calibration.load(tmp_path / "a.yaml")
     assert seen.field is not None

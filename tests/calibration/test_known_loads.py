@@ -8,37 +8,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactflow.calibration.file import Calibration, ScaleEntry
+from tactflow.calibration.file import Calibration
 from tactflow.calibration.force import fit_force
 from tactflow.calibration.known_loads import Gain, at_rest_of, carry, gain
 from tactflow.calibration.session import learn_weights
 from tactflow.calibration.weights import Weighed, fit_loads
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.force import Seen
-from tactflow.vision.types import Scale
 from tests.calibration.test_field_force import fitted
 from tests.calibration.test_weights import session
+from tests.calibrations import bare_calibration
 
 FORCES = np.array([1.0, 2, 5, 8, 12, 16])
-
-
-def plain() -> Calibration:
-    """A calibration without a force."""
-    return Calibration(
-        sensor="main",
-        made_from="a.mcap",
-        raw_size=(32, 24),
-        size=(32, 24),
-        corners=[(0.0, 0.0)] * 4,
-        scale=ScaleEntry.of(Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0)), "pitch"),
-        look=np.full((12, 16, 3), 90, np.float32),
-    )
 
 
 def calibrated(seed: int) -> Calibration:
     """One by six weights on a gel whose answer differs by a tenth from load to load."""
     seen, loads = session(seed, FORCES)
-    return plain().model_copy(update={"force": fit_loads(seen, loads, FORCES.tolist()).entry})
+    return bare_calibration().model_copy(update={"force": fit_loads(seen, loads, FORCES.tolist()).entry})
 
 
 def today(seed: int, forces: list[float], stiffness: float = 1.0) -> Weighed:
@@ -51,7 +38,7 @@ def test_two_presses_carry_a_force_to_a_stiffer_gel_with_an_honest_error() -> No
     ratios = []
     for seed in range(60):
         other = calibrated(seed)
-        made = carry(plain(), other, gain(other, today(500 + seed, [5.0, 15.0], stiffness=1.5)))
+        made = carry(bare_calibration(), other, gain(other, today(500 + seed, [5.0, 15.0], stiffness=1.5)))
         assert made.force is not None
         rng = np.random.default_rng(seed)
         for force in rng.uniform(2, 20, 10):
@@ -71,7 +58,7 @@ def test_what_a_gel_shows_at_rest_is_not_carried_to_another_sensor() -> None:
         watched=replace(seen, press=brighter, change=seen.change + 2, change_at_rest=2.5)
     )
     plain_gel, noisy_gel = (
-        carry(plain(), here, gain(here, loads))
+        carry(bare_calibration(), here, gain(here, loads))
         for loads in (weighed, noisy)
         for here in [at_rest_of(loads, other)]
     )
@@ -84,9 +71,9 @@ def test_what_a_gel_shows_at_rest_is_not_carried_to_another_sensor() -> None:
 def test_what_is_carried_is_scaled_in_all_its_parts() -> None:
     seen, known = fitted(1, 12)
     fit = fit_force({"a": seen}, {"a": known})
-    other = plain().model_copy(update={"force": fit.entry, "field_force": fit.field})
+    other = bare_calibration().model_copy(update={"force": fit.entry, "field_force": fit.field})
     found = Gain(2.0, 0.2, np.ones(2), np.ones(2), np.ones(2))
-    made = carry(plain(), other, found)
+    made = carry(bare_calibration(), other, found)
     assert made.force is not None
     assert other.force is not None
     assert made.field_force is not None
@@ -97,7 +84,7 @@ def test_what_is_carried_is_scaled_in_all_its_parts() -> None:
     assert after.error == pytest.approx((2 * before.error[0], math.hypot(before.error[1], 0.1)))
     assert after.range == pytest.approx(tuple(2 * limit for limit in before.range))
     with pytest.raises(ConfigError, match="required 2 loads or more, found 1"):
-        carry(plain(), other, found._replace(known=np.ones(1)))
+        carry(bare_calibration(), other, found._replace(known=np.ones(1)))
 
 
 def test_a_gel_that_answers_otherwise_is_noticed_and_one_that_does_not_passes() -> None:
@@ -111,7 +98,7 @@ def test_a_gel_that_answers_otherwise_is_noticed_and_one_that_does_not_passes() 
 def test_the_address_of_a_camera_is_stored_without_its_password() -> None:
     lines: list[str] = []
     weighed = today(1, [2.0, 5.0, 12.0])
-    made = learn_weights(plain(), weighed, "rtsp://me:secret@camera:554/1", lines.append)
+    made = learn_weights(bare_calibration(), weighed, "rtsp://me:secret@camera:554/1", lines.append)
     assert made.force is not None
     assert list(made.force.recordings) == ["rtsp://camera:554/..."]
     assert lines[0].startswith("force, 3 loads: RMS error")
@@ -122,10 +109,10 @@ def test_loads_that_cannot_be_compared_are_refused() -> None:
     with pytest.raises(ConfigError, match="no load of known force"):
         gain(calibrated(1), weighed._replace(forces=[math.nan]))
     with pytest.raises(ConfigError, match="has no force part"):
-        gain(plain(), weighed)
+        gain(bare_calibration(), weighed)
     seen, known = fitted(1, 12)
     fit = fit_force({"a": seen}, {"a": known})
-    by_dots = plain().model_copy(update={"force": fit.entry, "field_force": fit.field})
+    by_dots = bare_calibration().model_copy(update={"force": fit.entry, "field_force": fit.field})
     assert seen.field is not None
     wide = Weighed(replace(seen, field=seen.field[:, :-4]), [(8, 9)], [1.0])
     with pytest.raises(ConfigError, match="for pictures of another aspect ratio"):

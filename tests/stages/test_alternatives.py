@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 import tactflow
 from tactflow import Frame
-from tactflow.calibration.file import Calibration, ScaleEntry, small_picture
+from tactflow.calibration.file import small_picture
 from tactflow.config.registry import resolve
 from tactflow.engine.frame import Absent
 from tactflow.sim import open_scene
 from tactflow.vision.depth.slopes import SlopeModel
 from tactflow.vision.geometry import Preprocessor
 from tactflow.vision.types import MarkerStatus, Scale
+from tests.calibrations import bare_calibration
 from tests.vision.dots import grid, render
 
 TRACKERS = ["lucas_kanade", "dis_flow", "rlof", "nearest_dots"]
@@ -46,16 +47,9 @@ def test_heights_are_those_of_the_ball_that_has_these_slopes(name: str) -> None:
     pressed = untouched.copy()
     pressed[..., :2] = np.rint(100 + 120 * np.moveaxis(normal, 0, -1))
     mask = ((away < rim) * 255).astype(np.uint8)
-    calibration = Calibration(
-        sensor="main",
-        made_from="a.mcap",
-        raw_size=(200, 160),
-        size=(200, 160),
-        corners=[(0.0, 0.0)] * 4,
-        scale=ScaleEntry.of(Scale(mm, mm, (0.0, 0.0), (99.5, 79.5)), "pitch"),
-        look=small_picture(untouched),
-        slopes=SlopeModel(coefficients),
-    )
+    scale = Scale(mm, mm, (0.0, 0.0), (99.5, 79.5))
+    parts = {"look": small_picture(untouched), "slopes": SlopeModel(coefficients)}
+    calibration = bare_calibration((200, 160), scale, **parts)
     component = resolve(name, "stages")
     stage: Any = component.make(component.params(), calibration=calibration)
     found = stage.process(pressed, untouched, mask, calibration.scale)

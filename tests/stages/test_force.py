@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactflow.calibration.file import Calibration, DotsForceEntry, ForceEntry, LinearForceEntry, ScaleEntry
+from tactflow.calibration.file import Calibration, DotsForceEntry, ForceEntry, LinearForceEntry
 from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import Absent
 from tactflow.stages.force import Force
 from tactflow.vision.field_force import FieldForce
 from tactflow.vision.force import LightChange
 from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
+from tests.calibrations import bare_calibration
 
 SCALE = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
 GEL = np.full((24, 32, 3), 90, np.uint8)
@@ -56,17 +57,7 @@ def stage(
         left_out="press",
         drift=drift,
     )
-    made = Calibration(
-        sensor="main",
-        made_from="a.mcap",
-        raw_size=(32, 24),
-        size=(32, 24),
-        corners=[(0.0, 0.0)] * 4,
-        scale=ScaleEntry.of(SCALE, "pitch"),
-        look=np.full((12, 16, 3), 90, np.float32),
-        force=force,
-        field_force=BY_DOTS if dots else None,
-    )
+    made = bare_calibration(scale=SCALE, force=force, field_force=BY_DOTS if dots else None)
     made.save(folder / "main.yaml")
     return Force(StageParams(), Calibration.load(folder / "main.yaml"))
 

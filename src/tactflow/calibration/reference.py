@@ -82,15 +82,9 @@ def read_reference(path: Path, source: str = "") -> Reference:
     >>> read_reference(path).force[3].tolist()
     [nan, nan, 3.0]
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *lines = [*csv.reader(file, skipinitialspace=True)] or [[]]
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: is not a CSV file: {error}") from None
+    (_, header), *lines = csv_lines(path) or [(1, [])]
     columns = _columns(path, header)
-    rows = [(number, row) for number, row in enumerate(lines, 2) if any(cell.strip() for cell in row)]
+    rows = [(number, row) for number, row in lines if any(cell.strip() for cell in row)]
     if len(rows) < FEWEST_SAMPLES:
         raise ConfigError(f"{path}: required {FEWEST_SAMPLES} lines of force or more, found {len(rows)}")
     table = {
@@ -117,6 +111,21 @@ def read_reference(path: Path, source: str = "") -> Reference:
     unknown = np.full(len(rows), np.nan)
     force = np.stack([table.get(name, unknown) for name in ("fx", "fy", "fz")], axis=1)
     return Reference(path.name, table[clock], clock == "frame", force)
+
+
+def csv_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Number and cells of every line of a CSV, blank ones too.
+
+    Raises ConfigError if it cannot be read, or is no CSV.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, skipinitialspace=True)
+            return [(reader.line_num, row) for row in reader]
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: is not a CSV file: {error}") from None
 
 
 def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:

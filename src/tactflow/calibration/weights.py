@@ -6,7 +6,6 @@ dots; between two loads nothing touches the gel.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from tactflow.calibration.force_samples import (
     Watcher,
     features_of_press,
 )
-from tactflow.calibration.reference import TimeOffset
+from tactflow.calibration.reference import TimeOffset, csv_lines
 from tactflow.engine.errors import ConfigError
 from tactflow.message.result import Result
 
@@ -62,12 +61,7 @@ def read_weights(words: Sequence[str]) -> list[float]:
 
 
 def _read_csv(path: Path) -> list[float]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, skipinitialspace=True)
-            (_, header), *rows = [(reader.line_num, row) for row in reader if row] or [(1, [])]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"--weights: {path} cannot be read: {error}") from None
+    (_, header), *rows = [line for line in csv_lines(path) if line[1]] or [(1, [])]
     names = [cell.strip().lower() for cell in header]
     found = [name for name in COLUMNS if name in names]
     if not found:
