@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import f
 
-from tactflow.vision.arrays import Floats
+from tactflow.vision.arrays import Floats, Floats32
 from tactflow.vision.pose.align import NORMAL_STDDEV_RAD
 from tactflow.vision.pose.imprint import MIN_PATCH_CELLS, PATCHES_PER_SIDE, Imprint
 from tactflow.vision.pose.rigid import inverse
@@ -120,13 +120,20 @@ def _relief_misfit(keyframe: Keyframe, shown: Imprint | None = None, motion: Flo
     points = template.points
     if shown is not None:
         points = points[shared_points(shown, template, motion)]
-    x, y, weight = points[:, 0], points[:, 1], points[:, 5]
+    x, y, normals, weight = points[:, 0], points[:, 1], points[:, 3:5], points[:, 5]
+    patches = min(PATCHES_PER_SIDE**2, len(points) * template.every / MIN_PATCH_CELLS**2)
+    square = float(weight @ (_rough(x, y, normals, weight) ** 2).sum(axis=1) / max(weight.sum(), 1e-12))
+    return max(patches * square / NORMAL_STDDEV_RAD**2, 1e-12)
+
+
+def _rough(x: Floats, y: Floats, values: Floats | Floats32, weight: Floats | Floats32) -> Floats:
+    """(n, k): what a polynomial of second degree in x and y, (n,) each, leaves of values (n, k).
+
+    weight : (n,), of the squares.
+    """
     terms = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
     root = np.sqrt(weight)[:, None]
-    smooth = terms @ np.linalg.lstsq(root * terms, root * points[:, 3:5], rcond=None)[0]
-    patches = min(PATCHES_PER_SIDE**2, len(points) * template.every / MIN_PATCH_CELLS**2)
-    square = float(weight @ ((points[:, 3:5] - smooth) ** 2).sum(axis=1) / max(weight.sum(), 1e-12))
-    return max(patches * square / NORMAL_STDDEV_RAD**2, 1e-12)
+    return np.asarray(values - terms @ np.linalg.lstsq(root * terms, root * values, rcond=None)[0])
 
 
 def _guesses(one: Contact, other: Contact) -> Iterator[tuple[float, int, int, Floats]]:
@@ -164,11 +171,9 @@ def _relief(imprint: Imprint, degrees: float, side: int) -> _Relief:
     weight = imprint.planes[..., 3]
     rows, columns = np.nonzero(weight)
     x, y = columns / weight.shape[1] - 0.5, rows / weight.shape[0] - 0.5
-    terms = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
-    height, root = imprint.planes[rows, columns, 2], np.sqrt(weight[rows, columns])
-    smooth = terms @ np.linalg.lstsq(root[:, None] * terms, root * height, rcond=None)[0]
+    height, known = imprint.planes[rows, columns, 2:3], weight[rows, columns]
     values = np.zeros(weight.shape, np.float32)
-    values[rows, columns] = (height - smooth) * weight[rows, columns]
+    values[rows, columns] = _rough(x, y, height, known)[:, 0] * known
     turn = cv2.getRotationMatrix2D(((weight.shape[1] - 1) / 2, (weight.shape[0] - 1) / 2), degrees, 1.0)
     across = int(np.hypot(*weight.shape)) + 1
     turn = turn + np.array([[0, 0, (across - length) / 2] for length in weight.shape[::-1]])
