@@ -3,45 +3,32 @@
 from __future__ import annotations
 
 import argparse
-import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final
 
-from tactflow.api import Settings, ended_by_signals, load, make_runner
+from tactflow.api import load
 from tactflow.calibration.check import check, check_force
 from tactflow.calibration.file import Calibration
-from tactflow.calibration.force_samples import Watched
 from tactflow.calibration.guide import Guide
-from tactflow.calibration.known_loads import FEWEST_LOADS_TO_CARRY, at_rest_of, carry, gain
-from tactflow.calibration.reference import read_reference, recordings_with_csv
+from tactflow.calibration.reference import read_reference
 from tactflow.calibration.session import (
     ENOUGH_PRESSES,
     Method,
-    Play,
     Wish,
     find_presses,
     instruction,
     learn,
-    learn_force,
-    learn_weights,
     watch,
-    weigh,
 )
-from tactflow.calibration.weights import FEWEST_LOADS, Weighed, WeightGuide, read_weights
-from tactflow.calibration.words import core_words, gain_words
+from tactflow.calibration.words import core_words
+from tactflow.cli.calibrate_force import add_force, check_loads
+from tactflow.cli.calibrate_session import file_and_pipeline, load_uncalibrated, page_of, player
 from tactflow.cli.options import add_overwrite, add_sensor, refuse_output
-from tactflow.engine.collect import with_collector
-from tactflow.engine.contract import Source
 from tactflow.engine.errors import ConfigError, StageError
-from tactflow.engine.graph import Node, Pipeline
-from tactflow.message.result import Result
+from tactflow.engine.graph import Pipeline
 from tactflow.system.arguments import number, positive
-from tactflow.system.signals import INTERRUPTED_EXIT_CODE, Interrupted
 from tactflow.system.terminal import notes, say, show, typed
 
 # Gels and balls have 1 to 100.
@@ -198,14 +185,14 @@ def _make(args: argparse.Namespace) -> int:
     method: Method = "darkness" if args.darkness else "refine" if args.refine else "slopes"
     wish = Wish(args.pitch, args.area, args.ball_radius, method, args.gel_thickness)
     base = _base(args, pipeline)
-    loaded = _load(args, pipeline)
+    loaded = load_uncalibrated(args, pipeline)
     out = args.out or Path("calibration") / f"{loaded.sensor}.yaml"
     refuse_output("--out", out, overwrite=args.overwrite, suffixes=(".yaml",))
     presses = args.presses or ENOUGH_PRESSES[method]
     say(instruction(args.ball_radius, presses))
     guide = Guide(presses, say)
-    page = _page(args, pipeline, guide) if args.view else {}
-    session = find_presses(_player(loaded, page), None if args.ball_radius is None else guide)
+    page = page_of(args, pipeline, guide) if args.view else {}
+    session = find_presses(player(loaded, page), None if args.ball_radius is None else guide)
     made_from = str(args.source or loaded.source.params.model_dump().get("source", ""))
     learned = learn(session, wish, base, say, sensor=loaded.sensor, made_from=made_from)
     learned.save(out)
@@ -239,15 +226,15 @@ def _base(args: argparse.Namespace, pipeline: str | None) -> Calibration | None:
 
 def _check(args: argparse.Namespace) -> int:
     """Test how well a calibration still fits."""
-    path, pipeline = _file_and_pipeline(args, "check")
+    path, pipeline = file_and_pipeline(args, "check")
     calibration = Calibration.load(path)
     if args.weights is not None:
-        return _check_loads(args, path, pipeline, calibration)
+        return check_loads(args, path, pipeline, calibration)
     pressed = calibration.photometric or calibration.darkness
     presses = args.presses or ENOUGH_PRESSES["slopes" if calibration.darkness is None else "darkness"]
     say(instruction(None if pressed is None else pressed.ball_radius, presses))
     guide = None if pressed is None else Guide(presses, say)
-    session = find_presses(_player(_load(args, pipeline)), guide)
+    session = find_presses(player(load_uncalibrated(args, pipeline)), guide)
 
     if (misfit := calibration.misfit(session.mapping)) is not None:
         show([f"does not fit: {misfit}; use the pipeline that it was made with, or calibrate again"])
@@ -257,7 +244,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.csv is not None:
         if calibration.force is None:
             raise ConfigError(f"calibrate check: {path} has no force that --csv could be compared with")
-        watched = watch(_player(_load(args, pipeline)), path)
+        watched = watch(player(load_uncalibrated(args, pipeline)), path)
         force_fits, lines = check_force(
             calibration.force,
             calibration.field_force,
@@ -268,113 +255,6 @@ def _check(args: argparse.Namespace) -> int:
         fits = fits and force_fits
     show(["it still fits" if fits else "it does not fit; unless a reason above applies, calibrate again"])
     return 0 if fits else StageError.exit_code
-
-
-def _check_loads(args: argparse.Namespace, path: Path, pipeline: str | None, calibration: Calibration) -> int:
-    """Compare the force with known loads; with --overwrite, results tell from then on."""
-    _require_force(calibration, path)
-    found = gain(calibration, _weigh(args, path, pipeline, fewest=1))
-    show([gain_words(found, str(path))])
-    fits = found.is_one
-    if args.overwrite and calibration.force is not None:
-        drift = 0.0 if fits else abs(found.value - 1)
-        force = calibration.force.model_copy(update={"drift": drift})
-        calibration.model_copy(update={"force": force}).save(path)
-        show([f"{path}: standard errors of the force are {'as fitted' if fits else 'wider by as much'}"])
-    elif not fits:
-        show(["with --overwrite, the standard errors of results become wider by as much"])
-    show(["it still fits" if fits else "it does not fit; calibrate the force again"])
-    return 0 if fits else StageError.exit_code
-
-
-def _force(args: argparse.Namespace) -> int:
-    """Fit the force and write it into the calibration file."""
-    path, pipeline = _file_and_pipeline(args, "force")
-    calibration = Calibration.load(path)
-    if calibration.force is not None and not args.overwrite:
-        raise ConfigError(f"calibrate force: {path} has a force already; give --overwrite to replace it")
-    if args.weights is not None:
-        _force_by_weights(args, path, pipeline, calibration).save(path)
-        say(f"the force is added to {path}")
-        return 0
-    if args.like is not None:
-        raise ConfigError("calibrate force --like: required --weights, two or more that are put on the gel")
-    if args.source is None:
-        raise ConfigError(
-            "calibrate force: required --source, a recording with a CSV of the same name beside it"
-        )
-    gauges = {args.source: args.csv} if args.csv else recordings_with_csv(args.source)
-
-    def watched(source: str) -> Watched:
-        return watch(_player(_load(args, pipeline, source=source)), path)
-
-    learn_force(calibration, gauges, watched, args.offset, say).save(path)
-    say(f"the force is added to {path}")
-    return 0
-
-
-def _force_by_weights(
-    args: argparse.Namespace, path: Path, pipeline: str | None, calibration: Calibration
-) -> Calibration:
-    """The calibration with a force that is fitted to known weights, or carried from another sensor."""
-    if args.like is None:
-        weighed = _weigh(args, path, pipeline, FEWEST_LOADS, fits=True)
-        return learn_weights(calibration, weighed, str(args.source or "live"), say)
-    other = Calibration.load(args.like)
-    _require_force(other, args.like)
-    weighed = _weigh(args, path, pipeline, FEWEST_LOADS_TO_CARRY)
-    other = at_rest_of(weighed, other)
-    found = gain(other, weighed)
-    say(gain_words(found, str(args.like)))
-    return carry(calibration, other, found)
-
-
-def _require_force(calibration: Calibration, path: Path) -> None:
-    """Raise ConfigError if a calibration has no force part. path : of it."""
-    if calibration.force is None:
-        raise ConfigError(f"calibrate --weights: {path} has no force; add it with `tactflow calibrate force`")
-
-
-def _weigh(
-    args: argparse.Namespace, path: Path, pipeline: str | None, fewest: int, fits: bool = False
-) -> Weighed:
-    """The loads of a session. path : of the calibration, for the scale. fewest : loads that are needed.
-    fits : see `WeightGuide`."""
-    if args.csv is not None:
-        raise ConfigError("calibrate: --weights and --csv both give the forces; leave one of them out")
-    forces = read_weights(args.weights)
-    if 0 < len(forces) < fewest:
-        raise ConfigError(f"calibrate --weights: required {fewest} weights or more, got {len(forces)}")
-    if not forces and not sys.stdin.isatty():
-        raise ConfigError("calibrate --weights: required the weights in g, as nobody can be asked for them")
-    guide = WeightGuide(forces, say, fits)
-    page = _page(args, pipeline, guide) if args.view else {}
-    weigh(_player(_load(args, pipeline), page), path, guide)
-    return guide.finish(_reading)
-
-
-def _reading(time: float) -> float:
-    """The force of a load, N, by the reading of a scale; NaN without one."""
-    while True:
-        try:
-            answer = input(f"reading of the scale at {time:.1f} s, g (Enter leaves this load out): ").strip()
-        except EOFError:
-            return math.nan
-        if not answer:
-            return math.nan
-        try:
-            (force,) = read_weights([answer])
-        except ConfigError as problem:
-            say(str(problem))
-        else:
-            return force
-
-
-def _file_and_pipeline(args: argparse.Namespace, verb: str) -> tuple[Path, str | None]:
-    if len(args.words) not in (1, 2):
-        raise ConfigError(f"calibrate {verb}: required a calibration file, and a pipeline if wanted")
-    path, *pipeline = args.words
-    return Path(path), pipeline[0] if pipeline else None
 
 
 VERBS: Final[Mapping[str, tuple[Callable[[argparse.Namespace], int], str, str, Sequence[str]]]] = {
@@ -391,7 +271,7 @@ VERBS: Final[Mapping[str, tuple[Callable[[argparse.Namespace], int], str, str, S
         ("--realtime", "--presses", "--csv", "--offset", "--weights", "--view"),
     ),
     "force": (
-        _force,
+        add_force,
         "FILE [PIPELINE]",
         "fit the force, and add it to a calibration",
         ("--realtime", "--csv", "--offset", "--weights", "--like", "--view"),
@@ -403,53 +283,3 @@ WORDS: Final = {
     "FILE [PIPELINE]": "the calibration file; the pipeline as in 'tactflow run'",
 }
 """Words of a verb -> their description."""
-
-
-def _player(pipeline: Pipeline, page: Mapping[str, Node] = MappingProxyType({})) -> Play:
-    """Plays a pipeline without its sinks, nothing skipped. page : sinks that look on.
-
-    A signal such as Ctrl-C ends it.
-    """
-
-    def play(
-        take: Callable[[Result, Source], bool], needed: Mapping[str, str], calibration: Path | None = None
-    ) -> None:
-        ports = {port.name for node in pipeline.nodes.values() for port in node.component.ports.outputs}
-        for port, stage in needed.items():
-            if port not in ports:
-                raise ConfigError(f"calibrate: required a pipeline that gives {port}; add the stage {stage}")
-
-        def hand_over(result: Result) -> None:
-            if runner.source is not None and not take(result, runner.source):
-                runner.stop()
-
-        plain = replace(pipeline, skipping=False, calibration=calibration)
-        collecting = with_collector(plain, Result, hand_over, name="tactflow.calibrate", references=True)
-        runner = make_runner(replace(collecting, nodes={**collecting.nodes, **page}))
-        with ended_by_signals(runner):
-            ended = runner.run()
-        if ended.exit_code == INTERRUPTED_EXIT_CODE:
-            raise Interrupted
-        if ended.failure is not None:
-            raise ended.failure
-
-    return play
-
-
-def _load(
-    args: argparse.Namespace,
-    pipeline: str | None,
-    settings: Settings = MappingProxyType({}),
-    source: str | None = None,
-) -> Pipeline:
-    """The pipeline without a calibration. source : default: --source."""
-    settings = {"calibration": None, **settings}
-    source = args.source if source is None else source
-    return load(pipeline, source=source, sensor=args.sensor, settings=settings, realtime=args.realtime)
-
-
-def _page(args: argparse.Namespace, pipeline: str | None, guide: Guide | WeightGuide) -> dict[str, Node]:
-    """The live page of the pipeline, or else one with defaults, showing the guided session."""
-    own, added = _load(args, pipeline), _load(args, pipeline, {"sinks.view": {}})
-    node = next(node for node in (*own.sinks, *added.sinks) if node.component.name == "view")
-    return {node.id: replace(node, component=node.component.with_arguments(session=guide))}
