@@ -3,12 +3,16 @@
     python lab/frame_cost.py                        # this checkout
     python lab/frame_cost.py --against DIR          # DIR (old) and this checkout (new) in turns
     python lab/frame_cost.py --scene "press?light=bright" --pipeline classic    # for the README
+    python lab/frame_cost.py --against DIR --grasps ../shared/data              # whole real grasps
 
 Each checkout needs its own `.venv`. The pipeline runs in one thread with a JSON Lines sink; reading the
 recording is not counted. Behind each median is the ratio of the 99th percentile to it. Two checkouts take
 turns every 20 frames, and each frame is compared with the same frame of the other. So the median ratio new
 / old and its 95 % interval (bootstrap over runs) are robust to other load on the machine, unlike the times
 themselves.
+
+Of real grasps, from before the first touch until after the last, the table has the mean of a frame, and the
+ratio of the sums; a stage that a frame does not need costs nothing in it.
 """
 
 from __future__ import annotations
@@ -22,18 +26,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from itertools import islice
 from pathlib import Path
-from statistics import median, quantiles
+from statistics import fmean, median, quantiles
+from types import MappingProxyType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ("press", "cable", "dense")
 SCENE_FRAMES = 240
 """Frames of each scene: several presses, about half of the frames with contact."""
+GRASPS = (
+    ("franka_mini", "mini", "gels/franka_mini/*.avi", 11, {}),
+    ("wedge_grip", "markerless", "wedge_grip/*.avi", 2, {"stages.preprocess.rotate": 0}),
+)
+"""Name, shipped pipeline, recordings in the folder of recordings, every how many of them, and settings."""
 TURN_FRAMES = 20
 """Frames per turn, read before the clock starts: they are in memory, but not in the CPU's cache."""
 START_COMMANDS = {
@@ -94,11 +104,11 @@ class Stopwatch:
         setattr(cls, method, call)
 
 
-def measure_frames(file: str, recording: Path, results: Path) -> list[Times]:
+def measure_frames(file: str, settings: Mapping[str, Any], recording: Path, results: Path) -> list[Times]:
     """CPU times of each frame in the current checkout, ms, as `contact frame`, `idle tracker`, ..."""
     import tactflow
 
-    settings: dict[str, Any] = {"sinks": {"jsonl": {"path": str(results), "segment": "capture"}}}
+    settings = {**settings, "sinks": {"jsonl": {"path": str(results), "segment": "capture"}}}
     for node in tactflow.load(file).nodes.values():
         if node.component.kind == "stage":
             settings[f"stages.{node.id}.segment"] = "capture"
@@ -122,13 +132,16 @@ def python(tree: Path, *arguments: str | Path) -> list[str]:
     return [str(tree / ".venv" / "bin" / "python"), *map(str, arguments)]
 
 
-def measure_scene(trees: dict[str, Path], file: str, recording: Path) -> Samples:
+def measure_recording(
+    trees: dict[str, Path], file: str, recording: Path, settings: Mapping[str, Any] = MappingProxyType({})
+) -> Samples:
     """Run all checkouts on a recording, taking turns of `TURN_FRAMES` frames."""
     children: dict[str, Any] = {}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with tempfile.TemporaryDirectory() as folder:
         for name, tree in trees.items():
-            child = ("--pipeline", file, "--child", recording, f"{folder}/{name}.jsonl")
+            given = json.dumps(dict(settings))
+            child = ("--pipeline", file, "--child", given, recording.resolve(), f"{folder}/{name}.jsonl")
             command = python(tree, Path(__file__).resolve(), *child)
             children[name] = subprocess.Popen(command, cwd=tree, **pipes)
             children[name].stdout.readline()
@@ -169,6 +182,25 @@ def print_rows(title: str, turns: Sequence[Samples]) -> None:
         print(row + ratio_text(ratios), flush=True)
 
 
+def print_means(name: str, turns: Sequence[Samples]) -> None:
+    """Print the mean of the whole frame and of each stage over all frames, and the ratio of the sums."""
+    frames = {tree: [merged(times) for turn in turns for times in turn[tree]] for tree in turns[0]}
+    for key in dict.fromkeys(key for times in frames["new"] for key in times):
+        row = f"{name + ', ' + key:<32}"
+        for times in frames.values():
+            row += f"{fmean(frame.get(key, 0.0) for frame in times):10.3f}{'':7}"
+        sums = [
+            {tree: sum(merged(frame).get(key, 0.0) for frame in turn[tree]) for tree in turn}
+            for turn in (turns if "old" in frames else ())
+        ]
+        print(row + ratio_text([turn["new"] / turn["old"] for turn in sums if turn["old"]]), flush=True)
+
+
+def merged(times: Times) -> Times:
+    """The times of a frame without the kind of frame in their names."""
+    return {key.partition(" ")[2]: value for key, value in times.items()}
+
+
 def ratio_text(ratios: Sequence[float]) -> str:
     """The median of the ratios, and its 95 % interval by bootstrap."""
     if not ratios:
@@ -185,23 +217,31 @@ def main() -> None:
     parser.add_argument("--scene", action="append", metavar="NAME", help=f"default: {', '.join(SCENES)}")
     parser.add_argument("--turns", type=int, default=5, help="runs of each checkout (default: 5)")
     parser.add_argument("--pipeline", default="pipeline.yaml", help="file or name (default: pipeline.yaml)")
-    parser.add_argument("--child", type=Path, nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--grasps", type=Path, metavar="DATA", help="instead: recordings of grasps in DATA")
+    parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child is not None:
-        print(json.dumps(measure_frames(args.pipeline, *args.child)))
+        settings, recording, results = args.child
+        print(json.dumps(measure_frames(args.pipeline, json.loads(settings), Path(recording), Path(results))))
         return
     trees = {"old": args.against.resolve()} if args.against else {}
     trees["new"] = ROOT
     for tree in trees.values():
         subprocess.run(python(tree, "-m", "tactflow", "warmup"), cwd=tree, capture_output=True, check=True)
-    print(f"{'median, ms; p99 / p50':<32}" + "".join(f"{name:>10}{'':>7}" for name in trees) + "   ratio")
+    what = "mean, ms" if args.grasps else "median, ms; p99 / p50"
+    print(f"{what:<32}" + "".join(f"{name:>10}{'':>7}" for name in trees) + "   ratio")
+    if args.grasps is not None:
+        for name, pipeline, pattern, every, settings in GRASPS:
+            recordings = sorted(args.grasps.glob(pattern))[::every]
+            print_means(name, [measure_recording(trees, pipeline, path, settings) for path in recordings])
+        return
     with tempfile.TemporaryDirectory() as folder:
         for scene in args.scene or SCENES:
             recording = Path(folder) / f"{scene}.npy".replace("?", "-")
             options = f"{'&' if '?' in scene else '?'}frames={SCENE_FRAMES}"
             command = ("sim", f"{scene}{options}", "--out", recording)
             subprocess.run(python(ROOT, "-m", "tactflow", *command), capture_output=True, check=True)
-            turns = [measure_scene(trees, args.pipeline, recording) for _ in range(args.turns)]
+            turns = [measure_recording(trees, args.pipeline, recording) for _ in range(args.turns)]
             print_rows(f"{scene}, ", turns)
     print_rows("", [measure_start(trees) for _ in range(args.turns)])
 

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactflow.vision.arrays import MAD_TO_SIGMA
 from tactflow.vision.markers.lattice import nearest
 from tactflow.vision.types import Scale
 
@@ -50,8 +51,6 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
     >>> round(scale.stderr[0], 3)
     0.016
     """
-    from scipy.stats import median_abs_deviation
-
     if not (np.isfinite(pitch) and pitch > 0):
         raise ValueError(f"pitch: required > 0 mm, got {pitch:g}")
     groups = _links(np.asarray(dots, np.float64).reshape(-1, 2))
@@ -63,7 +62,8 @@ def scale_from_pitch(dots: ArrayLike, pitch: float, size: tuple[int, int]) -> Sc
         )
     means = np.array([np.median(group, axis=0) for group in groups])
     x, y = _square(means, pitch)
-    spread = np.array([median_abs_deviation(group, axis=0, scale="normal") for group in groups])
+    deviations = [np.abs(group - mean) for group, mean in zip(groups, means, strict=True)]
+    spread = MAD_TO_SIGMA * np.array([np.median(deviation, axis=0) for deviation in deviations])
     error = spread / np.sqrt([[len(group)] for group in groups])
     # Along an axis the relative error of the scale is that of the links that run along it.
     along = np.argmax(np.abs(means), axis=0)

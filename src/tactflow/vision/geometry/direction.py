@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from typing import Final
@@ -104,7 +105,11 @@ def _outline_power(contours: Contours, moments: Moments) -> Floats:
         fraction = np.imag(np.conj(around[:-2]) * around[2:]) / (4 * math.pi)
         deviations.append((distance / 2 - 1) * fraction)
         turns.append(turn)
-    powers = np.vander(np.concatenate(turns), _ROUGHNESS_HARMONICS.stop, increasing=True)[
-        :, _ROUGHNESS_HARMONICS.start :
-    ]
-    return np.asarray(np.abs(np.concatenate(deviations) @ powers) ** 2)
+    # Products and sums of rows: a product of matrices would wake the threads of BLAS.
+    turn = np.concatenate(turns)
+    terms = np.empty((len(_ROUGHNESS_HARMONICS), len(turn)), np.complex128)
+    np.multiply(np.concatenate(deviations), turn**_ROUGHNESS_HARMONICS.start, out=terms[0])
+    for before, after in itertools.pairwise(terms):
+        np.multiply(before, turn, out=after)
+    harmonics = terms.sum(axis=1)
+    return np.asarray(harmonics.real**2 + harmonics.imag**2)
