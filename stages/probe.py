@@ -62,7 +62,6 @@ class Probe(Stage):
     def reset(self) -> None:
         """A new reference follows."""
         self._test: RestTest | None = None
-        self._gel = slice(None), slice(None)
         self._since_work = 0
 
     def process(self, frame: Frame) -> ProbePorts:
@@ -71,16 +70,16 @@ class Probe(Stage):
         if not self._skipping:
             return ProbePorts(True, True)
         if self._test is None:
-            self._gel = bounding_box(valid_area(frame.image))
             self._test = RestTest(
-                frame.image[self._gel],
+                frame.image,
                 repeatability=self.params.repeatability,
                 tint=self.params.tint,
                 false_alarms=self.params.false_alarms,
+                window=bounding_box(valid_area(frame.image)),
             )
         self._since_work += 1
         due = frame.reference or self._since_work >= self.params.at_least_every
-        look = self._test.look(frame.image[self._gel], touching=self.watched, due=due)
+        look = self._test.look(frame.image, touching=self.watched, due=due)
         if look.suspect:
             self._since_work = 0
         return ProbePorts(look.changed, look.suspect)

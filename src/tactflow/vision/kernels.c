@@ -43,6 +43,7 @@ typedef uint8_t Bytes16 __attribute__((vector_size(16)));
 typedef uint8_t u8;
 typedef uint16_t u16;
 typedef uint32_t u32;
+typedef int16_t i16;
 typedef int32_t i32;
 typedef int64_t i64;
 
@@ -151,60 +152,94 @@ LOOP smooth_cells(const Arg *a, double *out)
     return 0;
 }
 
+#define SLOPE_STEPS_PER_GREY 8
+
 LOOP sum_tiles(const Arg *a, double *out)
 {
-    const u8 *picture = a[0].data, *resting = a[2].data;
-    const i64 *used = a[1].data, stride = a[0].shape[1];
-    const float *slopes = a[3].data;
-    float *sums = a[4].data;
-    const i64 rows = a[4].shape[1], columns = a[4].shape[2], high = a[2].shape[0], width = a[2].shape[1];
-    const i64 thick = high / rows, wide = width / columns;
-    u16 *light = malloc(3 * width * sizeof(u16));
-    float *shift = malloc(2 * width * sizeof(float));
+    const u8 *picture = a[0].data;
+    const i64 left = a[1].whole, *used = a[2].data, *at_rest = a[4].data, stride = a[0].shape[1];
+    const i16 *slopes = a[3].data;
+    const float *px_per_edge = a[5].data;
+    float *light = a[6].data, *shift = a[7].data;
+    const i64 rows = a[6].shape[1], columns = a[6].shape[2], high = a[2].shape[0], width = a[3].shape[2];
+    const i64 thick = high / rows, wide = width / columns, tiles = rows * columns;
+    const float pixels = (float)(thick * wide);
+    /* Sums with one tile of 0 more on all sides. */
+    const i64 padded = columns + 2, plane = (rows + 2) * padded;
+    float *moved = calloc(2 * (plane + width) + 3 * width, sizeof(float));
     (void)out;
-    if (!light || !shift) {
-        free(light);
-        free(shift);
+    if (!moved)
         return OUT_OF_MEMORY;
-    }
+    i32 *restrict moved_x = (i32 *)(moved + 2 * plane), *restrict moved_y = moved_x + width;
+    u16 *restrict total = (u16 *)(moved_y + width);
     for (i64 row = 0; row < rows; row++) {
-        memset(light, 0, 3 * width * sizeof(u16));
-        memset(shift, 0, 2 * width * sizeof(float));
+        memset(moved_x, 0, 2 * width * sizeof(i32));
+        memset(total, 0, 3 * width * sizeof(u16));
         for (i64 y = row * thick; y < (row + 1) * thick; y++) {
-            const u8 *restrict line = picture + used[y] * stride;
-            const u8 *restrict rest = resting + y * width;
-            const float *restrict along = slopes + y * width, *restrict down = slopes + (high + y) * width;
-            u16 *restrict total = light;
-            float *restrict shift_x = shift, *restrict shift_y = shift + width;
+            const u8 *restrict line = picture + used[y] * stride + left;
+            const i16 *restrict along = slopes + y * width, *restrict down = slopes + (high + y) * width;
             /* The lines lie apart in memory, so that the processor does not read ahead by itself. */
-            const u8 *next = picture + used[MIN(y + 4, high - 1)] * stride;
+            const u8 *next = picture + used[MIN(y + 4, high - 1)] * stride + left;
             for (i64 x = 0; x < 3 * width; x += 64)
                 PREFETCH(next + x);
             for (i64 x = 0; x < 3 * width; x++)
                 total[x] = (u16)(total[x] + line[x]);
             for (i64 x = 0; x < width; x++) {
-                const float more = (float)((int)line[3 * x + 1] - (int)rest[x]);
-                shift_x[x] += more * along[x];
-                shift_y[x] += more * down[x];
+                const i32 green = line[3 * x + 1];
+                moved_x[x] += along[x] * green;
+                moved_y[x] += down[x] * green;
             }
         }
         for (i64 column = 0; column < columns; column++) {
-            i64 channel[3] = {0, 0, 0};
-            float moved[2] = {0, 0};
-            for (i64 x = column * wide; x < (column + 1) * wide; x++) {
-                for (int c = 0; c < 3; c++)
-                    channel[c] += light[3 * x + c];
-                moved[0] += shift[x];
-                moved[1] += shift[width + x];
+            const i64 tile = row * columns + column;
+            const u16 *restrict levels = total + 3 * column * wide;
+            i32 blue = 0, green = 0, red = 0, sum_x = 0, sum_y = 0;
+            for (i64 x = 0; x < wide; x++) {
+                blue += levels[3 * x];
+                green += levels[3 * x + 1];
+                red += levels[3 * x + 2];
             }
-            for (int c = 0; c < 3; c++)
-                sums[(c * rows + row) * columns + column] = (float)channel[c];
-            for (int c = 0; c < 2; c++)
-                sums[((3 + c) * rows + row) * columns + column] = moved[c];
+            for (i64 x = column * wide; x < (column + 1) * wide; x++) {
+                sum_x += moved_x[x];
+                sum_y += moved_y[x];
+            }
+            light[tile] = (float)blue / pixels;
+            light[tiles + tile] = (float)green / pixels;
+            light[2 * tiles + tile] = (float)red / pixels;
+            moved[(row + 1) * padded + column + 1] = (float)(sum_x - at_rest[tile]);
+            moved[plane + (row + 1) * padded + column + 1] = (float)(sum_y - at_rest[tiles + tile]);
         }
     }
-    free(light);
-    free(shift);
+    for (i64 row = 0; row < 2 * rows; row++) {
+        const float *restrict sums = moved + row / rows * plane + row % rows * padded;
+        const float *restrict factor = px_per_edge + row * columns;
+        for (i64 x = 0; x < columns; x++) {
+            float total = 0;
+            for (int y = 0; y < 3; y++)
+                total += sums[y * padded + x] + sums[y * padded + x + 1] + sums[y * padded + x + 2];
+            shift[row * columns + x] = total * factor[x] / (9 * SLOPE_STEPS_PER_GREY);
+        }
+    }
+    free(moved);
+    return 0;
+}
+
+LOOP find_excess(const Arg *a, double *out)
+{
+    const float *departure = a[0].data, *allowed = a[1].data, *shift = a[3].data, *followed = a[4].data;
+    const float *bound = a[5].data, growth = (float)a[2].number;
+    const i64 tiles = a[0].shape[0] * a[0].shape[1];
+    float departed = -INFINITY, moved = -INFINITY;
+    for (i64 i = 0; i < tiles; i++) {
+        const float excess = departure[i] - MAX(allowed[i] + growth, 1);
+        departed = MAX(departed, excess);
+    }
+    for (i64 i = 0; i < 2 * tiles; i++) {
+        const float excess = fabsf(shift[i] - followed[i]) - bound[i];
+        moved = MAX(moved, excess);
+    }
+    out[0] = departed;
+    out[1] = moved;
     return 0;
 }
 
@@ -917,11 +952,11 @@ typedef struct {
     double r_squared, rest;
 } Fit;
 
-INLINE Fit fit_template(const int16_t *weight, const float *term, const float *restrict patch, i64 size,
+INLINE Fit fit_template(const i16 *weight, const float *term, const float *restrict patch, i64 size,
                                double varies)
 {
-    const int16_t *restrict w0 = weight, *restrict w1 = w0 + size, *restrict w2 = w1 + size, *restrict w3 = w2 + size;
-    const int16_t *restrict w4 = w3 + size;
+    const i16 *restrict w0 = weight, *restrict w1 = w0 + size, *restrict w2 = w1 + size, *restrict w3 = w2 + size;
+    const i16 *restrict w4 = w3 + size;
     float sum[5] = {0, 0, 0, 0, 0};
     for (i64 p = 0; p < size; p++) {
         sum[0] += (float)w0[p] * patch[p];
@@ -945,7 +980,7 @@ LOOP align_marks(const Arg *a, double *out)
     const u8 *image = a[0].data;
     const double *start = a[1].data;
     const i64 *marks = a[2].data, *places = a[3].data, *widths = a[6].data, rows = a[6].shape[0];
-    const int16_t *weights = a[4].data;
+    const i16 *weights = a[4].data;
     const float *terms = a[5].data, longest = (float)a[7].number;
     double *position = a[8].data;
     float *error = a[9].data;
@@ -1357,7 +1392,8 @@ typedef struct {
 static const Loop LOOPS[] = {
     {"halve", "B2 n n B2!", '-', halve},
     {"smooth_cells", "B2 f3!", '-', smooth_cells},
-    {"sum_tiles", "B2 q1 B2 f3 f3!", '-', sum_tiles},
+    {"sum_tiles", "B2 n q1 h3 q3 f3 f3! f3!", '-', sum_tiles},
+    {"find_excess", "f2 f2 x f3 f3 f3", '2', find_excess},
     {"weigh_change", "f3 f2 f1 f1 f3 f3 f2 f2 B2 f2 f2! f2! f2!", '4', weigh_change},
     {"scaled_change", "B2 n n f2 f1 f1 f2 f2 f2! x", '-', scaled_change},
     {"compare_blocks", "f3 f2 f2 f2 f2 f2 f2! f2! f2! x", '-', compare_blocks},

@@ -49,6 +49,8 @@ NOISE_BLOCK_COUNT: Final = 5
 second."""
 DOT_TOLERANCE_PX: Final = 0.05
 """Tolerance of the positions of dots, px."""
+SLOPE_STEPS_PER_GREY: Final = 8
+"""Steps of the slopes per grey level: the sum of the positive weights of Sobel's filter, over both sides."""
 ROUNDING_VARIANCE: Final = 1 / 12
 """Variance of rounding to whole grey levels, squared levels."""
 
@@ -98,6 +100,7 @@ class RestTest:
     frame : (H, W, 3) uint8 BGR, the untouched gel.
     repeatability, tint : see `ContactDetector`.
     false_alarms : share of still frames in which the dots are measured nevertheless, in (0, 0.5].
+    window : rows and columns of the frame that are examined, with start and stop; None: all.
 
     Examples
     --------
@@ -118,33 +121,42 @@ class RestTest:
         repeatability: float = 0.025,
         tint: float = 0.01,
         false_alarms: float = 0.01,
+        window: tuple[slice, slice] | None = None,
     ) -> None:
         if not 0 < false_alarms <= 0.5:
             raise ValueError(f"required false_alarms in (0, 0.5], got {false_alarms}")
         check_color_image(frame)
         self._shape = frame.shape
-        tile = min(max(MIN_LINES_PER_TILE, round(max(self._shape) / LONG_SIDE_TILES)), *self._shape[:2])
-        rows, columns = self._shape[0] // tile, self._shape[1] // tile
+        height, width, _ = self._shape
+        self._window = window or (slice(0, height), slice(0, width))
+        examined = frame[self._window]
+        height, width, _ = examined.shape
+        tile = min(max(MIN_LINES_PER_TILE, round(max(height, width) / LONG_SIDE_TILES)), height, width)
+        rows, columns = height // tile, width // tile
         lines = min(max(MIN_LINES_PER_TILE, READ_BYTES // (3 * tile * rows * columns)), tile)
-        gray = np.asarray(frame[: rows * tile, : columns * tile, 1], np.float32)
-        slopes = _slopes(gray)
+        green = examined[: rows * tile, : columns * tile, 1]
+        slopes = _slopes(green.astype(np.float32))
         used = _used_lines(np.square(slopes).sum(axis=(0, 2)).reshape(rows, tile), lines)
-        self._used = used, slice(columns * tile)
-        self._slopes: Floats32 = np.ascontiguousarray(slopes[:, used])
-        self._resting: NDArray[np.uint8] = np.ascontiguousarray(frame[self._used][..., 1])
+        slopes = np.ascontiguousarray(slopes[:, used])
+        self._used: Indices = used + self._window[0].start
+        # Differences of whole grey levels, so that these are whole numbers, too.
+        self._slopes: NDArray[np.int16] = np.rint(slopes * SLOPE_STEPS_PER_GREY).astype(np.int16)
         self._pixels = tile * lines
-        energy = np.square(self._slopes).reshape(2, rows, -1, columns, tile).sum(axis=(2, 4))
-        energy = _near(energy) + np.float32(ROUNDING_VARIANCE * self._pixels)
+        tiles = 2, rows, lines, columns, tile
+        energy = _near(np.square(slopes).reshape(tiles).sum(axis=(2, 4)))
+        energy += np.float32(ROUNDING_VARIANCE * self._pixels)
         self._px_per_edge = np.asarray(1 / np.sqrt(energy), np.float32)
+        self._at_rest: Indices = (self._slopes * green[used].astype(np.int64)).reshape(tiles).sum(axis=(2, 4))
         self._z = np.float32(-NormalDist().inv_cdf(false_alarms / (4 * rows * columns)))
-        self._light = _LightTest(self._sums(frame)[:3] / np.float32(self._pixels), repeatability, tint)
+        self._light = _LightTest(self._sums(frame)[0], repeatability, tint)
         self._frame: NDArray[np.uint8] | None = None
         self._last: _Measurement | None = None
         self._allowed: Floats32 | None = None
         self._followed: Floats32 | None = None
         self._steps: list[Floats32] = []
         self._variances: deque[Floats32] = deque(maxlen=NOISE_BLOCK_COUNT)
-        self._bound: Floats32 | None = None
+        # Until the noise is known, the dots may always have moved.
+        self._bound: Floats32 = np.full_like(self._px_per_edge, -1)
 
     def look(self, frame: NDArray[np.uint8], *, touching: bool = False, due: bool = False) -> Look:
         """Compare a frame with the earlier ones.
@@ -153,8 +165,8 @@ class RestTest:
         touching : whether the previous frame showed contact. due : whether the frame will be processed in
         full in any case.
         """
-        check_color_image(frame)
-        if frame.shape != self._shape:
+        if frame.shape != self._shape or frame.dtype != np.uint8:
+            check_color_image(frame)
             raise ValueError(f"required a frame of shape {self._shape}, got {frame.shape}")
         before, self._frame = self._frame, frame
         if touching:
@@ -169,31 +181,36 @@ class RestTest:
         if before is None or last is None or self._allowed is None or self._followed is None:
             self._allowed, self._followed = now
             return Look(True, True)
-        if not np.array_equal(now.shift, last.shift) or not np.array_equal(frame, before):
+        if now.shift.tobytes() != last.shift.tobytes() or not self._is_same(frame, before):
             self._learn(now.shift - last.shift)
         elif not due:
             return Look(False, False)
-        suspect = due or bool(
-            (now.departure > np.maximum(self._allowed + np.float32(GROWTH_TOLERANCE), 1)).any()
+        departed, moved = find_excess(
+            now.departure, self._allowed, GROWTH_TOLERANCE, now.shift, self._followed, self._bound
         )
+        suspect = due or departed > 0
         # A deviation that has crept back must not return unnoticed.
         self._allowed = now.departure if suspect else np.minimum(self._allowed, now.departure)
-        moved = self._bound is None or bool((np.abs(now.shift - self._followed) > self._bound).any())
-        if suspect or moved:
+        changed = suspect or moved > 0
+        if changed:
             self._followed = now.shift
-        return Look(suspect or moved, suspect)
+        return Look(changed, suspect)
+
+    def _is_same(self, frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+        return np.array_equal(frame[self._window], other[self._window])
 
     def _measure(self, frame: NDArray[np.uint8]) -> _Measurement:
-        sums = self._sums(frame)
-        departure = self._light.departure(sums[:3] / np.float32(self._pixels))
-        return _Measurement(departure, _near(sums[3:]) * self._px_per_edge)
+        light, shift = self._sums(frame)
+        return _Measurement(self._light.departure(light), shift)
 
-    def _sums(self, frame: NDArray[np.uint8]) -> Floats32:
-        """(5, rows, columns), see `sum_tiles`."""
-        sums = np.empty((5, *self._px_per_edge.shape[1:]), np.float32)
+    def _sums(self, frame: NDArray[np.uint8]) -> tuple[Floats32, Floats32]:
+        """Light (3, rows, columns), grey levels, and shift (2, rows, columns), see `sum_tiles`."""
+        light = np.empty((3, *self._px_per_edge.shape[1:]), np.float32)
+        shift = np.empty_like(self._px_per_edge)
         picture = np.ascontiguousarray(frame).reshape(len(frame), -1)
-        sum_tiles(picture, self._used[0], self._resting, self._slopes, sums)
-        return sums
+        left = 3 * self._window[1].start
+        sum_tiles(picture, left, self._used, self._slopes, self._at_rest, self._px_per_edge, light, shift)
+        return light, shift
 
     def _learn(self, step: Floats32) -> None:
         """Update the noise with the difference of displacements in two consecutive frames."""
@@ -209,8 +226,8 @@ class RestTest:
             np.maximum(np.maximum(near, variance / 2), np.float32(ROUNDING_VARIANCE / WINDOW_TILES**2))
         )
         bound = self._z * np.sqrt(2 * np.median(self._variances, axis=0))
-        shifts = bound * self._px_per_edge
-        self._bound = np.asarray(bound, np.float32) if np.median(shifts) <= DOT_TOLERANCE_PX else None
+        is_low = np.median(bound * self._px_per_edge) <= DOT_TOLERANCE_PX
+        self._bound = np.asarray(bound if is_low else np.full_like(bound, -1), np.float32)
 
 
 class _LightTest:
@@ -226,16 +243,18 @@ class _LightTest:
         slopes = [_slopes(plane) for plane in untouched]
         steady = TILE_NOISE_GREY**2 + GEL_MOVEMENT_TILES**2 * np.square(slopes).sum(axis=1)
         self._known = Derived.of(untouched, steady, repeatability, tint)
-        self._before = np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)
+        _, high, wide = untouched.shape
+        self._model = (
+            *(positions(wide), positions(high), self._known.mean, self._known.weight),
+            *(self._known.brightness, self._known.colour_factor),
+            *(np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)),
+        )
+        self._planes = np.empty_like(untouched)
 
     def departure(self, light: Floats32) -> Floats32:
         """Deviation (rows, columns) float32 of the light of a frame, (3, rows, columns), in thresholds."""
-        _, high, wide = light.shape
-        planes = np.empty((3, high, wide), np.float32)
-        known, places = self._known, (positions(wide), positions(high))
-        model = known.mean, known.weight, known.brightness, known.colour_factor
-        weigh_change(light, known.illumination.fit(light), *places, *model, *self._before, *planes)
-        return np.asarray(np.sqrt(planes[2] / np.float32(WIDE_DEVIATION)), np.float32)
+        weigh_change(light, self._known.illumination.fit(light), *self._model, *self._planes)
+        return np.asarray(np.sqrt(self._planes[2] / np.float32(WIDE_DEVIATION)), np.float32)
 
 
 def _slopes(plane: Floats32) -> Floats32:
@@ -268,17 +287,41 @@ def _used_lines(energy: Floats32, number: int) -> NDArray[np.intp]:
 
 @kernel
 def sum_tiles(
-    picture: NDArray[np.uint8], used: Indices, resting: NDArray[np.uint8], slopes: Floats32, sums: Floats32
+    picture: NDArray[np.uint8],
+    left: int,
+    used: Indices,
+    slopes: NDArray[np.int16],
+    at_rest: Indices,
+    px_per_edge: Floats32,
+    light: Floats32,
+    shift: Floats32,
 ) -> None:
-    """Sums over tiles of blue, green and red, and of the change of green times its slopes along x and y.
+    """Fill `light`, the means of blue, green and red over tiles, and `shift`, that of the edges near them.
 
-    picture : (H, 3 W). used : (n * rows,), its lines that are read, of W >= m * columns px; n < 258.
-    resting : (n * rows, m * columns), green of the untouched gel. slopes : (2, n * rows, m * columns), levels
-    per px. sums : (5, rows, columns), filled.
+    picture : (H, 3 W). left : its first byte in a line. used : (n * rows,), its lines that are read; n < 258.
+    slopes : (2, n * rows, m * columns), of green along x and y, `SLOPE_STEPS_PER_GREY` a level per px.
+    at_rest : (2, rows, columns), the sums over tiles of green of the untouched gel times its slopes.
+    px_per_edge : (2, rows, columns), factor of the means over `WINDOW_TILES` tiles a side of the same sums of
+    the picture, less `at_rest`. light : (3, rows, columns). shift : (2, rows, columns).
     """
-    _, rows, columns = sums.shape
-    tiles = rows, len(resting) // rows, columns, resting.shape[1] // columns
-    pictures = picture[used, : 3 * resting.shape[1]].reshape(*tiles, 3)
-    sums[:3] = pictures.sum(axis=(1, 3)).transpose(2, 0, 1)
-    more = pictures[..., 1].astype(np.float32) - resting.reshape(tiles)
-    sums[3:] = (slopes.reshape(2, *tiles) * more).sum(axis=(2, 4))
+    _, rows, columns = light.shape
+    tiles = rows, len(used) // rows, columns, slopes.shape[2] // columns
+    pictures = picture[used, left : left + 3 * slopes.shape[2]].reshape(*tiles, 3)
+    light[:] = pictures.mean(axis=(1, 3)).transpose(2, 0, 1)
+    moved = (slopes.reshape(2, *tiles) * pictures[..., 1].astype(np.int64)).sum(axis=(2, 4)) - at_rest
+    shift[:] = _near(moved.astype(np.float32)) * px_per_edge / SLOPE_STEPS_PER_GREY
+
+
+@kernel
+def find_excess(
+    departure: Floats32,
+    allowed: Floats32,
+    growth: float,
+    shift: Floats32,
+    followed: Floats32,
+    bound: Floats32,
+) -> tuple[float, float]:
+    """The largest excess of `departure` over 1 and over `allowed` by `growth`, (rows, columns), and of the
+    distance of `shift` from `followed` over `bound`, (2, rows, columns)."""
+    departed = (departure - np.maximum(allowed + np.float32(growth), 1)).max()
+    return float(departed), float((np.abs(shift - followed) - bound).max())
