@@ -16,6 +16,9 @@ import tactflow
 from tactflow.tools.stress.compare import difference, numbers
 from tactflow.vision import compiled
 from tactflow.vision.contact.background_kernels import smooth_cells
+from tactflow.vision.contact.components import contact_cells
+from tactflow.vision.contact.contact_outline import draw_level, largest_nearby, outline_level
+from tactflow.vision.contact.heights import smooth_range
 from tactflow.vision.contact.level_tree import grow_level_lines
 from tactflow.vision.geometry.downsample import halve
 
@@ -70,6 +73,43 @@ def test_level_lines_are_the_same_in_c_and_in_numpy(seed: int) -> None:
     ):
         assert (size, around) == (other_size, other_around)
         assert drop == pytest.approx(other_drop, abs=2e-3)
+
+
+@needs_compiler
+@pytest.mark.parametrize("seed", range(8))
+def test_cells_in_contact_are_the_same_in_c_and_in_numpy(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    size = tuple(draw.integers(1, 40, 2))
+    squared = np.asarray(cv2.GaussianBlur(draw.normal(size=size), (0, 0), 1.0) ** 2 * 40, np.float32)
+    before = cv2.GaussianBlur(draw.normal(size=size), (0, 0), 2.0) > 0.2
+    found = np.empty((2, *size), np.bool_)
+    arguments = squared, 3.0, 20.0, 8.0, before, 4
+    counts = [
+        cells(*arguments, into)
+        for cells, into in zip((contact_cells.compiled, contact_cells.plain), found, strict=True)
+    ]
+    assert counts[0] == counts[1] == found[0].sum()
+    np.testing.assert_array_equal(*found)
+
+
+@needs_compiler
+@pytest.mark.parametrize("seed", range(8))
+def test_outlines_are_the_same_in_c_and_in_numpy(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    high, wide = (int(side) for side in draw.integers(1, 24, 2))
+    noise = cv2.GaussianBlur(draw.normal(size=(2 * high, 2 * wide)), (0, 0), 1.5)
+    values = np.maximum(np.asarray(5 * noise, np.float32), 0)
+    core = (draw.random((high, wide)) > 0.95).astype(np.uint8)
+    nearby, level = np.empty((2, *values.shape), np.float32), np.empty((2, *values.shape), np.float32)
+    mask = np.zeros((2, 4 * high - 1, 4 * wide + 3), np.uint8)
+    for index, kind in enumerate(("compiled", "plain")):
+        getattr(largest_nearby, kind)(values, 0.55, nearby[index])
+        getattr(outline_level, kind)(values, 0.5, core, level[index])
+        getattr(draw_level, kind)(level[0], 1, 4, mask[index])
+    np.testing.assert_allclose(*nearby, rtol=1e-5)
+    np.testing.assert_array_equal(*level)
+    np.testing.assert_array_equal(*mask)
+    assert smooth_range.compiled(values) == pytest.approx(smooth_range.plain(values), rel=1e-6)
 
 
 @needs_compiler

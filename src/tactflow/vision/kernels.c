@@ -59,6 +59,62 @@ typedef struct {
 #define MAX(a, b) ((a) > (b) ? (a) : (b))
 #define OUT_OF_MEMORY (-1)
 
+/* Neighbours of a pixel along a line of `count`, reflected about the last one. */
+#define BEFORE(at, count) ((at) > 0 ? (at) - 1 : MIN(1, (count) - 1))
+#define AFTER(at, count) ((at) < (count) - 1 ? (at) + 1 : MAX((count) - 2, 0))
+
+/* Combine a cell with its eight neighbours in a grid of rows that are `stride` apart. */
+#define AROUND(cell, stride, with)                                                                                    \
+    ((cell)[-(stride) - 1] with (cell)[-(stride)] with (cell)[1 - (stride)] with (cell)[-1] with (cell)[0] with       \
+     (cell)[1] with (cell)[(stride) - 1] with (cell)[stride] with (cell)[(stride) + 1])
+
+/* Neighbouring pixels of a row, from `first` up to `end`, all of which are set or not. At the root of its component,
+ * whether that has been `found`. */
+typedef struct {
+    i32 first, end, root;
+    u8 found;
+} Run;
+
+INLINE i64 root_of_run(Run *runs, i64 run)
+{
+    while (runs[run].root != run)
+        run = runs[run].root = runs[runs[run].root].root; /* path halving */
+    return run;
+}
+
+INLINE void unite(Run *runs, i64 one, i64 other)
+{
+    const i64 first = root_of_run(runs, one), second = root_of_run(runs, other);
+    runs[MAX(first, second)].root = (i32)MIN(first, second);
+}
+
+/* Divide each row of a grid of 0 and 1 into runs, of which every second one is set, and unite those that touch those
+ * of the row above: set ones by sides or corners, others by sides. Around the grid nothing is set: that is the
+ * component of run 0. rows : (high + 1,), filled with the first run of each row. runs : up to wide + 3 a row. */
+INLINE void join_runs(const u8 *grid, i64 high, i64 wide, Run *runs, i64 *rows)
+{
+    i64 count = 0;
+    rows[0] = 0;
+    for (i64 y = 0; y < high; y++) {
+        const u8 *row = grid + y * wide;
+        i64 x = -1, above = y > 0 ? rows[y - 1] : 0;
+        for (u8 set = 0; x <= wide; set = !set) {
+            const i64 from = MAX(x, 0);
+            const u8 *next = from < wide ? memchr(row + from, !set, wide - from) : NULL;
+            const i64 end = next ? next - row : set ? wide : wide + 1;
+            runs[count] = (Run){(i32)x, (i32)end, (i32)count, 0};
+            if (!set && (x < 0 || end > wide || y == 0 || y == high - 1))
+                unite(runs, count, 0);
+            for (i64 k = above + (set ? 1 : 0); y > 0 && k < rows[y]; k += 2)
+                if (runs[k].first < end + set && runs[k].end > x - set)
+                    unite(runs, count, k);
+            count++;
+            x = end;
+        }
+        rows[y + 1] = count;
+    }
+}
+
 /* ---- picture: geometry/downsample.py, contact/background_kernels.py, change/rest.py ------------------------ */
 
 /* Means of 2 x 2 px, rounded, of two rows of 2 `count` interleaved BGR px. sums : scratch, 6 count. means : scratch,
@@ -247,40 +303,51 @@ LOOP find_excess(const Arg *a, double *out)
 
 #define SATURATION_GREY 255.0f
 
+/* Position of a pixel along a line, as `positions`. */
+INLINE float position(i64 pixel, i64 count)
+{
+    return (float)((double)pixel / (double)MAX(count - 1, 1) - 0.5);
+}
+
 LOOP weigh_change(const Arg *a, double *out)
 {
-    const float *smooth = a[0].data, *coefficients = a[1].data, *restrict across = a[2].data, *down = a[3].data;
-    const float *mean = a[4].data, *weight = a[5].data, *brightness = a[6].data, *factor = a[7].data;
-    const u8 *before = a[8].data;
-    const float *evidence_before = a[9].data;
-    float *squared = a[10].data, *colour = a[11].data, *evidence = a[12].data;
-    const i64 high = a[10].shape[0], wide = a[10].shape[1], size = high * wide;
-    const int compares = a[8].shape[0] * a[8].shape[1] > 0;
-    float *restrict along = malloc(wide * sizeof(float));
+    const float *cells = a[0].data, *coefficients = a[1].data, *untouched = a[2].data, *before = a[3].data;
+    float *change = a[4].data, *squared = a[5].data;
+    const i64 high = a[0].shape[1], wide = a[0].shape[2], size = high * wide;
+    const float *mean = untouched, *weight = mean + 3 * size, *brightness = weight + 3 * size;
+    const float *factor = brightness + size, *scale = factor + size;
+    float *colour = squared + size, *evidence = colour + size;
+    float *restrict along = malloc(2 * wide * sizeof(float)), *restrict across = along + wide;
     double now = 0, was = 0;
     float most = -INFINITY, most_colour = -INFINITY;
     if (!along)
         return OUT_OF_MEMORY;
+    for (i64 x = 0; x < wide; x++)
+        across[x] = position(x, wide);
     for (i64 y = 0; y < high; y++) {
         float *restrict total = squared + y * wide, *restrict rest = colour + y * wide;
         float *restrict both = evidence + y * wide;
+        const float *restrict unit = scale + y * wide;
         for (int c = 0; c < 3; c++) {
             const float *f = coefficients + 4 * c;
-            const float gain = f[0] + f[2] * down[y], slope = f[1], offset = f[3];
-            const float *restrict line = smooth + c * size + y * wide, *restrict usual = mean + c * size + y * wide;
-            const float *restrict scale = weight + c * size + y * wide;
+            const float gain = f[0] + f[2] * position(y, high), slope = f[1], offset = f[3];
+            const float *restrict line = cells + c * size + y * wide, *restrict usual = mean + c * size + y * wide;
+            const float *restrict part = weight + c * size + y * wide;
+            float *restrict signed_ = change + c * size + y * wide;
             if (c == 0)
                 for (i64 x = 0; x < wide; x++)
                     total[x] = along[x] = 0;
             for (i64 x = 0; x < wide; x++) {
                 const float light = usual[x] * (gain + slope * across[x]) + offset;
-                const float change = line[x] - usual[x] - light, least = line[x] - SATURATION_GREY;
-                const float deviation = (change > least ? change : least) * scale[x];
+                const float more = line[x] - usual[x] - light, least = line[x] - SATURATION_GREY;
+                const float shift = more > least ? more : least, deviation = shift * part[x];
+                signed_[x] = shift * unit[x];
                 total[x] += deviation * deviation;
-                along[x] += deviation * scale[x] * usual[x];
+                along[x] += deviation * part[x] * usual[x];
             }
         }
         const float *restrict bright = brightness + y * wide, *restrict counts = factor + y * wide;
+        const float *restrict last = before + y * wide;
         float row_most = -INFINITY, row_colour = -INFINITY;
         for (i64 x = 0; x < wide; x++) {
             rest[x] = (total[x] - along[x] * along[x] * bright[x]) * counts[x];
@@ -290,12 +357,11 @@ LOOP weigh_change(const Arg *a, double *out)
         }
         most = MAX(most, row_most);
         most_colour = MAX(most_colour, row_colour);
-        if (compares)
-            for (i64 x = 0; x < wide; x++)
-                if (before[y * wide + x]) {
-                    now += both[x];
-                    was += evidence_before[y * wide + x];
-                }
+        for (i64 x = 0; x < wide; x++)
+            if (last[x] > 0) {
+                now += both[x];
+                was += last[x];
+            }
     }
     free(along);
     out[0] = most;
@@ -305,44 +371,318 @@ LOOP weigh_change(const Arg *a, double *out)
     return 0;
 }
 
-LOOP scaled_change(const Arg *a, double *out)
+LOOP window_change(const Arg *a, double *out)
 {
-    const u8 *picture = a[0].data;
-    const i64 top = a[1].whole, left = a[2].whole, stride = a[0].shape[1], high = a[8].shape[0], wide = a[8].shape[1];
-    const float *coefficients = a[3].data, *across = a[4].data, *down = a[5].data, *mean = a[6].data, *scale = a[7].data;
-    const float beside = (float)a[9].number, center = 1 - 2 * beside;
-    float *change = a[8].data;
-    float *gain = malloc((4 * wide + 16) * sizeof(float));
+    const u8 *picture = a[0].data, *inside = a[5].data;
+    const i64 top = a[1].whole, left = a[2].whole, stride = a[0].shape[1], high = a[7].shape[1], wide = a[7].shape[2];
+    const i64 count = a[6].shape[0];
+    const float *coefficients = a[3].data, *untouched = a[4].data, *mixtures = a[6].data;
+    const float beside = (float)a[8].number, center = 1 - 2 * beside;
+    float *shown = a[7].data;
+    float *gain = malloc((12 * wide + 3 * count * wide + wide + 2) * sizeof(float));
     (void)out;
     if (!gain)
         return OUT_OF_MEMORY;
-    /* Gain in the middle row, its slope along y, offset; and a line with one more pixel on either side. */
-    float *restrict slope = gain + wide, *restrict offset = slope + wide, *restrict line = offset + wide;
-    for (i64 i = 0; i < wide; i++) {
+    /* Gain in the middle row, its slope along y, offset; a line; and three lines of each mixture, smoothed. */
+    float *restrict slope = gain + 3 * wide, *restrict offset = slope + 3 * wide, *restrict line = offset + 3 * wide;
+    float *restrict mixed = line + 3 * wide + 1, *ring = mixed + wide + 1;
+    for (i64 i = 0; i < 3 * wide; i++) {
         const float *f = coefficients + 4 * (i % 3);
-        gain[i] = f[0] + f[1] * across[left + i / 3];
+        gain[i] = f[0] + f[1] * position(left + i / 3, stride / 3);
         slope[i] = f[2];
         offset[i] = f[3];
     }
-    for (i64 y = 0; y < high; y++) {
-        const i64 first = (top + y) * stride + 3 * left;
-        const u8 *restrict values = picture + first;
-        const float *restrict usual = mean + first, *restrict unit = scale + first;
-        const float place = down[top + y];
-        float *restrict smooth = change + y * wide;
-        for (i64 i = 0; i < wide; i++) {
-            const float value = values[i], light = usual[i] * (gain[i] + slope[i] * place) + offset[i];
-            const float more = value - usual[i] - light, least = value - SATURATION_GREY;
-            line[i + 3] = (more > least ? more : least) * unit[i];
+    for (i64 row = 0; row <= high; row++) {
+        if (row < high) {
+            const i64 first = (top + row) * stride + 3 * left;
+            const u8 *restrict values = picture + first;
+            const float *restrict usual = untouched + first, *restrict unit = usual + a[0].shape[0] * stride;
+            const float place = position(top + row, a[0].shape[0]);
+            for (i64 i = 0; i < 3 * wide; i++) {
+                const float value = values[i], light = usual[i] * (gain[i] + slope[i] * place) + offset[i];
+                const float more = value - usual[i] - light, least = value - SATURATION_GREY;
+                line[i] = (more > least ? more : least) * unit[i];
+            }
+            for (i64 k = 0; k < count; k++) {
+                const float *m = mixtures + 3 * k, m0 = m[0], m1 = m[1], m2 = m[2];
+                float *restrict smooth = ring + (3 * k + row % 3) * wide;
+                for (i64 x = 0; x < wide; x++)
+                    mixed[x] = m0 * line[3 * x] + m1 * line[3 * x + 1] + m2 * line[3 * x + 2];
+                mixed[-1] = mixed[BEFORE(0, wide)];
+                mixed[wide] = mixed[AFTER(wide - 1, wide)];
+                for (i64 x = 0; x < wide; x++)
+                    smooth[x] = (mixed[x - 1] + mixed[x + 1]) * beside + mixed[x] * center;
+            }
         }
-        for (int c = 0; c < 3; c++) {
-            line[c] = line[3 * MIN(2, wide / 3) + c];
-            line[wide + 3 + c] = line[MAX(wide - 3, 3) + c];
+        for (i64 k = 0, y = row - 1; k < count && y >= 0; k++) {
+            const float *restrict above = ring + (3 * k + BEFORE(y, high) % 3) * wide;
+            const float *restrict here = ring + (3 * k + y % 3) * wide;
+            const float *restrict below = ring + (3 * k + AFTER(y, high) % 3) * wide;
+            const u8 *counts = inside + y / 2 * (wide / 2);
+            float *restrict into = shown + (k * high + y) * wide;
+            for (i64 x = 0; x < wide; x++)
+                into[x] = (above[x] + below[x]) * beside + here[x] * center;
+            for (i64 x = 0; x < wide / 2; x++)
+                if (!counts[x])
+                    into[2 * x] = into[2 * x + 1] = 0;
         }
-        for (i64 i = 0; i < wide; i++)
-            smooth[i] = (line[i] + line[i + 6]) * beside + line[i + 3] * center;
     }
     free(gain);
+    return 0;
+}
+
+/* ---- contact/components.py --------------------------------------------------------------------------------- */
+
+LOOP contact_cells(const Arg *a, double *out)
+{
+    const float *squared = a[0].data, weak = (float)a[1].number, start = (float)a[2].number;
+    const float stay = (float)a[3].number;
+    const u8 *before = a[4].data;
+    u8 *found = a[6].data;
+    const i64 least = a[5].whole, high = a[0].shape[0], wide = a[0].shape[1], stride = wide + 2;
+    u8 *changed = calloc(2 * (high + 2), stride), *wider = changed + (high + 2) * stride;
+    Run *runs = malloc(high * (wide + 3) * sizeof(Run));
+    i64 *rows = malloc((high + 1) * sizeof(i64)), *cells = calloc(high * (wide + 3), sizeof(i64));
+    u8 *peaks = calloc(high * (wide + 3), 1);
+    int result = OUT_OF_MEMORY;
+    if (!changed || !runs || !rows || !cells || !peaks)
+        goto done;
+    result = 0;
+    for (i64 y = 0; y < high; y++)
+        for (i64 x = 0; x < wide; x++)
+            changed[(y + 1) * stride + x + 1] = squared[y * wide + x] > weak;
+    /* Closing: what lies outside of the picture changes nothing. */
+    memset(wider, 1, (high + 2) * stride);
+    for (i64 y = 1; y <= high; y++)
+        for (i64 x = 1; x <= wide; x++)
+            wider[y * stride + x] = AROUND(changed + y * stride + x, stride, |);
+    for (i64 y = 0; y < high; y++)
+        for (i64 x = 0; x < wide; x++)
+            found[y * wide + x] = AROUND(wider + (y + 1) * stride + x + 1, stride, &);
+    join_runs(found, high, wide, runs, rows);
+    for (i64 y = 0; y < high; y++)
+        for (i64 run = rows[y] + 1; run < rows[y + 1]; run += 2) {
+            const i64 root = root_of_run(runs, run);
+            cells[root] += runs[run].end - runs[run].first;
+            for (i64 i = y * wide + runs[run].first; i < y * wide + runs[run].end; i++)
+                peaks[root] |= (squared[i] >= start) | (squared[i] >= stay) << 1 | before[i] << 2;
+        }
+    for (i64 y = 0; y < high; y++)
+        for (i64 run = rows[y] + 1; run < rows[y + 1]; run += 2) {
+            const i64 root = root_of_run(runs, run), length = runs[run].end - runs[run].first;
+            const int touched = cells[root] >= least && (peaks[root] & 1 || (peaks[root] & 6) == 6);
+            memset(found + y * wide + runs[run].first, touched, length);
+            out[0] += (double)(touched * length);
+        }
+done:
+    free(changed);
+    free(rows);
+    free(cells);
+    free(peaks);
+    free(runs);
+    return result;
+}
+
+/* ---- contact/contact_outline.py ---------------------------------------------------------------------------- */
+
+/* Sums of three neighbours in each row. */
+INLINE void sum_neighbours(const float *restrict values, i64 high, i64 wide, float *restrict sums)
+{
+    for (i64 y = 0; y < high; y++, values += wide, sums += wide) {
+        for (i64 x = 1; x < wide - 1; x++)
+            sums[x] = values[x - 1] + values[x] + values[x + 1];
+        sums[0] = values[0] + 2 * values[MIN(1, wide - 1)];
+        sums[wide - 1] = values[wide - 1] + 2 * values[MAX(wide - 2, 0)];
+    }
+}
+
+LOOP smooth_range(const Arg *a, double *out)
+{
+    const i64 high = a[0].shape[0], wide = a[0].shape[1];
+    float *sums = malloc(high * wide * sizeof(float)), most = -INFINITY, least = INFINITY;
+    if (!sums)
+        return OUT_OF_MEMORY;
+    sum_neighbours(a[0].data, high, wide, sums);
+    for (i64 y = 0; y < high; y++) {
+        const float *restrict here = sums + y * wide, *restrict above = sums + BEFORE(y, high) * wide;
+        const float *restrict below = sums + AFTER(y, high) * wide;
+        for (i64 x = 0; x < wide; x++) {
+            const float sum = above[x] + here[x] + below[x];
+            most = MAX(most, sum);
+            least = MIN(least, sum);
+        }
+    }
+    free(sums);
+    out[0] = least / 9;
+    out[1] = most / 9;
+    return 0;
+}
+
+/* Double the length of a line by linear interpolation. */
+INLINE void double_line(const float *restrict line, i64 count, float *restrict out)
+{
+    out[0] = line[0];
+    for (i64 x = 0; x < count - 1; x++) {
+        out[2 * x + 1] = 0.75f * line[x] + 0.25f * line[x + 1];
+        out[2 * x + 2] = 0.25f * line[x] + 0.75f * line[x + 1];
+    }
+    out[2 * count - 1] = line[count - 1];
+}
+
+LOOP largest_nearby(const Arg *a, double *out)
+{
+    const float *values = a[0].data;
+    float *nearby = a[2].data;
+    const double share = a[1].number;
+    const i64 high = a[0].shape[0], wide = a[0].shape[1], rows = high / 2, columns = wide / 2;
+    float *sums = malloc((high * wide + rows * columns) * sizeof(float)), *coarse = sums + high * wide, peak = 0;
+    (void)out;
+    if (!sums)
+        return OUT_OF_MEMORY;
+    sum_neighbours(values, high, wide, sums);
+    for (i64 row = 0; row < rows; row++) {
+        const float *restrict first = sums + BEFORE(2 * row, high) * wide, *restrict second = sums + 2 * row * wide;
+        const float *restrict third = second + wide, *restrict fourth = sums + AFTER(2 * row + 1, high) * wide;
+        float *restrict mean = coarse + row * columns;
+        for (i64 x = 0; x < columns; x++) {
+            float sum = 0;
+            for (int k = 0; k < 2; k++) {
+                const float both = second[2 * x + k] + third[2 * x + k];
+                const float upper = first[2 * x + k] + both, lower = both + fourth[2 * x + k];
+                peak = MAX(peak, MAX(upper, lower));
+                sum += upper + lower;
+            }
+            mean[x] = sum / 36;
+        }
+    }
+    peak = (float)MAX(peak / 9, 1e-9);
+    const float clear = (float)(share * peak), least = 1e-3f * peak;
+    i64 changed = 0;
+    for (i64 i = 0; i < high * wide; i++)
+        changed += values[i] > clear;
+    /* Largest, and the mean of that, over squares; what lies outside is 0. */
+    const i64 reach = (i64)rint(sqrt((double)changed / 3.141592653589793) / 2), side = 2 * reach + 1;
+    const i64 padded = columns + 2 * reach, lines = rows + 2 * reach;
+    float *line = calloc(padded + 2 * reach + rows * padded + lines * (padded + columns) + 2 * columns, sizeof(float));
+    if (!line) {
+        free(sums);
+        return OUT_OF_MEMORY;
+    }
+    float *across = line + padded + 2 * reach, *largest = across + rows * padded, *summed = largest + lines * padded;
+    float *mean = summed + lines * columns, *between = mean + columns;
+    for (i64 y = 0; y < rows; y++) {
+        float *restrict into = across + y * padded;
+        memcpy(line + 2 * reach, coarse + y * columns, columns * sizeof(float));
+        for (i64 k = 0; k < side; k++)
+            for (i64 x = 0; x < padded; x++)
+                into[x] = MAX(into[x], line[x + k]);
+    }
+    for (i64 y = 0; y < lines; y++) {
+        float *restrict into = largest + y * padded, *restrict sum = summed + y * columns;
+        for (i64 from = MAX(y - 2 * reach, 0); from < MIN(y + 1, rows); from++)
+            for (i64 x = 0; x < padded; x++)
+                into[x] = MAX(into[x], across[from * padded + x]);
+        for (i64 k = 0; k < side; k++)
+            for (i64 x = 0; x < columns; x++)
+                sum[x] += into[x + k];
+    }
+    const float weight = 1 / (float)(side * side);
+    for (i64 y = 0; y < rows; y++) {
+        float *restrict into = coarse + y * columns;
+        memset(mean, 0, columns * sizeof(float));
+        for (i64 k = 0; k < side; k++)
+            for (i64 x = 0; x < columns; x++)
+                mean[x] += summed[(y + k) * columns + x];
+        for (i64 x = 0; x < columns; x++)
+            into[x] = MAX(mean[x] * weight, least);
+    }
+    for (i64 y = 0; y < high; y++) {
+        const float *restrict near = coarse + y / 2 * columns;
+        const float *restrict far = coarse + MIN(MAX(y / 2 + (y % 2 ? 1 : -1), 0), rows - 1) * columns;
+        for (i64 x = 0; x < columns; x++)
+            between[x] = 0.75f * near[x] + 0.25f * far[x];
+        double_line(between, columns, nearby + y * wide);
+    }
+    free(line);
+    free(sums);
+    return 0;
+}
+
+LOOP outline_level(const Arg *a, double *out)
+{
+    const float *values = a[0].data, fraction = (float)a[1].number;
+    const u8 *core = a[2].data;
+    float *level = a[3].data;
+    const i64 high = a[0].shape[0], wide = a[0].shape[1], columns = a[2].shape[1], side = wide / MAX(columns, 1);
+    u8 *inside = malloc(high * wide);
+    Run *runs = malloc(high * (wide + 3) * sizeof(Run));
+    i64 *rows = malloc((high + 1) * sizeof(i64));
+    (void)out;
+    if (!inside || !runs || !rows) {
+        free(inside);
+        free(runs);
+        free(rows);
+        return OUT_OF_MEMORY;
+    }
+    for (i64 y = 0; y < high; y++) {
+        u8 *restrict row = inside + y * wide;
+        for (i64 x = 0; x < wide; x++)
+            row[x] = values[y * wide + x] - fraction > 0;
+        for (i64 column = 0; column < columns; column++)
+            if (core[y / side * columns + column])
+                memset(row + column * side, 1, side);
+    }
+    join_runs(inside, high, wide, runs, rows);
+    /* Holes belong to what is around them. */
+    for (i64 y = 0; y < high; y++)
+        for (i64 run = rows[y]; run < rows[y + 1]; run += 2)
+            if (root_of_run(runs, run) != 0) {
+                unite(runs, run, run - 1);
+                unite(runs, run, run + 1);
+            }
+    for (i64 y = 0; y < high; y++)
+        for (i64 run = rows[y] + 1; run < rows[y + 1]; run += 2)
+            for (i64 column = runs[run].first / side; column <= (runs[run].end - 1) / side; column++)
+                runs[root_of_run(runs, run)].found |= core[y / side * columns + column];
+    for (i64 y = 0; y < high; y++)
+        for (i64 run = rows[y]; run < rows[y + 1]; run++) {
+            const i64 root = root_of_run(runs, run);
+            if (root != 0)
+                memset(inside + y * wide + runs[run].first, runs[root].found, runs[run].end - runs[run].first);
+        }
+    for (i64 i = 0; i < high * wide; i++) {
+        const float more = values[i] - fraction;
+        /* Pixels that are filled in or removed get the extreme values of the level. */
+        const float clipped = MIN(MAX(more, -0.5f), 0.5f);
+        level[i] = (more > 0) == inside[i] ? clipped : (float)inside[i] - 0.5f;
+    }
+    free(inside);
+    free(runs);
+    free(rows);
+    return 0;
+}
+
+LOOP draw_level(const Arg *a, double *out)
+{
+    const float *level = a[0].data;
+    const i64 top = a[1].whole, left = a[2].whole, high = a[0].shape[0], wide = a[0].shape[1], stride = a[3].shape[1];
+    const i64 count = MIN(2 * wide, stride - left);
+    u8 *mask = a[3].data;
+    float *line = malloc(3 * wide * sizeof(float)), *pixels = line + wide;
+    (void)out;
+    if (!line)
+        return OUT_OF_MEMORY;
+    for (i64 y = 0; y < MIN(2 * high, a[3].shape[0] - top); y++) {
+        const float *restrict near = level + y / 2 * wide;
+        const float *restrict far = level + MIN(MAX(y / 2 + (y % 2 ? 1 : -1), 0), high - 1) * wide;
+        u8 *restrict into = mask + (top + y) * stride + left;
+        for (i64 x = 0; x < wide; x++)
+            line[x] = 0.75f * near[x] + 0.25f * far[x];
+        double_line(line, wide, pixels);
+        for (i64 x = 0; x < count; x++)
+            into[x] |= pixels[x] > 0 ? 255 : 0;
+    }
+    free(line);
     return 0;
 }
 
@@ -354,19 +694,21 @@ static int ascending(const void *one, const void *other)
     return (a > b) - (a < b);
 }
 
-LOOP compare_blocks(const Arg *a, double *out)
+LOOP fit_light(const Arg *a, double *out)
 {
-    const float *cells = a[0].data, *row_weights = a[1].data, *column_weights = a[2].data, *reference = a[3].data;
-    const float *per_brightness = a[4].data, *usual_limit = a[5].data;
-    float *excess = a[6].data, *limit = a[7].data, *coefficients = a[8].data;
-    const i64 high = a[0].shape[1], wide = a[0].shape[2], down = a[1].shape[0], across = a[2].shape[0];
-    const i64 blocks = down * across;
-    const float saturated = (float)a[9].number;
-    float *restrict line = malloc((wide + blocks) * sizeof(float));
+    const float *cells = a[0].data, *row_weights = a[1].data, *column_weights = a[2].data, *blocks = a[3].data;
+    const float *basis = a[4].data, *step = a[5].data, *shrink = a[6].data, *center = a[7].data;
+    float *coefficients = a[8].data;
+    const i64 high = a[0].shape[1], wide = a[0].shape[2], down = a[1].shape[0], across = a[2].shape[0], n = down * across;
+    const i64 most_steps = a[10].whole;
+    const float saturated = (float)a[9].number, least_step = (float)a[11].number;
+    const float rejections[2] = {INFINITY, (float)a[12].number};
+    const float *reference = blocks, *per_brightness = blocks + 3 * n, *usual_limit = blocks + 6 * n;
+    float *restrict line = malloc((wide + 7 * n) * sizeof(float));
     (void)out;
     if (!line)
         return OUT_OF_MEMORY;
-    float *ratios = line + wide;
+    float *ratios = line + wide, *excess = ratios + n, *limit = excess + 3 * n;
     for (int c = 0; c < 3; c++) {
         i64 count = 0;
         float most = 0;
@@ -380,7 +722,7 @@ LOOP compare_blocks(const Arg *a, double *out)
                     line[x] += part * values[x];
             }
             for (i64 column = 0; column < across; column++) {
-                const i64 at = c * blocks + row * across + column;
+                const i64 at = c * n + row * across + column;
                 float mean = 0;
                 for (i64 x = column * wide / across; x < ((column + 1) * wide + across - 1) / across; x++)
                     mean += line[x] * column_weights[column * wide + x];
@@ -399,18 +741,6 @@ LOOP compare_blocks(const Arg *a, double *out)
         }
         coefficients[4 * c] = most;
     }
-    free(line);
-    return 0;
-}
-
-LOOP fit_robustly(const Arg *a, double *out)
-{
-    const float *excess = a[0].data, *basis = a[1].data, *step = a[2].data, *shrink = a[3].data, *limit = a[4].data;
-    const float *center = a[5].data;
-    float *coefficients = a[6].data;
-    const i64 n = a[0].shape[1], most_steps = a[7].whole;
-    const float least_step = (float)a[8].number, rejections[2] = {INFINITY, (float)a[9].number};
-    (void)out;
     for (int pass = 0; pass < 2; pass++)
         for (i64 turn = 0; turn < most_steps; turn++) {
             float longest = 0;
@@ -447,6 +777,7 @@ LOOP fit_robustly(const Arg *a, double *out)
     for (int c = 0; c < 3; c++)
         for (int k = 0; k < 3; k++)
             coefficients[4 * c + k] /= center[c];
+    free(line);
     return 0;
 }
 
@@ -1394,10 +1725,14 @@ static const Loop LOOPS[] = {
     {"smooth_cells", "B2 f3!", '-', smooth_cells},
     {"sum_tiles", "B2 n q1 h3 q3 f3 f3! f3!", '-', sum_tiles},
     {"find_excess", "f2 f2 x f3 f3 f3", '2', find_excess},
-    {"weigh_change", "f3 f2 f1 f1 f3 f3 f2 f2 B2 f2 f2! f2! f2!", '4', weigh_change},
-    {"scaled_change", "B2 n n f2 f1 f1 f2 f2 f2! x", '-', scaled_change},
-    {"compare_blocks", "f3 f2 f2 f2 f2 f2 f2! f2! f2! x", '-', compare_blocks},
-    {"fit_robustly", "f2 f3 f3 f3 f2 f1 f2! n x x", '-', fit_robustly},
+    {"weigh_change", "f3 f2 f3 f2 f3! f3!", '4', weigh_change},
+    {"window_change", "B2 n n f2 f3 ?2 f2 f3! x", '-', window_change},
+    {"contact_cells", "f2 x x x ?2 n ?2!", 'n', contact_cells},
+    {"smooth_range", "f2", '2', smooth_range},
+    {"largest_nearby", "f2 x f2!", '-', largest_nearby},
+    {"outline_level", "f2 x B2 f2!", '-', outline_level},
+    {"draw_level", "f2 n n B2!", '-', draw_level},
+    {"fit_light", "f3 f2 f2 f3 f3 f3 f3 f1 f2! x n x x", '-', fit_light},
     {"grow_level_lines", "f2 B2 f1 n i2! f1! i2!", 'n', grow_level_lines},
     {"cover_spots", "B3 n n B2!", '-', cover_spots},
     {"fill_masked", "B2! B2 B2 q1 q1 n x x x", '-', fill_masked},

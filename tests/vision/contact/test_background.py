@@ -21,6 +21,9 @@ Image = NDArray[np.uint8]
 SIZES = st.tuples(st.integers(1, 70), st.integers(1, 70))
 """Heights and widths: also of less than a cell, and of no whole number of cells."""
 
+CHANNELS = np.eye(3, dtype=np.float32)
+"""Mixtures that are the channels themselves."""
+
 
 def _with_numpy() -> Any:
     """A context in which loops run in NumPy."""
@@ -47,8 +50,8 @@ def _compared(frames: list[Image]) -> tuple[BackgroundModel, list[Change]]:
     model = BackgroundModel(frames[0], 0.025, 0.01, 1.0)
     changes: list[Change] = []
     for frame in frames:
-        before = changes[-1].evidence > 10 if changes else None
-        changes.append(model.compare(frame, before, changes[-1].evidence if changes else None))
+        evidence = changes[-1].deviations[2] if changes else None
+        changes.append(model.compare(frame, None if evidence is None else evidence * (evidence > 10)))
     return model, changes
 
 
@@ -73,15 +76,14 @@ def test_the_loops_see_the_change_that_the_plain_version_sees(size: tuple[int, i
         assert np.array_equal(one.half, other.half)
         # The fit stops within 0.05 of a step, wherever that is: rounding may decide which step is the last.
         lights = [
-            under_illumination(np.full((3, *one.squared.shape), 100, np.float32), c.illumination)
+            under_illumination(np.full(one.cells.shape, 100, np.float32), c.illumination)
             for c in (one, other)
         ]
         np.testing.assert_allclose(*lights, atol=0.05)
         if np.abs(lights[0] - lights[1]).max() < 1e-3:
             # A light that differs by so much moves a deviation by 1e-3 / 0.29 grey levels, the least noise.
             least = 1e-3 / (12**-0.5 * 2 / 3)
-            for name in ("squared", "colour", "evidence"):
-                found, wanted = getattr(one, name), getattr(other, name)
+            for found, wanted in zip(one.deviations, other.deviations, strict=True):
                 slack = 2 * least * np.sqrt(np.abs(wanted).max()) + least**2
                 np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=slack)
             assert one.largest == pytest.approx(other.largest, rel=1e-2, abs=1e-2)
@@ -95,11 +97,12 @@ def test_the_loops_find_a_window_as_changed_as_the_plain_version(
     size: tuple[int, int], seed: int, data: st.DataObject
 ) -> None:
     model, changes = _compared(_pictures(size, seed, 2))
-    high, wide = changes[1].squared.shape
+    high, wide = changes[1].cells.shape[1:]
     top, left = data.draw(st.integers(0, high - 1)), data.draw(st.integers(0, wide - 1))
     bottom, right = data.draw(st.integers(top + 1, high)), data.draw(st.integers(left + 1, wide))
     inside = np.random.default_rng(seed).random((bottom - top, right - left)) < 0.8
-    window = slice(top, bottom), slice(left, right), inside
+    mixtures = data.draw(st.sampled_from([CHANNELS, CHANNELS[:2] - 0.3, CHANNELS[:1] + 0.5]))
+    window = slice(top, bottom), slice(left, right), inside, mixtures
     fast = model.window_change(changes[1], *window)
     oracles = _with_numpy()
     try:
@@ -204,12 +207,12 @@ def test_the_first_contact_waits_for_nothing_that_the_untouched_gel_could_tell(
     pressed = gel.copy()
     pressed[20:40, 20:40] = 160
     model = BackgroundModel(gel, repeatability=0.025, tint=0.01, shift=1.0)
-    model.compare(gel, None, None)
+    model.compare(gel, None)
     monkeypatch.delattr(background, "_steepness")
-    change = model.compare(pressed, None, None)
-    window = model.window_change(change, slice(0, 16), slice(0, 12), np.ones((16, 12), np.bool_))
+    change = model.compare(pressed, None)
+    window = model.window_change(change, slice(0, 16), slice(0, 12), np.ones((16, 12), np.bool_), CHANNELS)
     # Measured: 20 against 3.6, what is left of the gain that is taken out.
-    assert np.abs(window[15, 15]).min() > 4 * np.abs(window[2, 2]).max()
+    assert np.abs(window[:, 15, 15]).min() > 4 * np.abs(window[:, 2, 2]).max()
 
 
 def test_blotches_wider_than_a_cell_are_no_noise_to_an_outline() -> None:
@@ -222,8 +225,10 @@ def test_blotches_wider_than_a_cell_are_no_noise_to_an_outline() -> None:
         pressed = gel.copy()
         pressed[60:100, 60:100] += [40, 0, -40]
         model = BackgroundModel(gel.astype(np.uint8), repeatability=0.025, tint=0.01, shift=0.0)
-        change = model.compare(pressed.astype(np.uint8), None, None)
-        window = model.window_change(change, slice(0, 40), slice(0, 40), np.ones((40, 40), np.bool_))
-        strengths.append(float(np.linalg.norm(window, axis=2)[34:46, 34:46].mean()))
+        change = model.compare(pressed.astype(np.uint8), None)
+        window = model.window_change(
+            change, slice(0, 40), slice(0, 40), np.ones((40, 40), np.bool_), CHANNELS
+        )
+        strengths.append(float(np.linalg.norm(window, axis=0)[34:46, 34:46].mean()))
     # Measured: 18.4 and 17.5; 7.8 on blotches with the noise by which it is told whether anything touches.
     assert strengths[1] > 0.8 * strengths[0]

@@ -23,7 +23,6 @@ from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.background import Derived
 from tactflow.vision.contact.background_kernels import weigh_change
 from tactflow.vision.contact.components import WIDE_DEVIATION
-from tactflow.vision.contact.illumination import positions
 
 LONG_SIDE_TILES: Final = 24
 """Tiles along the longer side of a frame: a contact of 4 % of its width fills one. A smaller spot without
@@ -243,18 +242,15 @@ class _LightTest:
         slopes = [_slopes(plane) for plane in untouched]
         steady = TILE_NOISE_GREY**2 + GEL_MOVEMENT_TILES**2 * np.square(slopes).sum(axis=1)
         self._known = Derived.of(untouched, steady, repeatability, tint)
-        _, high, wide = untouched.shape
-        self._model = (
-            *(positions(wide), positions(high), self._known.mean, self._known.weight),
-            *(self._known.brightness, self._known.colour_factor),
-            *(np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)),
-        )
-        self._planes = np.empty_like(untouched)
+        self._before = np.zeros_like(untouched[0])
+        self._change, self._deviations = np.empty((2, *untouched.shape), np.float32)
 
     def departure(self, light: Floats32) -> Floats32:
         """Deviation (rows, columns) float32 of the light of a frame, (3, rows, columns), in thresholds."""
-        weigh_change(light, self._known.illumination.fit(light), *self._model, *self._planes)
-        return np.asarray(np.sqrt(self._planes[2] / np.float32(WIDE_DEVIATION)), np.float32)
+        illumination, untouched = self._known
+        coefficients = illumination.fit(light)
+        weigh_change(light, coefficients, untouched, self._before, self._change, self._deviations)
+        return np.asarray(np.sqrt(self._deviations[2] / np.float32(WIDE_DEVIATION)), np.float32)
 
 
 def _slopes(plane: Floats32) -> Floats32:

@@ -7,22 +7,20 @@ Frames are compared as means over cells of 4 x 4 px, lightly smoothed; to outlin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED_GREY, Floats32
+from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED_GREY, Flags, Floats32
 from tactflow.vision.contact.background_kernels import (
-    CENTER_WEIGHT,
     NEIGHBOUR_WEIGHT,
-    scaled_change,
     smooth_cells,
     weigh_change,
+    window_change,
 )
-from tactflow.vision.contact.illumination import IlluminationModel, positions, under_illumination
+from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
 
@@ -40,10 +38,6 @@ neighbouring pixels. Chosen by hand."""
 MIN_CELL_VALID_MEAN: Final = 128
 """Minimum mean of the valid area, 0 to 255, over a cell that counts: half of the cell."""
 
-_NO_CELLS: Final = np.zeros((0, 0), np.bool_)
-_NO_EVIDENCE: Final = np.zeros((0, 0), np.float32)
-"""Arguments of `weigh_change` without contact in the previous frame."""
-
 
 class Change(NamedTuple):
     """How a frame differs from the background.
@@ -51,61 +45,40 @@ class Change(NamedTuple):
     Attributes
     ----------
     half : (2h, 2w, 3) uint8, the frame at half resolution.
-    cells : (3, h, w) float32, grey levels.
     illumination : (3, 4) float32, coefficients of `IlluminationModel.fit`.
-    squared : (h, w) float32, squared deviation of each cell, chi-square with three degrees of freedom where
-        nothing touches.
-    colour : the same for colour alone, with two degrees of freedom.
-    evidence : the larger of the two.
-    largest, largest_colour : maxima of `squared` and `colour`.
+    cells : (3, h, w) float32, signed change of each cell, in standard deviations that are the same for all
+        channels; 0 where all are saturated, or where there is no gel. The variation of the light is relative
+        to the brightness of the whole picture: relative to its own, a dark channel that a tilt lights up
+        would dominate the others.
+    deviations : (3, h, w) float32, of each cell: the squared deviation, chi-square with three degrees of
+        freedom where nothing touches; the same for colour alone, with two degrees of freedom; and the
+        evidence, the larger of the two.
+    largest, largest_colour : maxima of the first two.
     remaining : ratio of this change to that of the previous frame, over the cells that were in contact
         then; 1 if none was.
     """
 
     half: NDArray[np.uint8]
-    cells: Floats32
     illumination: Floats32
-    squared: Floats32
-    colour: Floats32
-    evidence: Floats32
+    cells: Floats32
+    deviations: Floats32
     largest: float
     largest_colour: float
     remaining: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Untouched:
-    """The untouched gel at half resolution, for outlines; (h, 3 w) float32 each.
+class Derived(NamedTuple):
+    """Quantities derived from the mean and noise of the untouched gel.
 
     Attributes
     ----------
-    mean : grey levels.
-    scale : one over the standard deviation.
-    """
-
-    mean: Floats32
-    scale: Floats32
-
-
-@dataclass(frozen=True, slots=True)
-class Derived:
-    """Quantities derived from the mean and noise of the untouched gel; (3, h, w) float32 of cells.
-
-    Attributes
-    ----------
-    weight : one over the standard deviation.
-    brightness : (h, w), one over the squared length of the weighted mean.
-    colour_factor : (h, w), how much more a change of colour counts than one of brightness.
-    scale : (h, w), one over the standard deviation for `signed_change`; 0 where all channels are saturated,
-        or where there is no gel.
+    planes : (9, h, w) float32, of each cell: its mean and one over its standard deviation, of three channels
+        each; one over the squared length of the weighted mean; how much more a change of colour counts than
+        one of brightness; and the factor of `Change.cells`, one over the standard deviation.
     """
 
     illumination: IlluminationModel
-    mean: Floats32
-    weight: Floats32
-    brightness: Floats32
-    colour_factor: Floats32
-    scale: Floats32
+    planes: Floats32
 
     @classmethod
     def of(
@@ -130,14 +103,8 @@ class Derived:
         scale = scale * (mean.min(axis=0) < SATURATED_GREY)
         if gel is not None:
             weight, scale = weight * gel, scale * gel
-        return cls(
-            illumination=illumination,
-            mean=np.ascontiguousarray(mean, np.float32),
-            weight=np.asarray(weight, np.float32),
-            brightness=np.asarray(1 / length**2, np.float32),
-            colour_factor=np.asarray(factor, np.float32),
-            scale=np.asarray(scale, np.float32),
-        )
+        planes = np.concatenate([mean, weight, [1 / length**2, factor, scale]])
+        return cls(illumination, np.asarray(planes, np.float32))
 
 
 class BackgroundModel:
@@ -159,8 +126,8 @@ class BackgroundModel:
     >>> model = BackgroundModel(gel, repeatability=0.025, tint=0.01, shift=1.0)
     >>> pressed = gel.copy()
     >>> pressed[20:40, 20:40] = 160
-    >>> change = model.compare(pressed, None, None)
-    >>> change.squared.shape, bool(change.squared[7, 7] > 20 * change.squared[0, 0])
+    >>> squared = model.compare(pressed, None).deviations[0]
+    >>> squared.shape, bool(squared[7, 7] > 20 * squared[0, 0])
     ((16, 12), True)
     """
 
@@ -181,7 +148,7 @@ class BackgroundModel:
         self._frames = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
         self._known: Derived | None = None
-        self._untouched: _Untouched | None = None
+        self._untouched: Floats32 | None = None
 
     def add(self, image: NDArray[np.uint8]) -> None:
         """Learn from one more frame of the same size; more frames estimate the noise better."""
@@ -189,7 +156,7 @@ class BackgroundModel:
         half = _halved(image)
         smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
-        change: Floats32 = smooth - under_illumination(known.mean, coefficients)
+        change: Floats32 = smooth - under_illumination(known.planes[:3], coefficients)
         count = self._frames
         self._squares = self._squares + change * change * np.float32(count / (count + 1))
         self._mean = self._mean + change / np.float32(count + 1)
@@ -198,87 +165,42 @@ class BackgroundModel:
         self._known = None
         self._untouched = None
 
-    def compare(
-        self, image: NDArray[np.uint8], before: NDArray[np.bool_] | None, evidence_before: Floats32 | None
-    ) -> Change:
+    def compare(self, image: NDArray[np.uint8], before: Floats32 | None) -> Change:
         """Compare a frame of the same size with the background.
 
-        before : (h, w) bool, cells in contact in the previous frame; None if there were none.
-        evidence_before : (h, w) float32, the previous frame's evidence.
+        before : (h, w) float32, the previous frame's evidence in cells in contact, 0 elsewhere; None if
+            nothing was in contact.
         """
         known = self._derived()
         if self._untouched is None:
             # Computed with the reference, so that the first frame with contact does not wait for it.
             self._untouched = self._compared_with()
-        high, wide = known.colour_factor.shape
         half = _halved(image)
         smooth = _smoothed(half)
         coefficients = known.illumination.fit(smooth)
-        squared, colour, evidence = np.empty((3, high, wide), np.float32)
-        if before is None or evidence_before is None:
-            before, evidence_before = _NO_CELLS, _NO_EVIDENCE
+        if before is None:
+            before = np.zeros(smooth.shape[1:], np.float32)
+        cells, deviations = np.empty((2, *smooth.shape), np.float32)
         largest, largest_colour, now, was = weigh_change(
-            smooth,
-            coefficients,
-            positions(wide),
-            positions(high),
-            known.mean,
-            known.weight,
-            known.brightness,
-            known.colour_factor,
-            before.view(np.uint8),
-            evidence_before,
-            squared,
-            colour,
-            evidence,
+            smooth, coefficients, known.planes, before, cells, deviations
         )
         remaining = math.sqrt(now / was) if was > 0 else 1.0
-        return Change(
-            half, smooth, coefficients, squared, colour, evidence, largest, largest_colour, remaining
-        )
-
-    def signed_change(self, change: Change) -> Floats32:
-        """Signed change of each cell, (3, h, w), in standard deviations that are the same for all channels.
-
-        change : of this frame. The result is 0 where `Derived.scale` is. The variation of the light
-        is relative to the brightness of the whole picture: relative to its own, a dark channel that a tilt
-        lights up would dominate the others.
-        """
-        known = self._derived()
-        expected = under_illumination(known.mean, change.illumination)
-        return np.asarray((change.cells - expected) * known.scale, np.float32)
+        return Change(half, coefficients, cells, deviations, largest, largest_colour, remaining)
 
     def window_change(
-        self, change: Change, rows: slice, columns: slice, inside: NDArray[np.bool_]
+        self, change: Change, rows: slice, columns: slice, inside: Flags, mixtures: Floats32
     ) -> Floats32:
-        """Signed change in a window, (2 h, 2 w, 3) float32, at half resolution, in standard deviations.
+        """Signed change in a window, (k, 2 h, 2 w) float32, at half resolution, in standard deviations.
 
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, the cells of it that
-        count; the result is 0 in the others.
+        count; the result is 0 in the others. mixtures : (k, 3) float32, weights of the channels.
         """
         assert self._untouched is not None
-        high, wide = 2 * inside.shape[0], 2 * inside.shape[1]
-        scaled = np.empty((high, 3 * wide), np.float32)
-        scaled_change(
-            change.half.reshape(len(change.half), -1),
-            2 * rows.start,
-            2 * columns.start,
-            change.illumination,
-            positions(change.half.shape[1]),
-            positions(len(change.half)),
-            self._untouched.mean,
-            self._untouched.scale,
-            scaled,
-            NEIGHBOUR_WEIGHT,
-        )
-        smooth = cv2.sepFilter2D(
-            scaled,
-            cv2.CV_32F,
-            np.ones(1, np.float32),
-            np.array([NEIGHBOUR_WEIGHT, CENTER_WEIGHT, NEIGHBOUR_WEIGHT], np.float32),
-        )
-        smooth *= inside.repeat(2, axis=0).repeat(6, axis=1)
-        return np.asarray(smooth.reshape(high, wide, 3), np.float32)
+        picture = change.half.reshape(len(change.half), -1)
+        shown = np.empty((len(mixtures), 2 * inside.shape[0], 2 * inside.shape[1]), np.float32)
+        window = 2 * rows.start, 2 * columns.start, change.illumination, self._untouched, inside, mixtures
+        window_change(picture, *window, shown, NEIGHBOUR_WEIGHT)
+        return shown
 
     def _derived(self) -> Derived:
         if self._known is not None:
@@ -289,10 +211,10 @@ class BackgroundModel:
         self._known = Derived.of(mean, steady, self._repeatability, self._tint, self._gel)
         return self._known
 
-    def _compared_with(self) -> _Untouched:
-        """The untouched gel at half resolution, for outlines.
+    def _compared_with(self) -> Floats32:
+        """(2, 2 h, 6 w), interleaved: mean of the untouched gel, and one over its standard deviation.
 
-        The variation of the light is relative to the brightness of the whole picture, as in `signed_change`.
+        The variation of the light is relative to the brightness of the whole picture, as in `Change.cells`.
         """
         mean = self._half
         light = self._repeatability * mean.mean()
@@ -300,12 +222,8 @@ class BackgroundModel:
         scale = np.asarray(1 / np.sqrt(variance), np.float32)
         if self._gel is not None:
             scale = scale * self._gel.repeat(2, axis=0).repeat(2, axis=1)
-        return _Untouched(_interleaved(mean), _interleaved(scale))
-
-
-def _interleaved(planes: Floats32) -> Floats32:
-    """(h, 3 w) float32 of (3, h, w)."""
-    return np.ascontiguousarray(planes.transpose(1, 2, 0), np.float32).reshape(planes.shape[1], -1)
+        interleaved = np.ascontiguousarray(np.stack([mean, scale]).transpose(0, 2, 3, 1), np.float32)
+        return interleaved.reshape(2, mean.shape[1], -1)
 
 
 def _planes(picture: NDArray[np.uint8]) -> Floats32:

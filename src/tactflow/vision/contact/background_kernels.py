@@ -7,20 +7,19 @@ Borders are reflected about the last pixel, OpenCV's default.
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from tactflow.vision.arrays import Bytes, Floats32
+from tactflow.vision.arrays import Bytes, Flags, Floats32
 from tactflow.vision.compiled import kernel
-from tactflow.vision.contact.illumination import SATURATION_GREY
+from tactflow.vision.contact.illumination import under_illumination
 
 BLUR_SIGMA_PX: Final = 0.8
 """Standard deviation of the smoothing of changes, pixels of the window. Chosen by hand."""
 _AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA_PX**2))
-CENTER_WEIGHT: Final = 1 / (1 + 2 * _AT_ONE)
 NEIGHBOUR_WEIGHT: Final = _AT_ONE / (1 + 2 * _AT_ONE)
-"""Weights of a pixel and of each of its two neighbours: a Gaussian with that standard deviation."""
+"""Weight of each of the two neighbours of a pixel: a Gaussian with that standard deviation."""
 
 
 @kernel
@@ -40,71 +39,59 @@ def smooth_cells(half: Bytes, smooth: Floats32) -> None:
 
 @kernel
 def weigh_change(
-    smooth: Floats32,
+    cells: Floats32,
     coefficients: Floats32,
-    across: Floats32,
-    down: Floats32,
-    mean: Floats32,
-    weight: Floats32,
-    brightness: Floats32,
-    colour_factor: Floats32,
-    before: Bytes,
-    evidence_before: Floats32,
-    squared: Floats32,
-    colour: Floats32,
-    evidence: Floats32,
+    untouched: Floats32,
+    before: Floats32,
+    change: Floats32,
+    deviations: Floats32,
 ) -> tuple[float, float, float, float]:
-    """Squared deviations of each cell from the background under this frame's illumination.
+    """Deviations of each cell from the background under this frame's illumination.
 
-    Returns the maxima of squared and of colour, and the sums of the evidence over `before` in this frame and
-    in the previous one.
+    Returns the maxima of the squared deviations and of those of colour, and the sums of the evidence over the
+    cells that were in contact in the previous frame, now and then.
 
-    smooth, mean, weight : (3, h, w). brightness, colour_factor : (h, w). coefficients : (3, 4). across,
-    down : positions, (w,) and (h,). before : (h, w), cells in contact in the previous frame, and
-    evidence_before : the evidence there; both (0, 0) if there were none. squared, colour, evidence : (h, w),
-    filled.
+    cells : (3, h, w), grey levels. coefficients : (3, 4), of `IlluminationModel.fit`. untouched : (9, h, w),
+    `Derived.planes`. before : (h, w), the previous frame's evidence in contact, 0 elsewhere.
+    change, deviations : (3, h, w), filled as in `background.Change`.
     """
-    gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
-    light = mean * (gain + slope_y * down[:, None] + slope_x * across) + offset
-    change = np.maximum(smooth - mean - light, smooth - SATURATION_GREY)
-    deviation = change * weight
+    mean, weight, (brightness, colour_factor, scale) = untouched[:3], untouched[3:6], untouched[6:]
+    shift = cells - under_illumination(mean, coefficients)
+    change[:] = shift * scale
+    deviation = shift * weight
+    squared, colour, evidence = deviations
     squared[:] = (deviation * deviation).sum(axis=0)
     along = (deviation * weight * mean).sum(axis=0)
     colour[:] = (squared - along * along * brightness) * colour_factor
     evidence[:] = np.maximum(squared, colour)
-    inside = before != 0 if before.size else np.zeros(squared.shape, np.bool_)
-    was = evidence_before[inside].sum(dtype=np.float64) if before.size else 0.0
-    now = evidence[inside].sum(dtype=np.float64)
+    now, was = (values[before > 0].sum(dtype=np.float64) for values in (evidence, before))
     return float(squared.max()), float(colour.max()), float(now), float(was)
 
 
 @kernel
-def scaled_change(
+def window_change(
     picture: Bytes,
     top: int,
     left: int,
     coefficients: Floats32,
-    across: Floats32,
-    down: Floats32,
-    mean: Floats32,
-    scale: Floats32,
-    change: Floats32,
+    untouched: Floats32,
+    inside: Flags,
+    mixtures: Floats32,
+    shown: Floats32,
     beside: float,
 ) -> None:
-    """Signed change in a window, in standard deviations, smoothed along x.
+    """Mixtures of the signed changes of the channels in a window, in standard deviations, smoothed.
 
     picture : (H, 3 W), the frame at the window's resolution. top, left : of the window. coefficients :
-    (3, 4), of `IlluminationModel.fit`. across, down : positions, (W,) and (H,). mean, scale : (H, 3 W).
-    change : (h, 3 w), filled. beside : weight of each neighbour.
+    (3, 4), of `IlluminationModel.fit`. untouched : (2, H, 3 W), mean and one over the standard deviation.
+    inside : (h / 2, w / 2), cells of 2 x 2 px that count. mixtures : (k, 3). shown : (k, h, w), filled, 0
+    where nothing counts. beside : weight of each neighbour in the smoothing along x and y.
     """
-    high, wide = change.shape[0], change.shape[1] // 3
-    rows, columns = slice(top, top + high), slice(3 * left, 3 * (left + wide))
-    values: Any = picture[rows, columns].astype(mean.dtype).reshape(high, wide, 3)
-    usual, unit = (each[rows, columns].reshape(high, wide, 3) for each in (mean, scale))
-    gain, slope_x, slope_y, offset = coefficients.T
-    gains = gain + slope_x * across[left : left + wide, None] + slope_y * down[rows, None, None]
-    light = values - usual - (usual * gains + offset)
-    line = np.maximum(light, values - SATURATION_GREY) * unit
-    line = np.pad(line, ((0, 0), (1, 1), (0, 0)), mode="reflect")
-    smooth = (line[:, :-2] + line[:, 2:]) * beside + line[:, 1:-1] * (1 - 2 * beside)
-    change[:] = smooth.reshape(change.shape)
+    frame, mean, scale = np.stack([picture, *untouched]).reshape(3, len(picture), -1, 3).transpose(0, 3, 1, 2)
+    change = (frame - under_illumination(mean, coefficients)) * scale
+    window = change[:, top : top + shown.shape[1], left : left + shown.shape[2]]
+    mixed = np.tensordot(mixtures, window, 1)
+    for axis in (2, 1):
+        line = np.pad(mixed, [(int(at == axis),) * 2 for at in range(3)], mode="reflect").swapaxes(axis, 0)
+        mixed = ((line[:-2] + line[2:]) * beside + line[1:-1] * (1 - 2 * beside)).swapaxes(0, axis)
+    shown[:] = mixed * inside.repeat(2, axis=0).repeat(2, axis=1)

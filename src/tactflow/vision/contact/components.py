@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Flags, Floats32
+from tactflow.vision.compiled import kernel
 
 SQUARE: Final = np.ones((3, 3), np.uint8)
 """A cell and its neighbours."""
@@ -41,30 +42,29 @@ def wide_change(colour: Floats32, extent: float) -> Flags | None:
     return np.asarray(wide[labels], np.bool_) if wide.any() else None
 
 
+@kernel
 def contact_cells(
-    squared: Floats32, weak: float, start: float, stay: float, before: Flags | None
-) -> Flags | None:
-    """Cells in contact by hysteresis, small gaps closed; (h, w) bool, or None if there are none.
+    squared: Floats32, weak: float, start: float, stay: float, before: Flags, least: int, found: Flags
+) -> int:
+    """Find cells in contact by hysteresis, small gaps closed; returns their number.
 
     squared : (h, w) float32, squared deviations. weak : low threshold, for cells connected to a contact.
     start : peak that starts a contact. stay : peak that continues one. before : (h, w) bool, cells in contact
-    in the previous frame.
+    in the previous frame. least : minimum number of connected cells. found : (h, w) bool, filled.
 
     >>> import numpy as np
     >>> squared = np.zeros((9, 9), np.float32)
     >>> squared[2:6, 2:6] = 20
-    >>> contact_cells(squared, 5, 10, 10, None).sum(), contact_cells(squared, 5, 30, 10, None)
-    (np.int64(16), None)
+    >>> before, found = np.zeros((2, 9, 9), np.bool_)
+    >>> [contact_cells(squared, 5, start, 10, before, 8, found) for start in (10, 30)]
+    [16, 0]
     """
     changed = cv2.morphologyEx((squared > weak).view(np.uint8), cv2.MORPH_CLOSE, SQUARE)
     count, labels = cv2.connectedComponents(changed, connectivity=8)
-    contact = np.zeros(count, np.bool_)
-    contact[labels[squared >= start]] = True
-    if before is not None:
-        lasting, strong = np.zeros((2, count), np.bool_)
-        lasting[labels[before]] = True
-        strong[labels[squared >= stay]] = True
-        contact |= lasting & strong
-    contact &= np.bincount(labels.ravel(), minlength=count) >= min(MIN_CELLS, squared.size // 4)
+    starts, stays, lasts = np.zeros((3, count), np.bool_)
+    for into, cells in ((starts, squared >= start), (stays, squared >= stay), (lasts, before)):
+        into[labels[cells]] = True
+    contact = (starts | (stays & lasts)) & (np.bincount(labels.ravel(), minlength=count) >= least)
     contact[0] = False
-    return np.asarray(contact[labels], np.bool_) if contact.any() else None
+    found[:] = contact[labels]
+    return int(found.sum())

@@ -19,7 +19,8 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats32, Mask
+from tactflow.vision.arrays import Floats32, Mask
+from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.heights import has_two_flanks
 
 BORDER_SLOPE_FRACTION: Final = 0.55
@@ -51,15 +52,17 @@ class RelativeChange(NamedTuple):
     border: float
 
 
-def relative_change(change: Floats32, mixtures: Floats32) -> RelativeChange:
+def relative_change(shown: Floats32) -> RelativeChange:
     """The slope or depth of a gel over its local maximum.
 
-    change : (h, w, 3) float32, in the window of the contact, standard deviations; 0 outside its region.
-    mixtures : (k, 3) float32, weights of the channels; several give slopes. One gives a slope if the contact
-        brightens on one flank and darkens on the other, and depth if it does either as a whole.
+    shown : (k, h, w) float32, in the window of the contact, h and w even, 0 outside its region: mixtures of
+        the change of the channels. Several are slopes. One is a slope if the contact brightens on one flank
+        and darkens on the other, and depth if it does either as a whole.
     """
-    shows, border = _what_shows(change, mixtures)
-    return RelativeChange(np.asarray(shows / largest_nearby(shows), np.float32), border)
+    size, border = _what_shows(shown)
+    nearby = np.empty_like(size)
+    largest_nearby(size, BORDER_SLOPE_FRACTION, nearby)
+    return RelativeChange(size / nearby, border)
 
 
 def contact_level(change: RelativeChange, core: Mask, border: float = BORDER_SLOPE_FRACTION) -> Floats32:
@@ -68,7 +71,7 @@ def contact_level(change: RelativeChange, core: Mask, border: float = BORDER_SLO
     Parameters
     ----------
     change : in the window of the contact.
-    core : (h, w) uint8, 1 where the contact certainly is, else 0.
+    core : (h / n, w / n) uint8, n whole, 1 where the contact certainly is, else 0.
     border : slope at the outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
         fraction of the local depth is in proportion.
 
@@ -83,71 +86,79 @@ def contact_level(change: RelativeChange, core: Mask, border: float = BORDER_SLO
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> disc = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
     >>> core = (disc == 1).astype(np.uint8)
-    >>> change = relative_change(np.stack([disc] * 3, axis=2), np.ones((1, 3), np.float32))
+    >>> change = relative_change(disc[None])
     >>> level = contact_level(change, core)
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
     fraction = min(change.border * border / BORDER_SLOPE_FRACTION, 1.0)
-    level = np.asarray(change.values - np.float32(fraction), np.float32)
-    inside = _around(np.asarray((level > 0) | (core > 0)), core)
-    # Pixels that are filled in or removed get the extreme values of the level.
-    np.clip(level, -0.5, 0.5, out=level)
-    np.copyto(level, inside - np.float32(0.5), where=(level > 0) != inside)
+    level = np.empty_like(change.values)
+    outline_level(change.values, fraction, core, level)
     return level
 
 
-def _what_shows(change: Floats32, mixtures: Floats32) -> tuple[Floats32, float]:
+def _what_shows(shown: Floats32) -> tuple[Floats32, float]:
     """Size of the slope, or depth, (h, w), and its fraction of the local maximum at the contact's border."""
-    shown = np.asarray(cv2.transform(change, mixtures), np.float32)
-    if len(mixtures) > 1:
+    if len(shown) > 1:
         # OpenCV's lengths take a tenth of the time of NumPy's.
-        return np.asarray(reduce(cv2.magnitude, cv2.split(shown)), np.float32), BORDER_SLOPE_FRACTION
-    if has_two_flanks(shown):
-        return np.abs(shown), BORDER_ONE_SLOPE_FRACTION
-    more, less = np.maximum(shown, np.float32(0)), np.maximum(-shown, np.float32(0))
-    return (
-        less if cv2.norm(less, cv2.NORM_L2SQR) > cv2.norm(more, cv2.NORM_L2SQR) else more
-    ), BORDER_DEPTH_FRACTION
+        return np.asarray(reduce(cv2.magnitude, shown), np.float32), BORDER_SLOPE_FRACTION
+    (change,) = shown
+    size = np.abs(change)
+    if has_two_flanks(change):
+        return size, BORDER_ONE_SLOPE_FRACTION
+    return np.maximum(change if np.vdot(change, size) >= 0 else -change, np.float32(0)), BORDER_DEPTH_FRACTION
 
 
-def largest_nearby(values: Floats32) -> Floats32:
-    """Local maximum (h, w) > 0, smoothed.
+@kernel
+def largest_nearby(values: Floats32, share: float, nearby: Floats32) -> None:
+    """Local maximum, smoothed, > 0.
 
     The neighbourhood reaches as far as the radius of a disc with the area of the clearly changed pixels, so
     that it holds one side of the contact but not the other. There is no change beyond the window.
+
+    values : (h, w), h and w even. share : of the maximum, from which a pixel is clearly changed. nearby :
+    (h, w), filled.
     """
     smooth = np.asarray(cv2.blur(values, (3, 3)), np.float32)
     peak = max(float(smooth.max()), 1e-9)
-    reach = round(math.sqrt(np.count_nonzero(values > BORDER_SLOPE_FRACTION * peak) / math.pi) / 2)
-    half = -(-values.shape[1] // 2), -(-values.shape[0] // 2)
-    coarse = cv2.resize(smooth, half, interpolation=cv2.INTER_AREA)
+    reach = round(math.sqrt(np.count_nonzero(values > share * peak) / math.pi) / 2)
+    coarse = cv2.resize(smooth, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     padded = cv2.copyMakeBorder(coarse, reach, reach, reach, reach, cv2.BORDER_CONSTANT)
-    largest = cv2.dilate(padded, square)
-    around = cv2.blur(largest, square.shape, borderType=cv2.BORDER_CONSTANT)
+    around = cv2.blur(cv2.dilate(padded, square), square.shape, borderType=cv2.BORDER_CONSTANT)
     around = around[reach : reach + coarse.shape[0], reach : reach + coarse.shape[1]]
     # The bound only keeps quotients finite: without any, 0 / 0 where nothing has changed.
-    nearby = cv2.resize(np.maximum(around, np.float32(1e-3 * peak)), values.shape[::-1])
-    return np.asarray(nearby, np.float32)
+    nearby[:] = cv2.resize(np.maximum(around, np.float32(1e-3 * peak)), None, fx=2, fy=2)
 
 
-def _around(changed: Flags, core: Mask) -> Flags:
-    """(h, w): changed components that overlap the core, which is part of them, with their holes filled."""
-    outlines, _ = cv2.findContours(changed.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    filled = np.zeros(core.shape, np.uint8)
+@kernel
+def outline_level(values: Floats32, fraction: float, core: Mask, level: Floats32) -> None:
+    """Fill `level`, (h, w), as in `contact_level`; positive in components that overlap the core, which is
+    part of them, with their holes filled.
+
+    values : (h, w). fraction : of them, at the outline. core : (h / n, w / n).
+    """
+    sure = core.repeat(len(level) // len(core), axis=0).repeat(len(level) // len(core), axis=1)
+    level[:] = values - level.dtype.type(fraction)
+    changed = ((level > 0) | (sure > 0)).view(np.uint8)
+    outlines, _ = cv2.findContours(changed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    filled = np.zeros(changed.shape, np.uint8)
     cv2.drawContours(filled, outlines, -1, 1.0, cv2.FILLED)
     count, components = cv2.connectedComponents(filled, connectivity=8)
     overlaps = np.zeros(count, np.bool_)
-    overlaps[components[core > 0]] = True
-    return np.asarray(overlaps[components])
+    overlaps[components[sure > 0]] = True
+    inside = overlaps[components]
+    # Pixels that are filled in or removed get the extreme values of the level.
+    np.clip(level, -0.5, 0.5, out=level)
+    np.copyto(level, inside - np.float32(0.5), where=(level > 0) != inside)
 
 
-def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) -> None:
+@kernel
+def draw_level(level: Floats32, top: int, left: int, mask: Mask) -> None:
     """Set the pixels of a mask to 255 where a level set, interpolated to its resolution, is positive.
 
-    level : (h, w) float32. top, left : its place in the mask, px; it may extend beyond the mask. mask :
-    (H, W) uint8, changed in place. side : of the level's pixels, px.
+    level : (h, w), at half of the mask's resolution. top, left : its place in the mask, px; it may extend
+    beyond the mask. mask : (H, W), 0 or 255, changed in place.
 
     >>> mask = np.zeros((2, 4), np.uint8)
     >>> draw_level(np.array([[1, -1]], np.float32), 0, 0, mask)
@@ -155,7 +166,6 @@ def draw_level(level: Floats32, top: int, left: int, mask: Mask, side: int = 2) 
     array([[255, 255,   0,   0],
            [255, 255,   0,   0]], dtype=uint8)
     """
-    pixels = np.asarray(cv2.resize(level, None, fx=side, fy=side), np.float32)
+    pixels = np.asarray(cv2.resize(level, None, fx=2, fy=2), np.float32)
     part = mask[top:, left:][: pixels.shape[0], : pixels.shape[1]]
-    positive = (pixels[: part.shape[0], : part.shape[1]] > 0).view(np.uint8)
-    np.maximum(part, positive * np.uint8(255), out=part)
+    part[pixels[: part.shape[0], : part.shape[1]] > 0] = 255

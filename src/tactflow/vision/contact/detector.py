@@ -35,7 +35,7 @@ from scipy import special
 
 from tactflow.vision.arrays import Flags, Floats32, check_color_image, check_mask
 from tactflow.vision.contact.background import CELL_PX, BackgroundModel, Change
-from tactflow.vision.contact.components import SQUARE, contact_cells, wide_change
+from tactflow.vision.contact.components import MIN_CELLS, SQUARE, contact_cells, wide_change
 from tactflow.vision.contact.contact_outline import (
     BORDER_SLOPE_FRACTION,
     CORE_SLOPE_FRACTION,
@@ -181,9 +181,8 @@ class ContactDetector:
         self._background: BackgroundModel | None = None
         self._shape: tuple[int, ...] = ()
         self._gel: NDArray[np.uint8] | None = None
-        self._before: Flags | None = None
+        self._before: Floats32 | None = None
         self._strongest = self._strongest_wide = 0.0
-        self._evidence: Floats32 | None = None
         self._suspected: Flags | None = None
         self._masks: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
         self._heights, self._contacts = HeightModel(), ContactFinder()
@@ -221,9 +220,8 @@ class ContactDetector:
         self._check(image)
         if self._background is None:
             raise ValueError("required a reference frame first: call add_reference")
-        before, self._before = self._before, None
-        change = self._background.compare(image, before, self._evidence)
-        self._evidence = change.evidence
+        change = self._background.compare(image, self._before)
+        before, self._before = None if self._before is None else self._before > 0, None
         strength = math.sqrt(max(change.largest, change.largest_colour))
         found = self._clear(change, before)
         faint = found is None
@@ -237,15 +235,15 @@ class ContactDetector:
         if found is None:
             self._masks = None
             return ContactResult(np.zeros(image.shape[:2], np.uint8), False, strength)
-        self._before = found
         if self._masks is not None and faint and change.remaining < 1 - self._creep:
             mask, core = (kept.copy() for kept in self._masks)
         else:
-            mask, core = self._masks = self._outlined(change, image.shape[:2])
-        # A gray camera records no colours: what would be a change of colour is a change of light there.
-        colour = change.squared if self._heights.alike else change.colour
-        deviations = np.stack([change.squared, colour]) * self._before
-        return ContactResult(mask, True, strength, deviations, core)
+            mask, core = self._masks = self._outlined(change, found, image.shape[:2])
+        *deviations, self._before = change.deviations * found
+        if self._heights.alike:
+            # A gray camera records no colours: what would be a change of colour is a change of light there.
+            deviations[1] = deviations[0]
+        return ContactResult(mask, True, strength, np.stack(deviations), core)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
         check_color_image(image)
@@ -253,23 +251,22 @@ class ContactDetector:
             raise ValueError(f"required the reference's shape {self._shape}, got {image.shape}")
 
     def _outlined(
-        self, change: Change, shape: tuple[int, ...]
+        self, change: Change, changed: Flags, shape: tuple[int, ...]
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Contact mask (H, W) of a change, and its core: the outlined regions, or the changed cells without a
         core if none is found."""
         assert self._background is not None
-        assert self._before is not None
-        heights = self._heights(self._background.signed_change(change))
-        mask, inner = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-        regions = self._contacts(heights, self._before)
+        heights = self._heights(change.cells)
+        mask, inner = np.zeros((2, *shape), np.uint8)
+        regions = self._contacts(heights, changed)
         for rows, columns, inside, core in regions:
-            window = self._background.window_change(change, rows, columns, inside)
-            shown = relative_change(window, heights.mixtures)
+            window = self._background.window_change(change, rows, columns, inside, heights.mixtures)
+            shown = relative_change(window)
             for border, surely, drawn in zip(self._borders, (core, _inner(core)), (mask, inner), strict=True):
-                level = contact_level(shown, surely.repeat(2, axis=0).repeat(2, axis=1), border)
+                level = contact_level(shown, surely, border)
                 draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, drawn)
         if not regions:
-            draw_level(self._before - np.float32(0.5), 0, 0, mask, CELL_PX)
+            draw_level(np.asarray(cv2.resize(changed - np.float32(0.5), None, fx=2, fy=2)), 0, 0, mask)
         # Cells reach beyond the gel.
         return (mask, inner) if self._gel is None else (mask & self._gel, inner & self._gel)
 
@@ -278,13 +275,14 @@ class ContactDetector:
 
         before : cells in contact in the previous frame.
         """
-        limit, remembered = self._limit(change.squared.size), self._relaxation**2 * self._strongest
+        squared = change.deviations[0]
+        limit, remembered = self._limit(squared.size), self._relaxation**2 * self._strongest
         start, stay = max(limit, remembered), limit * HELD_THRESHOLD_FRACTION**2
         if not self._relaxation < change.remaining < 1 - self._creep:
             stay = max(stay, remembered)
         if change.largest < (start if before is None else stay):
             return None
-        return contact_cells(change.squared, LOW_THRESHOLD_FRACTION * limit, start, stay, before)
+        return _contact_cells(squared, limit, start, stay, before)
 
     def _faint(self, change: Change, before: Flags | None) -> Flags | None:
         """Cells (h, w) in contact by the extent of a change of colour in two frames, or that fade while being
@@ -296,22 +294,23 @@ class ContactDetector:
         if change.remaining <= ENDED_FRACTION:
             return None
         fading = change.remaining < 1 - self._creep
-        limit = self._limit(change.colour.size)
-        belongs = wide_change(change.colour, self._extent(change.colour.size))
+        _, colour, evidence = change.deviations
+        limit = self._limit(colour.size)
+        belongs = wide_change(colour, self._extent(colour.size))
         if belongs is not None:
             remembered = self._relaxation**2 * self._strongest_wide
-            if not fading and change.colour[belongs].max() < remembered:
+            if not fading and colour[belongs].max() < remembered:
                 belongs = None
             self._suspected = belongs
         if before is None:
             # One frame may be a flash, a cable's shadow, a damaged picture.
             if belongs is None or suspected is None or not (belongs & suspected).any():
                 return None
-        elif fading and change.evidence[before].max() >= limit * HELD_THRESHOLD_FRACTION**2:
+        elif fading and evidence[before].max() >= limit * HELD_THRESHOLD_FRACTION**2:
             belongs = before if belongs is None else before | belongs
         if belongs is None:
             return None
-        return contact_cells(change.evidence, LOW_THRESHOLD_FRACTION * limit, math.inf, 0.0, belongs)
+        return _contact_cells(evidence, limit, math.inf, 0.0, belongs)
 
     def _extent(self, cells: int) -> float:
         """Number of cells from which a faint change of colour is a contact."""
@@ -320,6 +319,17 @@ class ContactDetector:
     def _limit(self, cells: int) -> float:
         """Detection threshold on squared deviations, corrected for the number of cells."""
         return chi_square_threshold(self._false_alarms / cells)
+
+
+def _contact_cells(
+    squared: Floats32, limit: float, start: float, stay: float, before: Flags | None
+) -> Flags | None:
+    """Cells (h, w) in contact, or None if there are none; limit : detection threshold, others as for
+    `contact_cells`."""
+    found = np.empty(squared.shape, np.bool_)
+    last, least = np.zeros_like(found) if before is None else before, min(MIN_CELLS, found.size // 4)
+    count = contact_cells(squared, LOW_THRESHOLD_FRACTION * limit, start, stay, last, least, found)
+    return found if count else None
 
 
 def _inner(core: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -29,6 +29,7 @@ import numpy as np
 from scipy import linalg
 
 from tactflow.vision.arrays import Floats, Floats32, Indices
+from tactflow.vision.compiled import kernel
 
 PADDING_SHARE: Final = 0.15
 """Padding with gel at rest at both ends of a side, as a fraction of it: the integrated surface is
@@ -239,9 +240,15 @@ def _ridge(climbs: Floats32, mixtures: Floats32, high: int, wide: int) -> Floats
 
 def has_two_flanks(change: Floats32) -> bool:
     """Whether a change (h, w) is about as strong in both directions, as slopes are and depth is not."""
+    least, largest = smooth_range(change)
+    return min(-least, largest) >= MIN_FLANK_RATIO * max(-least, largest)
+
+
+@kernel
+def smooth_range(change: Floats32) -> tuple[float, float]:
+    """The smallest and the largest mean over 3 x 3 values of a plane."""
     smooth = cv2.blur(change, (3, 3))
-    least, largest = sorted((float(smooth.max()), -float(smooth.min())))
-    return least >= MIN_FLANK_RATIO * largest
+    return float(smooth.min()), float(smooth.max())
 
 
 def _amplitude(change: Floats32) -> Floats32:

@@ -87,13 +87,11 @@ class IlluminationModel:
             if self._fitted is None
             else (brightness > MIN_BLOCK_BRIGHTNESS) & self._fitted
         )
-        self._per_brightness: Floats32 = np.where(
-            lit, 1 / np.maximum(brightness, MIN_BLOCK_BRIGHTNESS), np.float32(0)
-        )
+        per_brightness = np.where(lit, 1 / np.maximum(brightness, MIN_BLOCK_BRIGHTNESS), np.float32(0))
         self._step: Floats32 = np.ascontiguousarray(inverse @ fitted, np.float32)
         self._shrink: Floats32 = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
-        self._reference = self._block_means(reference)
-        self._limit: Floats32 = np.float32(CLIP_STDDEVS) * np.sqrt(self._block_means(variance))
+        limit = np.float32(CLIP_STDDEVS) * np.sqrt(self._block_means(variance))
+        self._blocks: Floats32 = np.stack([self._block_means(reference), per_brightness, limit])
 
     def fit(self, cells: Floats32) -> Floats32:
         """Coefficients of the change of illumination between the reference and a frame.
@@ -103,27 +101,17 @@ class IlluminationModel:
         grey levels.
         """
         coefficients = np.zeros((3, 4), np.float32)
-        excess, limit = np.empty_like(self._reference), np.empty_like(self._reference)
-        compare_blocks(
+        fit_light(
             cells,
             self._row_weights,
             self._column_weights,
-            self._reference,
-            self._per_brightness,
-            self._limit,
-            excess,
-            limit,
-            coefficients,
-            SATURATED_GREY,
-        )
-        fit_robustly(
-            excess,
+            self._blocks,
             self._basis,
             self._step,
             self._shrink,
-            limit,
             self._center,
             coefficients,
+            SATURATED_GREY,
             MAX_STEPS,
             MIN_STEP_GREY,
             REJECT_CLIP_RATIO,
@@ -170,56 +158,41 @@ def _block_weights(blocks: int, count: int) -> Floats32:
 
 
 @kernel
-def compare_blocks(
+def fit_light(
     cells: Floats32,
     row_weights: Floats32,
     column_weights: Floats32,
-    reference: Floats32,
-    per_brightness: Floats32,
-    usual_limit: Floats32,
-    excess: Floats32,
-    limit: Floats32,
+    blocks: Floats32,
+    basis: Floats32,
+    step: Floats32,
+    shrink: Floats32,
+    center: Floats32,
     coefficients: Floats32,
     saturated: float,
+    max_steps: int,
+    min_step: float,
+    reject: float,
 ) -> None:
-    """Initialise a fit: fill `excess` and `limit`, (3, n), and the gains in `coefficients`, (3, 4).
+    """Least-squares steps with clipped residuals; fills `coefficients`, (3, 4), which are 0.
 
-    cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. reference :
-    (3, n), their means, subtracted to give `excess`. usual_limit : (3, n); `limit` is 0 for blocks that are
-    saturated, at this grey level. per_brightness : (3, n), one over the brightness, 0 where it is unlit: a
-    gain is the median of the relative changes of lit, unsaturated blocks, or the largest one if all are
-    saturated.
+    cells : (3, h, w). row_weights, column_weights : (p, h) and (q, w), of the n = p q blocks. blocks :
+    (3, 3, n): their means on the untouched gel; one over their brightness, 0 where they are unlit; and the
+    limits of their residuals, which are 0 for blocks that are saturated, at this grey level. A gain starts at
+    the median of the relative changes of lit, unsaturated blocks, or the largest one if all are saturated.
+    basis, step : (3, 4, n), the model and its pseudo-inverse. shrink : (3, 4, 4), effect of the ridge on the
+    coefficients in a step. center : (3,), divides the first three coefficients at the end. A fit ends after
+    `max_steps`, or when no coefficient moves by `min_step`; the second one rejects residuals above `reject`
+    times the limit.
     """
-    means = (row_weights @ cells @ column_weights.T).reshape(excess.shape)
-    excess[:] = means - reference
-    limit[:] = np.where(means < saturated, usual_limit, 0)
+    reference, per_brightness, usual_limit = blocks
+    means = (row_weights @ cells @ column_weights.T).reshape(reference.shape)
+    excess = means - reference
+    limit = np.where(means < saturated, usual_limit, 0)
     for ratios, lit, free, into in zip(
         excess * per_brightness, per_brightness > 0, limit > 0, coefficients, strict=True
     ):
         used = np.sort(ratios[lit & free])
         into[0] = used[len(used) // 2] if len(used) else ratios[lit].max(initial=0)
-
-
-@kernel
-def fit_robustly(
-    excess: Floats32,
-    basis: Floats32,
-    step: Floats32,
-    shrink: Floats32,
-    limit: Floats32,
-    center: Floats32,
-    coefficients: Floats32,
-    max_steps: int,
-    min_step: float,
-    reject: float,
-) -> None:
-    """Least-squares steps with clipped residuals; `coefficients`, (3, 4), holds the start and the result.
-
-    excess, limit : (3, n), the data and the limits of their residuals; the second fit rejects residuals above
-    `reject` times the limit. basis, step : (3, 4, n), the model and its pseudo-inverse. shrink :
-    (3, 4, 4), effect of the ridge on the coefficients in a step. center : (3,), divides the first three
-    coefficients at the end. A fit ends after `max_steps`, or when no coefficient moves by `min_step`.
-    """
     for rejects in (False, True):
         for _ in range(max_steps):
             beyond = excess - (coefficients[:, None] @ basis)[:, 0]
