@@ -53,10 +53,13 @@ lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 
+# One beside the other, each with a cache of its own, as what is checked depends on the system.
+SYSTEMS := linux darwin win32
 types: $(VENV)/.installed-test
-	$(PY) -m mypy
-	$(PY) -m mypy --platform darwin
-	$(PY) -m mypy --platform win32
+	$(MAKE) --jobs=$(shell python3 -c "import os; print(os.cpu_count())") --output-sync $(SYSTEMS:%=types-%)
+
+types-%: $(VENV)/.installed-test
+	$(PY) -m mypy --platform $* --cache-dir .mypy_cache/$*
 
 
 $(VENV)/bin/python:
