@@ -1632,15 +1632,40 @@ LOOP compare_points(const Arg *a, double *out)
 
 /* ---- depth/slopes.py --------------------------------------------------------------------------------------- */
 
-/* A normal in proportion to where, on the line of colours from no change, it is as steep as `steepest`. */
-INLINE void bend_back(const float *one, const float *two, float *right, float *down, float steepest, i64 halvings)
+/* One part of a normal, by the degree of the terms of the colour (b, g, r). by : for each term, in the order of
+ * `TERM_FACTORS`, a quadratic polynomial of x. */
+#define COLOUR_TERMS 19
+#define AT(term) (by[3 * (term)] + x * (by[3 * (term) + 1] + x * by[3 * (term) + 2]))
+INLINE float linear_part(const float *by, float x, float b, float g, float r)
 {
-    const float bx = two[0] - one[0], by = two[1] - one[1], cx = *right - two[0], cy = *down - two[1];
+    return b * AT(0) + g * AT(1) + r * AT(2);
+}
+
+INLINE float quadratic_part(const float *by, float x, float b, float g, float r)
+{
+    return b * (b * AT(3) + g * AT(4) + r * AT(5)) + g * (g * AT(6) + r * AT(7)) + r * r * AT(8);
+}
+
+INLINE float whole_part(const float *by, float x, float b, float g, float r)
+{
+    const float bb = AT(3) + b * AT(9) + g * AT(10) + r * AT(11), bg = AT(4) + g * AT(12) + r * AT(13);
+    const float br = AT(5) + r * AT(14), gg = AT(6) + g * AT(15) + r * AT(16), gr = AT(7) + r * AT(17);
+    const float rr = AT(8) + r * AT(18);
+    return b * (AT(0) + b * bb + g * bg + r * br) + g * (AT(1) + g * gg + r * gr) + r * (AT(2) + r * rr);
+}
+
+/* The normal in proportion to where, on the line of colours from no change, it is as steep as `steepest`. */
+INLINE void bend_back(const float *by, float x, float b, float g, float r, float steepest, i64 halvings, float *right,
+                      float *down)
+{
+    const float *also = by + 3 * COLOUR_TERMS;
+    const float ax = linear_part(by, x, b, g, r), bx = quadratic_part(by, x, b, g, r), cx = *right - ax - bx;
+    const float ay = linear_part(also, x, b, g, r), by_ = quadratic_part(also, x, b, g, r), cy = *down - ay - by_;
     float low = 0, high = 1;
     for (i64 k = 0; k < halvings; k++) {
         const float t = (low + high) / 2;
-        *right = one[0] + t * (bx + t * cx);
-        *down = one[1] + t * (by + t * cy);
+        *right = ax + t * (bx + t * cx);
+        *down = ay + t * (by_ + t * cy);
         if (t * t * (*right * *right + *down * *down) > steepest * steepest)
             high = t;
         else
@@ -1652,15 +1677,14 @@ LOOP slopes_of_colour(const Arg *a, double *out)
 {
     const float *change = a[0].data, *coefficients = a[1].data, *x = a[2].data, *y = a[3].data;
     const u8 *near = a[4].data;
-    const float steepest = (float)a[5].number, most = (float)a[10].number;
-    float *slope = a[6].data;
-    const i64 *factors = a[7].data, bands = a[8].whole, halvings = a[9].whole;
-    const i64 count_of_terms = a[1].shape[1], wide = a[2].shape[0], high = a[3].shape[0];
-    float *terms = malloc((count_of_terms + 4) * (wide + 1) * sizeof(float));
+    const float steepest = (float)a[5].number, most = (float)a[9].number;
+    float *slope = a[6].data, by[6 * COLOUR_TERMS];
+    const i64 bands = a[7].whole, halvings = a[8].whole, wide = a[2].shape[0], high = a[3].shape[0];
+    float *restrict blue = malloc(3 * (wide + 1) * sizeof(float)), *restrict green = blue + wide;
+    float *restrict red = green + wide;
     (void)out;
-    if (!terms)
+    if (!blue)
         return OUT_OF_MEMORY;
-    float *parts = terms + count_of_terms * wide; /* Normals up to the first and the second degree. */
     for (i64 row = 0; row < high; row++) {
         const u8 *band = near + row / bands * wide;
         i64 start = 0, end = wide;
@@ -1669,35 +1693,27 @@ LOOP slopes_of_colour(const Arg *a, double *out)
         while (end > start && !band[end - 1])
             end--;
         const i64 count = end - start;
-        const float v = y[row], *restrict places = x + start;
+        const float v = y[row], *restrict pixels = change + 3 * (row * wide + start), *restrict places = x + start;
         float *restrict right = slope + row * wide + start, *restrict down = slope + (high + row) * wide + start;
-        for (i64 k = 0; k < count_of_terms; k++) {
-            float *restrict term = terms + k * wide;
-            if (k < 3)
-                for (i64 i = 0; i < count; i++)
-                    term[i] = change[3 * (row * wide + start + i) + k];
-            else {
-                const float *one = terms + factors[2 * (k - 3)] * wide, *other = terms + factors[2 * (k - 3) + 1] * wide;
-                for (i64 i = 0; i < count; i++)
-                    term[i] = one[i] * other[i];
-            }
-            /* In a row a coefficient is a quadratic polynomial of x alone. */
-            const float *f = coefficients + 6 * k, *g = f + 6 * count_of_terms;
-            const float f0 = f[0] + v * (f[2] + v * f[5]), f1 = f[1] + v * f[4], f2 = f[3];
-            const float g0 = g[0] + v * (g[2] + v * g[5]), g1 = g[1] + v * g[4], g2 = g[3];
-            for (i64 i = 0; i < count; i++) {
-                right[i] += term[i] * (f0 + places[i] * (f1 + places[i] * f2));
-                down[i] += term[i] * (g0 + places[i] * (g1 + places[i] * g2));
-            }
-            if (k == 2 || k == 8)
-                for (i64 i = 0; i < count; i++) {
-                    parts[4 * i + (k == 8) * 2] = right[i];
-                    parts[4 * i + (k == 8) * 2 + 1] = down[i];
-                }
+        for (i64 i = 0; i < count; i++) {
+            blue[i] = pixels[3 * i];
+            green[i] = pixels[3 * i + 1];
+            red[i] = pixels[3 * i + 2];
+        }
+        /* In a row a coefficient is a quadratic polynomial of x alone. */
+        for (int k = 0; k < 2 * COLOUR_TERMS; k++) {
+            const float *f = coefficients + 6 * k;
+            by[3 * k] = f[0] + v * (f[2] + v * f[5]);
+            by[3 * k + 1] = f[1] + v * f[4];
+            by[3 * k + 2] = f[3];
         }
         for (i64 i = 0; i < count; i++)
+            right[i] = whole_part(by, places[i], blue[i], green[i], red[i]);
+        for (i64 i = 0; i < count; i++)
+            down[i] = whole_part(by + 3 * COLOUR_TERMS, places[i], blue[i], green[i], red[i]);
+        for (i64 i = 0; i < count; i++)
             if (right[i] * right[i] + down[i] * down[i] > steepest * steepest)
-                bend_back(parts + 4 * i, parts + 4 * i + 2, right + i, down + i, steepest, halvings);
+                bend_back(by, places[i], blue[i], green[i], red[i], steepest, halvings, right + i, down + i);
         for (i64 i = 0; i < count; i++) {
             const float length = sqrtf(right[i] * right[i] + down[i] * down[i]), normal = MIN(length, most);
             const float longer = normal / (MAX(length, 1e-9f) * sqrtf(1 - normal * normal));
@@ -1705,7 +1721,7 @@ LOOP slopes_of_colour(const Arg *a, double *out)
             down[i] *= longer;
         }
     }
-    free(terms);
+    free(blue);
     return 0;
 }
 
@@ -1742,7 +1758,7 @@ static const Loop LOOPS[] = {
     {"sum_cells", "d2 d3 x d3 n d2 d2! d2! d2!", '-', sum_cells},
     {"compare_light", "f3 d1 x f2 f2 f3 q1 f2! d1!", 'n', compare_light},
     {"compare_points", "f3 d1 d1 d2 d2 d3 x d2! d1! d2! d1! d1!", '-', compare_points},
-    {"slopes_of_colour", "f3 f3 f1 f1 B2 x f3! q2 n n x", '-', slopes_of_colour},
+    {"slopes_of_colour", "f3 f3 f1 f1 B2 x f3! n n x", '-', slopes_of_colour},
 };
 #define COUNT ((int)(sizeof LOOPS / sizeof *LOOPS))
 #define MOST_ARGUMENTS 16

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -59,12 +60,11 @@ def integrate(
     """
     across, across_back, across_type, first_across = _TRANSFORMS[sides[0]]
     down, down_back, down_type, first_down = _TRANSFORMS[sides[1]]
-    divergence = _rise(slope[0].T, step[0], sides[0]).T
-    divergence = divergence + _rise(slope[1], step[1], sides[1])
+    divergence = _divergence(slope, step, sides)
     spectrum = across(divergence, across_type, axis=1, norm="ortho", overwrite_x=True)
     spectrum = down(spectrum, down_type, axis=0, norm="ortho", overwrite_x=True)
     height, width = spectrum.shape
-    eigenvalues = np.add.outer(_eigenvalues(height, first_down), _eigenvalues(width, first_across))
+    eigenvalues = _eigenvalues(height, first_down)[:, None] + _eigenvalues(width, first_across)
     if sides == ALL_OPEN:
         # The mean is not known from slopes.
         eigenvalues[0, 0] = np.inf
@@ -73,21 +73,25 @@ def integrate(
     return np.asarray(across_back(spectrum, across_type, axis=1, norm="ortho", overwrite_x=True), np.float32)
 
 
+@lru_cache(maxsize=256)
 def _eigenvalues(count: int, first: float) -> Floats32:
     """(count,): of the second difference, for the components of a transform."""
     return np.asarray(2 * np.cos(np.pi * (np.arange(count) + first) / count) - 2, np.float32)
 
 
-def _rise(slope: Floats32, step: float, open_sides: tuple[bool, bool]) -> Floats32:
-    """(h, w): by how much more the surface rises behind each pixel than before it, down the rows.
+def _divergence(slope: Floats32, step: tuple[float, float], sides: Sides) -> Floats32:
+    """(h, w): by how much more the surface rises behind each pixel than before it, in both directions.
 
-    slope : (h, w), growth down. step : from a row to the next. open_sides : of the first and last row.
-    Between two pixels it rises by the mean of their slopes; beyond an open side not at all, and at a side at
-    rest from its mirror image on.
+    Between two pixels it rises by the mean of their slopes. Beyond an open side the slope is that of the
+    mirror image, and beyond a side at rest that of the mirror image upside down.
     """
-    rise = np.empty((len(slope) + 1, slope.shape[1]), np.float32)
-    np.add(slope[1:], slope[:-1], rise[1:-1])
-    rise[1:-1] *= np.float32(step / 2)
-    for end, is_open in zip((0, -1), open_sides, strict=True):
-        rise[end] = 0.0 if is_open else slope[end] * np.float32(step)
-    return np.asarray(np.diff(rise, axis=0))
+    across, down = slope * (np.array(step, np.float32) / 2)[:, None, None]
+    (left, right), (top, bottom) = ((1 if is_open else -1 for is_open in pair) for pair in sides)
+    total: Floats32 = np.empty_like(down)
+    np.subtract(down[2:], down[:-2], out=total[1:-1])
+    total[0] = down[1] + top * down[0]
+    total[-1] = -down[-2] - bottom * down[-1]
+    total[:, 1:-1] += across[:, 2:] - across[:, :-2]
+    total[:, 0] += across[:, 1] + left * across[:, 0]
+    total[:, -1] -= across[:, -2] + right * across[:, -1]
+    return total

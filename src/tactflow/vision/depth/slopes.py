@@ -105,7 +105,6 @@ class SlopeModel:
             near,
             steepest,
             slope,
-            TERM_FACTORS,
             BAND_ROWS,
             BISECTION_COUNT,
             MAX_HORIZONTAL_PART,
@@ -122,7 +121,6 @@ def slopes_of_colour(
     near: Bytes,
     steepest: float,
     slope: Floats32,
-    factors: Indices,
     band: int,
     halvings: int,
     most: float,
@@ -130,7 +128,7 @@ def slopes_of_colour(
     """Add the slopes of the pixels near the contact to 0.
 
     change, x, y, near, steepest : of `SlopeModel.slopes`. coefficients : (2, 19, 6). slope : (2, h, w), all
-    0. factors : pairs of terms, `TERM_FACTORS`. band : rows per row of `near`. halvings : of the search for
+    0. band : rows per row of `near`. halvings : of the search for
     `steepest`. most : largest horizontal part of a unit normal.
     """
     dtype = coefficients.dtype
@@ -139,7 +137,7 @@ def slopes_of_colour(
         if not len(columns):
             continue
         part = slice(columns[0], columns[-1] + 1)
-        terms = colour_terms(change[row, part], factors).astype(dtype)
+        terms = colour_terms(change[row, part]).astype(dtype)
         place = np.array([np.ones_like(x[part]), x[part], np.full_like(x[part], y[row]), x[part] ** 2,
                           x[part] * y[row], np.full_like(x[part], y[row] ** 2)], dtype)  # fmt: skip
         parts = terms * (coefficients @ place)
