@@ -19,6 +19,7 @@ from tactflow.vision.contact.background_kernels import smooth_cells
 from tactflow.vision.contact.components import contact_cells
 from tactflow.vision.contact.contact_outline import draw_level, largest_nearby, outline_level
 from tactflow.vision.contact.heights import smooth_range
+from tactflow.vision.contact.level_lines import select_contacts
 from tactflow.vision.contact.level_tree import grow_level_lines
 from tactflow.vision.geometry.downsample import halve
 
@@ -61,18 +62,37 @@ def test_level_lines_are_the_same_in_c_and_in_numpy(seed: int) -> None:
     levels = np.linspace(heights.min(), heights.max(), 12, dtype=np.float32)[1:-1]
     found = []
     for grow in (grow_level_lines.compiled, grow_level_lines.plain):
-        above, drops = np.zeros(heights.shape, np.int32), np.zeros(2000, np.float32)
+        within, drops = np.zeros(heights.shape, np.int32), np.zeros(2000, np.float32)
         lines = np.zeros((2000, 7), np.int32)
-        count = grow(heights, marked, levels, 2, above, drops, lines)
+        count = grow(heights, marked, levels, 2, within, drops, lines)
         sizes = [*map(tuple, lines[:count, [0, 2, 3, 4, 5]])]
         around = [sizes[line[6]] if line[6] >= 0 else None for line in lines[:count]]
-        found.append((above, sorted(zip(sizes, drops[:count].round(3), around, strict=True), key=str)))
+        innermost = np.append(lines[:count, [0, 2, 3, 4, 5]], [[-1] * 5], axis=0)[within]
+        found.append((innermost, sorted(zip(sizes, drops[:count].round(3), around, strict=True), key=str)))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     for (size, drop, around), (other_size, other_drop, other_around) in zip(
         found[0][1], found[1][1], strict=True
     ):
         assert (size, around) == (other_size, other_around)
         assert drop == pytest.approx(other_drop, abs=2e-3)
+
+
+@needs_compiler
+@pytest.mark.parametrize("seed", range(8))
+def test_contacts_are_the_same_in_c_and_in_numpy(seed: int) -> None:
+    noise = np.random.default_rng(seed).normal(size=(40, 51)).astype(np.float32)
+    heights = np.ascontiguousarray(cv2.GaussianBlur(noise, (0, 0), 4.0))
+    levels = np.linspace(0, heights.max(), 14, dtype=np.float32)[1:-1]
+    within, drops = np.empty(heights.shape, np.int32), np.empty(3000, np.float32)
+    lines, contacts = np.empty((3000, 7), np.int32), np.empty((2, *heights.shape), np.int32)
+    count = grow_level_lines(heights, (noise > 2).astype(np.uint8), levels, 9, within, drops, lines)
+    found = [
+        select(lines[:count], drops[:count], within, into, 0.5, 0.5, 0.6, 0.5)
+        for select, into in zip((select_contacts.compiled, select_contacts.plain), contacts, strict=True)
+    ]
+    assert found[0] == pytest.approx(found[1])
+    assert found[0][0] > 0
+    np.testing.assert_array_equal(*contacts)
 
 
 @needs_compiler

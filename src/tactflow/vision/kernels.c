@@ -317,13 +317,15 @@ LOOP weigh_change(const Arg *a, double *out)
     const float *mean = untouched, *weight = mean + 3 * size, *brightness = weight + 3 * size;
     const float *factor = brightness + size, *scale = factor + size;
     float *colour = squared + size, *evidence = colour + size;
-    float *restrict along = malloc(2 * wide * sizeof(float)), *restrict across = along + wide;
+    float *restrict along = malloc(4 * wide * sizeof(float)), *restrict across = along + wide;
+    float *restrict most = across + wide, *restrict most_colour = most + wide;
     double now = 0, was = 0;
-    float most = -INFINITY, most_colour = -INFINITY;
     if (!along)
         return OUT_OF_MEMORY;
-    for (i64 x = 0; x < wide; x++)
+    for (i64 x = 0; x < wide; x++) {
         across[x] = position(x, wide);
+        most[x] = most_colour[x] = -INFINITY;
+    }
     for (i64 y = 0; y < high; y++) {
         float *restrict total = squared + y * wide, *restrict rest = colour + y * wide;
         float *restrict both = evidence + y * wide;
@@ -348,26 +350,29 @@ LOOP weigh_change(const Arg *a, double *out)
         }
         const float *restrict bright = brightness + y * wide, *restrict counts = factor + y * wide;
         const float *restrict last = before + y * wide;
-        float row_most = -INFINITY, row_colour = -INFINITY;
+        float row_now = 0, row_was = 0;
         for (i64 x = 0; x < wide; x++) {
-            rest[x] = (total[x] - along[x] * along[x] * bright[x]) * counts[x];
-            both[x] = MAX(total[x], rest[x]);
-            row_most = MAX(row_most, total[x]);
-            row_colour = MAX(row_colour, rest[x]);
+            const float light = total[x], hue = (light - along[x] * along[x] * bright[x]) * counts[x];
+            rest[x] = hue;
+            both[x] = light > hue ? light : hue;
+            most[x] = most[x] > light ? most[x] : light;
+            most_colour[x] = most_colour[x] > hue ? most_colour[x] : hue;
         }
-        most = MAX(most, row_most);
-        most_colour = MAX(most_colour, row_colour);
-        for (i64 x = 0; x < wide; x++)
-            if (last[x] > 0) {
-                now += both[x];
-                was += last[x];
-            }
+        for (i64 x = 0; x < wide; x++) {
+            row_now += last[x] > 0 ? both[x] : 0;
+            row_was += last[x];
+        }
+        now += row_now;
+        was += row_was;
     }
-    free(along);
-    out[0] = most;
-    out[1] = most_colour;
+    out[0] = out[1] = -INFINITY;
+    for (i64 x = 0; x < wide; x++) {
+        out[0] = MAX(out[0], most[x]);
+        out[1] = MAX(out[1], most_colour[x]);
+    }
     out[2] = now;
     out[3] = was;
+    free(along);
     return 0;
 }
 
@@ -688,10 +693,19 @@ LOOP draw_level(const Arg *a, double *out)
 
 /* ---- contact/illumination.py ------------------------------------------------------------------------------- */
 
-static int ascending(const void *one, const void *other)
+/* The value that is larger than half of them. */
+INLINE float upper_median(const float *restrict values, i64 count)
 {
-    const float a = *(const float *)one, b = *(const float *)other;
-    return (a > b) - (a < b);
+    for (i64 i = 0; i < count; i++) {
+        i32 less = 0, equal = 0;
+        for (i64 k = 0; k < count; k++) {
+            less += values[k] < values[i];
+            equal += values[k] == values[i];
+        }
+        if (less <= count / 2 && count / 2 < less + equal)
+            return values[i];
+    }
+    return NAN;
 }
 
 LOOP fit_light(const Arg *a, double *out)
@@ -735,11 +749,7 @@ LOOP fit_light(const Arg *a, double *out)
                 }
             }
         }
-        if (count) {
-            qsort(ratios, count, sizeof(float), ascending);
-            most = ratios[count / 2];
-        }
-        coefficients[4 * c] = most;
+        coefficients[4 * c] = count ? upper_median(ratios, count) : most;
     }
     for (int pass = 0; pass < 2; pass++)
         for (i64 turn = 0; turn < most_steps; turn++) {
@@ -882,22 +892,63 @@ INLINE void order_by_level(const float *z, i64 high, i64 wide, const float *leve
 #undef REACH
 }
 
+/* The smallest window that holds all values above a level, with one more cell around where the plane has one: its
+ * `top`, `left`, and (exclusive) `bottom`, `right`. Returns 0 if there are none. */
+INLINE int window_above(const float *z, i64 high, i64 wide, float level, i64 window[4])
+{
+    i64 top = high, bottom = 0, left = wide, right = 0;
+    for (i64 y = 0; y < high; y++) {
+        const float *restrict row = z + y * wide;
+        int any = 0;
+        for (i64 x = 0; x < wide; x++)
+            any |= row[x] > level;
+        if (!any)
+            continue;
+        top = MIN(top, y);
+        bottom = y + 1;
+        for (i64 x = 0; x < left; x++)
+            if (row[x] > level)
+                left = x;
+        for (i64 x = wide; x > right; x--)
+            if (row[x - 1] > level)
+                right = x;
+    }
+    window[0] = MAX(top - 1, 0);
+    window[1] = MAX(left - 1, 0);
+    window[2] = MIN(bottom + 1, high);
+    window[3] = MIN(right + 1, wide);
+    return bottom > 0;
+}
+
 LOOP grow_level_lines(const Arg *a, double *out)
 {
-    const float *z = a[0].data, *levels = a[2].data;
+    const float *levels = a[2].data;
     const u8 *marked = a[1].data;
-    i32 *above = a[4].data, *lines = a[6].data;
+    i32 *within = a[4].data, *lines = a[6].data;
     float *drops = a[5].data;
-    const i64 high = a[0].shape[0], wide = a[0].shape[1], size = high * wide, most = a[2].shape[0], least = a[3].whole;
-    i32 *root = malloc((4 * size + 2 * most + 4) * sizeof(i32));
+    const i64 most = a[2].shape[0], least = a[3].whole, columns = a[0].shape[1];
+    i64 window[4];
+    memset(within, 0xff, a[0].shape[0] * columns * sizeof(i32));
+    /* All lines lie in the window, and touch its border only where it is the picture's. */
+    if (!most || !window_above(a[0].data, a[0].shape[0], columns, levels[0], window))
+        return 0;
+    const i64 high = window[2] - window[0], wide = window[3] - window[1], size = high * wide;
+    within += window[0] * columns + window[1];
+    marked += window[0] * columns + window[1];
+    float *z = malloc(size * sizeof(float));
+    i32 *root = malloc((5 * size + 2 * most + 4) * sizeof(i32));
     Component *known = calloc(size, sizeof(Component));
-    if (!root || !known) {
+    if (!z || !root || !known) {
+        free(z);
         free(root);
         free(known);
         return OUT_OF_MEMORY;
     }
-    i32 *line_of = root + size, *order = line_of + size, *after = order + size, *ends = after + size;
-    i64 count = 0, inner = 0;
+    for (i64 y = 0; y < high; y++)
+        memcpy(z + y * wide, (float *)a[0].data + (window[0] + y) * columns + window[1], wide * sizeof(float));
+    i32 *line_of = root + size, *order = line_of + size, *after = order + size, *above = after + size;
+    i32 *ends = above + size;
+    i64 count = 0, inner = 0, pending = 0;
     order_by_level(z, high, wide, levels, most, above, order, ends, ends + most + 1, after);
     for (i64 i = 0; i < size; i++)
         root[i] = line_of[i] = -1;
@@ -906,7 +957,7 @@ LOOP grow_level_lines(const Arg *a, double *out)
         for (i64 i = ends[level + 1]; i < ends[level]; i++) {
             const i32 cell = order[i];
             known[cell].cells = 1;
-            known[cell].marked = marked[cell] != 0;
+            known[cell].marked = marked[cell / wide * columns + cell % wide] != 0;
             join(cell, z, high, wide, root, known);
         }
         for (i64 i = 0; i < ends[level]; i++) {
@@ -921,11 +972,94 @@ LOOP grow_level_lines(const Arg *a, double *out)
         }
         for (i64 line = inner; line < outer; line++)
             lines[7 * line + 6] = line_of[root_of(root, lines[7 * line + 1])];
+        /* Cells that no line is around so far; the order by level is no longer linked. */
+        i32 *cells = after;
+        memcpy(cells + pending, order + ends[level + 1], (ends[level] - ends[level + 1]) * sizeof(i32));
+        const i64 waiting = pending + ends[level] - ends[level + 1];
+        pending = 0;
+        for (i64 i = 0; i < waiting; i++) {
+            const i32 cell = cells[i], line = line_of[root_of(root, cell)];
+            within[cell / wide * columns + cell % wide] = line;
+            if (line < 0)
+                cells[pending++] = cell;
+        }
         inner = outer;
     }
+    for (i64 line = 0; line < count; line++) {
+        i32 *cell = lines + 7 * line + 1;
+        *cell = (i32)((window[0] + *cell / wide) * columns + window[1] + *cell % wide);
+    }
+    free(z);
     free(root);
     free(known);
     out[0] = (double)count;
+    return 0;
+}
+
+/* ---- contact/level_lines.py -------------------------------------------------------------------------------- */
+
+LOOP select_contacts(const Arg *a, double *out)
+{
+    const i32 *lines = a[0].data, *within = a[2].data;
+    const float *drops = a[1].data, climb = (float)a[4].number;
+    const double most_border = a[5].number, most_area = a[6].number, least_ratio = a[7].number;
+    i32 *contacts = a[3].data;
+    const i64 count = a[0].shape[0], size = a[2].shape[0] * a[2].shape[1];
+    float *slope = malloc((2 * count + 1) * sizeof(float)), *salience = slope + count, first = 0;
+    u8 *taken = calloc(2 * count + 1, 1), *inside = taken + count;
+    i32 number = 0;
+    if (!slope || !taken) {
+        free(slope);
+        free(taken);
+        return OUT_OF_MEMORY;
+    }
+    for (i64 i = 0; i < count; i++) {
+        const i32 *line = lines + 7 * i, sides = line[4], border = line[5];
+        const double length = 0.7853981633974483 * sides;
+        const int possible = sides >= (1 - most_border) * (sides + border) && line[2] <= most_area * (double)size;
+        slope[i] = possible ? (float)(drops[i] / MAX(length, 1)) : 0;
+        salience[i] = (float)(slope[i] * sqrt(length));
+    }
+    memset(contacts, 0, size * sizeof(i32));
+    for (;;) {
+        i64 steepest = 0;
+        for (i64 i = 1; i < count; i++)
+            if (salience[i] > salience[steepest])
+                steepest = i;
+        if (!count || !(salience[steepest] > 0) || salience[steepest] < least_ratio * first)
+            break;
+        i64 core = steepest, wide = steepest;
+        for (i64 outer; (outer = lines[7 * wide + 6]) >= 0; wide = outer) {
+            if (taken[outer] || slope[outer] < climb * slope[steepest])
+                break;
+            if (wide == steepest)
+                core = outer;
+        }
+        if (!lines[7 * wide + 3]) {
+            salience[steepest] = 0;
+            continue;
+        }
+        if (!number) {
+            first = salience[steepest];
+            out[1] = slope[steepest];
+        }
+        for (i64 i = wide; i >= 0; i--) {
+            const i64 outer = lines[7 * i + 6];
+            inside[i] = i == core ? 2 : i == wide ? 1 : outer >= 0 && outer <= wide ? inside[outer] : 0;
+            taken[i] |= inside[i] > 0;
+        }
+        for (i64 i = 0; i < size; i++)
+            if (within[i] >= 0 && within[i] <= wide && inside[within[i]])
+                contacts[i] = 2 * number + inside[within[i]];
+        for (; wide >= 0; wide = lines[7 * wide + 6])
+            taken[wide] = 1;
+        for (i64 i = 0; i < count; i++)
+            salience[i] = taken[i] ? 0 : salience[i];
+        number++;
+    }
+    free(slope);
+    free(taken);
+    out[0] = number;
     return 0;
 }
 
@@ -1750,6 +1884,7 @@ static const Loop LOOPS[] = {
     {"draw_level", "f2 n n B2!", '-', draw_level},
     {"fit_light", "f3 f2 f2 f3 f3 f3 f3 f1 f2! x n x x", '-', fit_light},
     {"grow_level_lines", "f2 B2 f1 n i2! f1! i2!", 'n', grow_level_lines},
+    {"select_contacts", "i2 f1 i2 i2! x x x x", '2', select_contacts},
     {"cover_spots", "B3 n n B2!", '-', cover_spots},
     {"fill_masked", "B2! B2 B2 q1 q1 n x x x", '-', fill_masked},
     {"weigh_motion", "d2 f1 ?1 q2 d2 x d1! n x x", '?', weigh_motion},

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from tactflow.vision.contact.heights import HeightModel, Heights
-from tactflow.vision.contact.level_lines import ContactFinder, ContactRegion, level_lines
+from tactflow.vision.contact.level_lines import ContactFinder, ContactRegion
 from tactflow.vision.contact.level_tree import grow_level_lines
 
 Float = NDArray[np.float32]
@@ -65,6 +65,16 @@ def plain_lines(heights: Float, levels: Float, least: int) -> list[tuple[float, 
     return sorted(lines)
 
 
+def grown(
+    heights: Float, changed: NDArray[np.bool_], levels: Float, least: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], Float]:
+    """What `grow_level_lines` fills: of each cell the innermost line, and the lines with their drops."""
+    within, drops = np.empty(heights.shape, np.int32), np.empty(heights.size * 4, np.float32)
+    lines = np.empty((len(drops), 7), np.int32)
+    count = grow_level_lines(heights, changed.astype(np.uint8), levels, least, within, drops, lines)
+    return within, lines[:count], drops[:count]
+
+
 def core(region: ContactRegion, shape: tuple[int, int] = SHAPE) -> NDArray[np.bool_]:
     cells = np.zeros(shape, np.bool_)
     cells[region.rows, region.columns] = region.core > 0
@@ -77,11 +87,9 @@ def test_each_level_line_is_measured(seed: int, high: int, wide: int) -> None:
     noise = np.random.default_rng(seed).normal(0, 9, (high, wide)).astype(np.float32)
     heights = np.asarray(cv2.blur(noise, (3, 3)), np.float32)
     levels = np.linspace(heights.min() - 1, heights.max(), 6, dtype=np.float32)[1:-1]
-    above, drops = np.empty((high, wide), np.int32), np.empty(high * wide * 4, np.float32)
-    marked, lines = (heights > 1).astype(np.uint8), np.empty((len(drops), 7), np.int32)
-    count = grow_level_lines(heights, marked, levels, 2, above, drops, lines)
-    level, _, cells, _, sides, border, _ = lines[:count].T
-    found = zip(level, cells, sides, border, drops[:count].astype(float), strict=True)
+    _, lines, drops = grown(heights, heights > 1, levels, 2)
+    level, _, cells, _, sides, border, _ = lines.T
+    found = zip(level, cells, sides, border, drops.astype(float), strict=True)
     expected = plain_lines(heights, levels, 2)
     for one, other in zip(sorted(found), expected, strict=True):
         assert one[:4] == other[:4]
@@ -93,15 +101,21 @@ def test_each_level_line_is_measured(seed: int, high: int, wide: int) -> None:
 def test_lines_lie_within_one_another_and_count_the_marked_cells(seed: int) -> None:
     heights = np.asarray(cv2.blur(np.random.default_rng(seed).normal(0, 9, (20, 30)), (3, 3)), np.float32)
     changed = heights > heights.mean()
-    lines = level_lines(heights, changed)
-    for index, outer in enumerate(lines.outer):
-        labels = ndimage.label(lines.above > lines.level[index])[0]
-        inside = labels == labels.flat[lines.inside[index]]
-        assert lines.encloses[index] == (inside & changed).any()
+    levels = np.linspace(0, heights.max(), 14, dtype=np.float32)[1:-1]
+    within, lines, _ = grown(heights, changed, levels, 9)
+    holes = np.ones((3, 3), np.bool_)
+    for index, (level, cell, cells, marked, _, _, outer) in enumerate(lines):
+        labels = ndimage.label(ndimage.binary_fill_holes(heights > levels[level], holes))[0]
+        inside = labels == labels.flat[cell]
+        assert cells == inside.sum()
+        assert marked == (inside & changed).sum()
+        # The cells inside lie within this line or one that it encloses.
+        nested = {index}
+        for inner in range(index - 1, -1, -1):
+            nested |= {inner} if lines[inner, 6] in nested else set()
+        assert np.array_equal(np.isin(within, list(nested)), inside)
         if outer >= 0:
-            labels = ndimage.label(lines.above > lines.level[outer])[0]
-            assert lines.level[outer] == lines.level[index] - 1
-            assert (labels == labels.flat[lines.inside[outer]])[inside].all()
+            assert lines[outer, 0] == level - 1
 
 
 @settings(max_examples=60, deadline=None)
@@ -186,7 +200,8 @@ def test_lamps_all_around_a_gray_camera_show_both_flanks_of_one_contact(place: t
 
 def test_a_change_of_nothing_has_no_lines() -> None:
     heights = HeightModel()(np.zeros((3, *SHAPE), np.float32))
-    assert not level_lines(heights.values, np.ones(SHAPE, np.bool_)).salience.size
+    levels = np.zeros(12, np.float32)
+    assert not len(grown(heights.values, np.ones(SHAPE, np.bool_), levels, 9)[1])
     assert regions(heights) == []
 
 

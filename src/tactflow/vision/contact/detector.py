@@ -239,11 +239,12 @@ class ContactDetector:
             mask, core = (kept.copy() for kept in self._masks)
         else:
             mask, core = self._masks = self._outlined(change, found, image.shape[:2])
-        *deviations, self._before = change.deviations * found
+        deviations = change.deviations * found
+        self._before = deviations[2]
         if self._heights.alike:
             # A gray camera records no colours: what would be a change of colour is a change of light there.
             deviations[1] = deviations[0]
-        return ContactResult(mask, True, strength, np.stack(deviations), core)
+        return ContactResult(mask, True, strength, deviations[:2], core)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
         check_color_image(image)

@@ -13,11 +13,11 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Flags, Floats32, Mask
+from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.heights import Heights
-from tactflow.vision.contact.level_tree import grow_level_lines
+from tactflow.vision.contact.level_tree import Numbers, grow_level_lines
 
 LEVEL_COUNT: Final = 12
 """Levels between the gel at rest and its highest point: their distance is a 13th of that height."""
@@ -42,56 +42,6 @@ MIN_SALIENCE_RATIO: Final = 0.5
 changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap equally well within 0.01)."""
 LEVELS: Final = np.arange(1, LEVEL_COUNT + 1, dtype=np.float32)
 """The levels, in units of their distance."""
-
-
-class LevelLines(NamedTuple):
-    """The level lines of a surface, from the highest level down.
-
-    For each line, (n,): level : index of its level.
-
-    Attributes
-    ----------
-    above : (h, w) int32, number of levels below each cell; holes are filled up to the line around them.
-    inside : a cell inside, as y w + x.
-    encloses : whether it encloses changed cells.
-    slope : mean slope of the surface along it, per cell; 0 if it is too wide or too open for a contact.
-    salience : slope in standard errors, up to a factor.
-    outer : index of the line around it, or -1.
-    """
-
-    above: NDArray[np.int32]
-    level: NDArray[np.int32]
-    inside: NDArray[np.int32]
-    encloses: Flags
-    slope: Floats32
-    salience: Floats32
-    outer: NDArray[np.int32]
-
-
-def level_lines(heights: Floats32, changed: Flags) -> LevelLines:
-    """Level lines at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
-    levels = LEVELS * (heights.max() / np.float32(LEVEL_COUNT + 1))
-    high, wide = heights.shape
-    # All lines lie in a window, and touch its border only where it is the picture's.
-    left, top, across, down = cv2.boundingRect((heights > levels[0]).view(np.uint8))
-    window = slice(max(top - 1, 0), top + down + 1), slice(max(left - 1, 0), left + across + 1)
-    surface = np.ascontiguousarray(heights[window])
-    marked = np.ascontiguousarray(changed[window]).view(np.uint8)
-    above = np.zeros((high, wide), np.int32)
-    over = np.empty(surface.shape, np.int32)
-    lines = np.empty((LEVEL_COUNT * surface.size // MIN_LINE_CELLS, 7), np.int32)
-    drops = np.empty(len(lines), np.float32)
-    count = grow_level_lines(surface, marked, levels, MIN_LINE_CELLS, over, drops, lines)
-    above[window] = over
-    level, inside, cells, enclosed, sides, border, outer = lines[:count].T
-    y, x = np.divmod(inside, surface.shape[1])
-    inside = (y + window[0].start) * wide + x + window[1].start
-    # Averaged over directions, a line is pi / 4 as long as the sides of the cells along it.
-    length = np.float32(math.pi / 4) * sides
-    possible = (sides >= (1 - MAX_BORDER_SHARE) * (sides + border)) & (cells <= MAX_AREA_SHARE * heights.size)
-    slope = np.asarray(drops[:count] * possible / np.maximum(length, np.float32(1)), np.float32)
-    salience = slope * np.sqrt(length)
-    return LevelLines(above, level, inside, enclosed > 0, slope, np.asarray(salience, np.float32), outer)
 
 
 class ContactRegion(NamedTuple):
@@ -149,62 +99,84 @@ class _Contacts(NamedTuple):
 
 
 def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
-    """Select the most salient lines that are not nested, and grow each outwards to the end of its climb."""
-    lines = level_lines(heights, changed)
-    regions: list[ContactRegion] = []
-    left, first, slope = lines.salience.copy(), 0.0, 0.0
-    free = np.ones(left.size, np.bool_)
-    while (salience := float(left.max(initial=0))) > 0 and salience >= MIN_SALIENCE_RATIO * first:
-        steepest = int(left.argmax())
-        outwards = _outwards(lines, steepest, free)
-        wide = outwards[-1]
-        if not lines.encloses[wide]:
-            left[steepest] = 0
+    """The contacts at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
+    levels = LEVELS * (heights.max() / np.float32(LEVEL_COUNT + 1))
+    within, contacts = np.empty((2, *heights.shape), np.int32)
+    lines = np.empty((LEVEL_COUNT * heights.size // MIN_LINE_CELLS, 7), np.int32)
+    drops = np.empty(len(lines), np.float32)
+    count = grow_level_lines(heights, changed.view(np.uint8), levels, MIN_LINE_CELLS, within, drops, lines)
+    limits = MIN_CLIMB_SLOPE_RATIO, MAX_BORDER_SHARE, MAX_AREA_SHARE, MIN_SALIENCE_RATIO
+    number, slope = select_contacts(lines[:count], drops[:count], within, contacts, *limits)
+    return _Contacts([_region(contacts, 2 * index + 1) for index in range(int(number))], slope)
+
+
+@kernel
+def select_contacts(
+    lines: Numbers,
+    drops: Floats32,
+    within: Numbers,
+    contacts: Numbers,
+    climb: float,
+    most_border: float,
+    most_area: float,
+    least_ratio: float,
+) -> tuple[float, float]:
+    """Select the most salient lines that are not nested, and grow each outwards to the end of its climb.
+
+    Returns the number of contacts, and the slope of the first one's line; 0 without any.
+
+    lines, drops, within : of `grow_level_lines`. contacts : (h, w), filled: 2 i + 2 in the core of the i-th
+    contact, 2 i + 1 in other cells inside its outer line, 0 elsewhere. climb : `MIN_CLIMB_SLOPE_RATIO`.
+    most_border : `MAX_BORDER_SHARE`. most_area : `MAX_AREA_SHARE`. least_ratio : `MIN_SALIENCE_RATIO`.
+    """
+    _, _, cells, enclosed, sides, border, outer = lines.T
+    # Averaged over directions, a line is pi / 4 as long as the sides of the cells along it.
+    length = math.pi / 4 * sides
+    possible = (sides >= (1 - most_border) * (sides + border)) & (cells <= most_area * within.size)
+    slope = np.asarray(drops * possible / np.maximum(length, 1), np.float32)
+    salience = np.asarray(slope * np.sqrt(length), np.float32)
+    free = np.ones(len(lines), np.bool_)
+    contacts[:] = 0
+    number, first, largest = 0, 0.0, 0.0
+    while (most := float(salience.max(initial=0))) > 0 and most >= least_ratio * first:
+        steepest = int(salience.argmax())
+        outwards, least = [steepest], climb * slope[steepest]
+        while (line := int(outer[outwards[-1]])) >= 0 and free[line] and slope[line] >= least:
+            outwards.append(line)
+        if not enclosed[outwards[-1]]:
+            salience[steepest] = 0
             continue
-        if not regions:
-            first, slope = salience, float(lines.slope[steepest])
+        if not number:
+            first, largest = most, float(slope[steepest])
         # The gel is steepest between this line and the next one.
-        core, near = (_inside(lines, line) for line in (outwards[:2][-1], wide))
-        regions.append(_region(core, near))
+        core, near = (_lines_inside(line, outer) for line in (outwards[:2][-1], outwards[-1]))
+        contacts += (2 * number + 1) * near[within] + core[within]
         # Nested lines belong to the same contact.
-        free[: wide + 1][near.ravel()[lines.inside[: wide + 1]] > 0] = False
-        while wide >= 0:
-            free[wide] = False
-            wide = lines.outer[wide]
-        left *= free
-    return _Contacts(regions, slope)
+        free[near[:-1]] = False
+        line = outwards[-1]
+        while line >= 0:
+            free[line] = False
+            line = int(outer[line])
+        salience *= free
+        number += 1
+    return number, largest
 
 
-def _outwards(lines: LevelLines, steepest: int, free: Flags) -> list[int]:
-    """The lines from the steepest one outwards, up to one that is much flatter or belongs to another
-    contact."""
-    found, least = [steepest], MIN_CLIMB_SLOPE_RATIO * lines.slope[steepest]
-    while (outer := int(lines.outer[found[-1]])) >= 0 and free[outer] and lines.slope[outer] >= least:
-        found.append(outer)
-    return found
+def _lines_inside(line: int, outer: Numbers) -> Flags:
+    """(n + 1,) bool: whether each of n lines is this one or lies inside it; the last one stands for none."""
+    inside = np.zeros(len(outer) + 1, np.bool_)
+    inside[line] = True
+    for inner in range(line - 1, -1, -1):
+        inside[inner] = inside[outer[inner]]
+    return inside
 
 
-def _inside(lines: LevelLines, line: int) -> Mask:
-    """(h, w) uint8: 1 in the cells inside a line, else 0."""
-    cells = (lines.above > lines.level[line]).view(np.uint8)
-    y, x = divmod(int(lines.inside[line]), cells.shape[1])
-    cv2.floodFill(cells, None, (x, y), 2)
-    return np.asarray(cells == 2).view(np.uint8)
-
-
-def _region(core: Mask, near: Mask) -> ContactRegion:
-    """The region of a contact; core : cells that certainly belong to it. near : cells inside the outer
-    line."""
-    high, wide = core.shape
-    near = np.asarray(
-        cv2.dilate(near, np.ones((2 * SEARCH_MARGIN_CELLS + 1, 2 * SEARCH_MARGIN_CELLS + 1), np.uint8)),
-        np.uint8,
-    )
-    left, top, across, down = cv2.boundingRect(near)
-    rows, columns = slice(max(top - 1, 0), top + down + 1), slice(max(left - 1, 0), left + across + 1)
-    return ContactRegion(
-        slice(rows.start, min(rows.stop, high)),
-        slice(columns.start, min(columns.stop, wide)),
-        np.ascontiguousarray(near[rows, columns]).view(np.bool_),
-        np.ascontiguousarray(core[rows, columns]),
-    )
+def _region(contacts: Numbers, near: int) -> ContactRegion:
+    """The region of a contact from `select_contacts`; near : number in its cells outside the core."""
+    cells = np.asarray(cv2.inRange(contacts, (near,), (near + 1,)))
+    left, top, across, down = cv2.boundingRect(cells)
+    margin = SEARCH_MARGIN_CELLS + 1
+    rows = slice(max(top - margin, 0), min(top + down + margin, contacts.shape[0]))
+    columns = slice(max(left - margin, 0), min(left + across + margin, contacts.shape[1]))
+    inside = cv2.dilate(cells[rows, columns], np.ones((2 * margin - 1, 2 * margin - 1), np.uint8))
+    return ContactRegion(rows, columns, inside > 0, (contacts[rows, columns] == near + 1).view(np.uint8))

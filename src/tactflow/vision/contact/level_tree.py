@@ -23,7 +23,7 @@ def grow_level_lines(
     marked: Mask,
     levels: Floats32,
     least: int,
-    above: Numbers,
+    within: Numbers,
     drops: Floats32,
     lines: Numbers,
 ) -> int:
@@ -34,17 +34,16 @@ def grow_level_lines(
 
     heights, marked : (h, w), the surface, and cells to count (non-zero). levels : (l,) ascending. least :
     minimum number of cells inside a line.
-    above : (h, w), filled with the number of levels below each cell, or below the lines around it.
+    within : (h, w), filled with the index of the innermost line around each cell, or -1.
     drops : (n,), filled with the sum of the surface's slope along each line, per cell.
     lines : (n, 7), filled with each line's level, as an index; one of the cells inside, as y w + x; the
     number of cells inside; the number of marked ones; the number of cell sides along the line, and along the
     border of the picture; and the index of the line around it, or -1.
     """
     count, inner = 0, 0
-    above[:] = 0
+    within[:] = -1
     for level in range(len(levels) - 1, -1, -1):
         inside = binary_fill_holes(heights > levels[level], np.ones((3, 3), np.bool_))
-        above += inside
         found, number = label(inside)
         parts = np.asarray(found, np.int32)
         sizes = np.bincount(parts.ravel(), minlength=number + 1)
@@ -60,6 +59,7 @@ def grow_level_lines(
             line_of[part] = count
             count += 1
         lines[inner:outer, 6] = line_of[parts.ravel()[lines[inner:outer, 1]]]
+        within[:] = np.where(within < 0, line_of[parts], within)
         inner = outer
     return count
 
