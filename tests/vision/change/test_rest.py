@@ -69,6 +69,26 @@ def test_what_is_contact_is_suspect_however_slowly_it_comes(
     assert any(suspects[begin : begin + 2])
 
 
+def test_what_is_faint_contact_on_a_gray_camera_is_suspect_however_slowly_it_comes() -> None:
+    y, x = np.mgrid[0:240, 0:320].astype(np.float32)
+    plain = np.repeat((120 + 30 * np.sin(x / 90) + 20 * np.cos(y / 70))[..., None], 3, axis=2)
+
+    def camera(seed: int, height: float) -> Image:
+        bump = 1 + height * np.exp(-((x - 100) ** 2 + (y - 90) ** 2) / (2 * 16**2))[..., None]
+        return np.repeat(noisy(plain * bump, seed)[..., :1], 3, axis=2)
+
+    detector, test = ContactDetector(), RestTest(camera(0, 0))
+    detector.add_reference(camera(0, 0))
+    heights = np.repeat(np.linspace(0, 0.09, 30), 2)
+    looks = [test.look(camera(seed, height)) for seed, height in enumerate(heights, 1)]
+    found = [detector.detect(camera(seed, height)) for seed, height in enumerate(heights, 1)]
+    begin = [result.touching for result in found].index(True)
+    suspects = [look.suspect for look in looks]
+    assert not any(suspects[1 : begin // 2])
+    # It takes two frames to find a faint contact.
+    assert sum(suspects[begin // 2 : begin + 2]) >= 2
+
+
 def test_a_touch_in_a_frame_of_its_own_is_seen_and_what_follows_is_rest_again() -> None:
     test = at_rest()
     assert test.look(noisy(gel() + spot(8, 60), 99)).suspect

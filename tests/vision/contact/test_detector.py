@@ -256,6 +256,29 @@ def test_a_faint_change_is_contact_if_it_is_one_of_colour_and_wide(
     assert math.hypot(x.mean() - 61, y.mean() - 83) < 2  # measured 0.3 to 0.7
 
 
+def _gray(image: Image) -> Image:
+    return cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("change", "width", "seen"),
+    [(0.08, 20, True), (-0.08, 20, True), (0.08, 6, False), (0.04, 20, False), (-0.08, 100, False)],
+    ids=["brighter", "darker", "a spot", "too faint", "a shadow"],
+)
+def test_a_gray_camera_shows_a_faint_contact_where_the_light_changes_locally(
+    change: float, width: float, seen: bool
+) -> None:
+    gel = _gel((400, 300))
+    y, x = np.mgrid[0:400, 0:300]
+    bump = np.exp(-((x - 161) ** 2 + (y - 183) ** 2) / (2 * width**2))[..., None]
+    detector = _detector(_gray(_noisy(gel, 1)))
+    found = [detector.detect(_gray(_noisy(gel * (1 + change * bump), seed))) for seed in range(2, 5)]
+    assert [result.touching for result in found] == [False, seen, seen]
+    if seen:
+        y, x = np.nonzero(found[-1].mask)
+        assert math.hypot(x.mean() - 161, y.mean() - 183) < 4
+
+
 def test_a_faint_change_in_a_single_frame_is_not_contact() -> None:
     gel = _gel()
     detector = _detector(_noisy(gel, 1))

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from tactflow.vision.arrays import Floats32, Indices, check_color_image
 from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.background import Derived
-from tactflow.vision.contact.background_kernels import weigh_change
 from tactflow.vision.contact.components import WIDE_DEVIATION
 
 LONG_SIDE_TILES: Final = 24
@@ -247,9 +246,7 @@ class _LightTest:
 
     def departure(self, light: Floats32) -> Floats32:
         """Deviation (rows, columns) float32 of the light of a frame, (3, rows, columns), in thresholds."""
-        illumination, untouched = self._known
-        coefficients = illumination.fit(light)
-        weigh_change(light, coefficients, untouched, self._before, self._change, self._deviations)
+        self._known.weigh(light, self._before, self._change, self._deviations)
         return np.asarray(np.sqrt(self._deviations[2] / np.float32(WIDE_DEVIATION)), np.float32)
 
 

@@ -37,6 +37,9 @@ CORRELATED_NOISE_RATIO: Final = 2.0
 neighbouring pixels. Chosen by hand."""
 MIN_CELL_VALID_MEAN: Final = 128
 """Minimum mean of the valid area, 0 to 255, over a cell that counts: half of the cell."""
+NEARBY_SHARE: Final = 0.25
+"""Side of the square over which the mean light nearby is taken, as a fraction of the longer side of the
+picture: wider than most contacts, and narrower than the shadows of lamps."""
 
 
 class Change(NamedTuple):
@@ -51,8 +54,8 @@ class Change(NamedTuple):
         to the brightness of the whole picture: relative to its own, a dark channel that a tilt lights up
         would dominate the others.
     deviations : (3, h, w) float32, of each cell: the squared deviation, chi-square with three degrees of
-        freedom where nothing touches; the same for colour alone, with two degrees of freedom; and the
-        evidence, the larger of the two.
+        freedom where nothing touches; the same for colour alone, with two degrees of freedom, or on a gray
+        camera for the light minus its mean nearby; and the evidence, the larger of the two.
     largest, largest_colour : maxima of the first two.
     remaining : ratio of this change to that of the previous frame, over the cells that were in contact
         then; 1 if none was.
@@ -75,10 +78,12 @@ class Derived(NamedTuple):
     planes : (9, h, w) float32, of each cell: its mean and one over its standard deviation, of three channels
         each; one over the squared length of the weighted mean; how much more a change of colour counts than
         one of brightness; and the factor of `Change.cells`, one over the standard deviation.
+    gray : whether all channels are the same.
     """
 
     illumination: IlluminationModel
     planes: Floats32
+    gray: bool
 
     @classmethod
     def of(
@@ -104,7 +109,26 @@ class Derived(NamedTuple):
         if gel is not None:
             weight, scale = weight * gel, scale * gel
         planes = np.concatenate([mean, weight, [1 / length**2, factor, scale]])
-        return cls(illumination, np.asarray(planes, np.float32))
+        return cls(illumination, np.asarray(planes, np.float32), bool((mean == mean[0]).all()))
+
+    def weigh(
+        self, cells: Floats32, before: Floats32, change: Floats32, deviations: Floats32
+    ) -> tuple[Floats32, float, float, float, float]:
+        """Deviations of a frame's cells, (3, h, w), from the untouched gel.
+
+        before, change, deviations, and all that is returned but the first, the illumination's coefficients :
+        as for `weigh_change`.
+        """
+        coefficients = self.illumination.fit(cells)
+        found = weigh_change(cells, coefficients, self.planes, before, change, deviations)
+        if not self.gray:
+            return coefficients, *found
+        squared, local, evidence = deviations
+        light = np.copysign(np.sqrt(squared / len(cells)), change[0])
+        side = max(round(NEARBY_SHARE * max(light.shape)), 1)
+        local[:] = np.square(light - cv2.blur(light, (side, side))) * self.planes[7]
+        np.maximum(squared, local, out=evidence)
+        return coefficients, found[0], float(local.max()), float(evidence[before > 0].sum()), found[3]
 
 
 class BackgroundModel:
@@ -150,6 +174,11 @@ class BackgroundModel:
         self._known: Derived | None = None
         self._untouched: Floats32 | None = None
 
+    @property
+    def gray(self) -> bool:
+        """Whether all channels are the same."""
+        return self._derived().gray
+
     def add(self, image: NDArray[np.uint8]) -> None:
         """Learn from one more frame of the same size; more frames estimate the noise better."""
         known = self._derived()
@@ -177,13 +206,10 @@ class BackgroundModel:
             self._untouched = self._compared_with()
         half = _halved(image)
         smooth = _smoothed(half)
-        coefficients = known.illumination.fit(smooth)
         if before is None:
             before = np.zeros(smooth.shape[1:], np.float32)
         cells, deviations = np.empty((2, *smooth.shape), np.float32)
-        largest, largest_colour, now, was = weigh_change(
-            smooth, coefficients, known.planes, before, cells, deviations
-        )
+        coefficients, largest, largest_colour, now, was = known.weigh(smooth, before, cells, deviations)
         remaining = math.sqrt(now / was) if was > 0 else 1.0
         return Change(half, coefficients, cells, deviations, largest, largest_colour, remaining)
 

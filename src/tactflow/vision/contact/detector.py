@@ -8,7 +8,9 @@ of false alarms, and then *where*, by a rule that does not depend on the noise:
 3. The residual, divided by its standard deviation, is chi-square distributed with three degrees of freedom
    where nothing touches. One threshold, corrected for the number of cells, decides whether anything does.
 4. Changes of colour alone are tested as well: lamps flicker and shadows fall in brightness, hardly in colour.
-   A fainter change of colour is a contact if it is wide, which noise and compression blocks are not.
+   A fainter change of colour is a contact if it is wide, which noise and compression blocks are not. A gray
+   camera has no colour; there the light minus its mean nearby takes its place, because the light of lamps
+   changes more smoothly than that of contacts.
 5. A contact ends at the noise level, or at a fraction of the strongest recent change, because a released gel
    creeps back. While it fades faster than by creep, it is still being unloaded and has not ended.
 6. The shape of the gel gives the contact region (`heights`, `level_lines`), and the outline is found there at
@@ -54,12 +56,13 @@ HELD_THRESHOLD_FRACTION: Final = 0.7
 by hand."""
 DECAY_PER_FRAME: Final = 0.98
 """Decay of the strongest recent change per frame: it halves in 34 frames. Chosen by hand."""
-MIN_WIDE_AREA_SHARE: Final = 0.01
-"""Minimum area of a wide change, as a fraction of the picture: more than compression noise, which comes in
-blocks of 16 px of the camera (4 cells without contact where 48 would be contact)."""
+MIN_WIDE_COLOUR_SHARE: Final = 0.01
+"""Minimum area of a wide change of colour, as a fraction of the picture: more than compression noise, which
+comes in blocks of 16 px of the camera (4 cells without contact where 48 would be contact). Light is
+compressed in blocks of 8 px, less than the other minimum."""
 CELLS_PER_LOG_RATE: Final = 0.7
-"""Increase of that minimum, in cells, for each factor of e in the rate of false alarms: measured on white
-noise, smoothed as the cells are."""
+"""Increase of the minimum area of a wide change, in cells, for each factor of e in the rate of false alarms:
+measured on white noise, smoothed as the cells are."""
 ENDED_FRACTION: Final = 0.5
 """A faint change that falls below this fraction of itself within one frame has ended. Chosen by hand."""
 
@@ -111,8 +114,8 @@ class ContactDetector:
     repeatability : local variation of the light on the untouched gel beyond noise, as a fraction of the
         brightness, 0..1. Higher misses lighter contacts.
     tint : the same for colour, if smaller than `repeatability`, 0..1: how much the channels vary against each
-        other. Higher finds soft contacts later on gels that respond with colour; lower detects compression
-        blocks.
+        other, or on a gray camera the light against that nearby. Higher finds soft contacts later on gels
+        that respond with colour; lower detects compression blocks.
     shift : distance by which the untouched gel may move against the camera, px. It makes sharp edges in the
         picture count less.
     relaxation : fraction of the strongest recent change that a gel may still show after release, in [0, 1):
@@ -241,9 +244,6 @@ class ContactDetector:
             mask, core = self._masks = self._outlined(change, found, image.shape[:2])
         deviations = change.deviations * found
         self._before = deviations[2]
-        if self._heights.alike:
-            # A gray camera records no colours: what would be a change of colour is a change of light there.
-            deviations[1] = deviations[0]
         return ContactResult(mask, True, strength, deviations[:2], core)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
@@ -315,7 +315,9 @@ class ContactDetector:
 
     def _extent(self, cells: int) -> float:
         """Number of cells from which a faint change of colour is a contact."""
-        return max(MIN_WIDE_AREA_SHARE * cells, CELLS_PER_LOG_RATE * math.log(cells / self._false_alarms))
+        assert self._background is not None
+        share = 0.0 if self._background.gray else MIN_WIDE_COLOUR_SHARE
+        return max(share * cells, CELLS_PER_LOG_RATE * math.log(cells / self._false_alarms))
 
     def _limit(self, cells: int) -> float:
         """Detection threshold on squared deviations, corrected for the number of cells."""
