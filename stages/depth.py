@@ -87,10 +87,11 @@ class Depth(Stage):
         height, width = contact_mask.shape
         placed = self.once(known.at, scale, (width, height))
         surface = Surface(placed.slopes, scale, self._errors, self._thickness)
-        depth = surface.depth(unmarked, rest, contact_mask)
+        slopes = surface.slopes(unmarked, rest, contact_mask)
+        depth = surface.depth_of(slopes, contact_mask)
         if (depth.greatest_stderr or 0) <= CONTRADICTION_ERROR * depth.greatest:
             return depth
-        if not surface.is_mirrored(unmarked, rest, contact_mask):
+        if not surface.is_mirrored(slopes):
             return depth
         self._warn(known.kind)
         return Absent("mirrored")

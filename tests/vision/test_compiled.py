@@ -21,6 +21,8 @@ from tactflow.vision.contact.contact_outline import draw_level, largest_nearby, 
 from tactflow.vision.contact.heights import smooth_range
 from tactflow.vision.contact.level_lines import select_contacts
 from tactflow.vision.contact.level_tree import grow_level_lines
+from tactflow.vision.depth.poisson import solve_down
+from tactflow.vision.depth.slopes import BAND_ROWS, coordinates, slopes_of_colour
 from tactflow.vision.geometry.downsample import halve
 
 needs_compiler = pytest.mark.skipif(
@@ -130,6 +132,26 @@ def test_outlines_are_the_same_in_c_and_in_numpy(seed: int) -> None:
     np.testing.assert_array_equal(*level)
     np.testing.assert_array_equal(*mask)
     assert smooth_range.compiled(values) == pytest.approx(smooth_range.plain(values), rel=1e-6)
+
+
+@needs_compiler
+def test_slopes_and_heights_are_the_same_in_c_and_in_numpy() -> None:
+    random = np.random.default_rng(0)
+    change = random.normal(0, 0.3, (37, 61, 3)).astype(np.float32)
+    near = np.ones((5, 61), np.uint8)
+    near[1, :20] = near[3] = 0
+    coefficients = random.normal(0, 0.3, (2, 19, 6)).astype(np.float32)
+    shift = -random.uniform(1e-4, 4, 61).astype(np.float32)
+    found = []
+    for name in ("compiled", "plain"):
+        slope = np.zeros((2, 37, 61), np.float32)
+        place = coordinates((61, 37))
+        getattr(slopes_of_colour, name)(change, coefficients, *place, near, 0.6, slope, BAND_ROWS, 12, 0.95)
+        heights = change[..., 0].copy()
+        getattr(solve_down, name)(heights, shift, -1, 1)
+        found.append((slope, heights))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4 * np.abs(other).max())
 
 
 @needs_compiler

@@ -1859,6 +1859,49 @@ LOOP slopes_of_colour(const Arg *a, double *out)
     return 0;
 }
 
+/* ---- depth/poisson.py -------------------------------------------------------------------------------------- */
+
+LOOP solve_down(const Arg *a, double *out)
+{
+    float *plane = a[0].data;
+    const float *shift = a[1].data;
+    const double ends[2] = {a[2].number, a[3].number};
+    const i64 high = a[0].shape[0], wide = a[0].shape[1];
+    /* Of each row: the inverse of its pivot, and its right side with the rows above eliminated. */
+    double *inverse = malloc(2 * high * wide * sizeof(double)), *side = inverse + high * wide;
+    (void)out;
+    if (!inverse)
+        return OUT_OF_MEMORY;
+    for (i64 y = 0; y < high; y++) {
+        const double middle = -2 + (y == 0 ? ends[0] : 0) + (y == high - 1 ? ends[1] : 0);
+        double *restrict pivot = inverse + y * wide, *restrict now = side + y * wide;
+        const double *above = pivot - wide, *before = now - wide;
+        const float *restrict row = plane + y * wide;
+        if (y == 0)
+            for (i64 x = 0; x < wide; x++) {
+                pivot[x] = 1 / (middle + shift[x]);
+                now[x] = row[x] * pivot[x];
+            }
+        else
+            for (i64 x = 0; x < wide; x++) {
+                pivot[x] = 1 / (middle + shift[x] - above[x]);
+                now[x] = (row[x] - before[x]) * pivot[x];
+            }
+    }
+    for (i64 y = high - 1; y >= 0; y--) {
+        const double *restrict pivot = inverse + y * wide, *below = side + (y + 1) * wide;
+        double *restrict now = side + y * wide;
+        float *restrict row = plane + y * wide;
+        for (i64 x = 0; x < wide; x++) {
+            if (y < high - 1)
+                now[x] -= pivot[x] * below[x];
+            row[x] = (float)now[x];
+        }
+    }
+    free(inverse);
+    return 0;
+}
+
 /* ---- Python ------------------------------------------------------------------------------------------------ */
 
 /* arguments : one word for each. A letter is the type of an array's elements (u1 ? i2 i4 i8 f4 f8), the digit after
@@ -1893,6 +1936,7 @@ static const Loop LOOPS[] = {
     {"sum_cells", "d2 d3 x d3 n d2 d2! d2! d2!", '-', sum_cells},
     {"compare_light", "f3 d1 x f2 f2 f3 q1 f2! d1!", 'n', compare_light},
     {"compare_points", "f3 d1 d1 d2 d2 d3 x d2! d1! d2! d1! d1!", '-', compare_points},
+    {"solve_down", "f2! f1 x x", '-', solve_down},
     {"slopes_of_colour", "f3 f3 f1 f1 B2 x f3! n n x", '-', slopes_of_colour},
 };
 #define COUNT ((int)(sizeof LOOPS / sizeof *LOOPS))

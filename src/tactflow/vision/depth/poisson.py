@@ -10,6 +10,7 @@ import numpy as np
 import scipy.fft
 
 from tactflow.vision.arrays import Floats32
+from tactflow.vision.compiled import kernel
 
 _Transform = Callable[..., Any]
 
@@ -23,9 +24,13 @@ _TRANSFORMS: Final[Mapping[tuple[bool, bool], tuple[_Transform, _Transform, int,
     (False, True): (scipy.fft.dst, scipy.fft.idst, 4, 0.5),
     (False, False): (scipy.fft.dst, scipy.fft.idst, 2, 1.0),
 }
-"""Whether the first and the last side of an axis are open -> transform, its inverse, their type, and the
+"""Whether the first and the last side of the rows are open -> transform, its inverse, their type, and the
 frequency of the first component, in half waves. All of them mirror the surface half a pixel outside: as it is
 where it goes on, upside down where it is at rest."""
+MIRROR_IMAGE: Final = {True: 1, False: -1}
+"""Whether a side is open -> the pixel beyond it, over the last one before it."""
+LEAST_EIGENVALUE: Final = -1e-9
+"""Instead of 0, for a surface whose mean the slopes do not tell: then the mean is near 0."""
 
 
 def integrate(
@@ -33,11 +38,12 @@ def integrate(
 ) -> Floats32:
     """Heights whose slopes are closest to the measured ones, in least squares.
 
-    Poisson's equation, solved by cosine and sine transforms. Where all sides are open the mean height is 0.
+    Poisson's equation, solved by a cosine or sine transform of the rows, and elimination down the columns.
+    Where all sides are open the mean height is 0.
 
     Parameters
     ----------
-    slope : (2, h, w) float32, growth to the right and down; quick where h and w are products of 2, 3 and 5.
+    slope : (2, h, w) float32, growth to the right and down; quick where w is a product of 2, 3 and 5.
     step : from a pixel to the next one, to the right and down, in the unit of the heights.
     sides : open ones.
 
@@ -58,25 +64,39 @@ def integrate(
     >>> np.round(integrate(slope, (0.5, 0.5), ((False, True), (True, True)))[0], 3).tolist()
     [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
     """
-    across, across_back, across_type, first_across = _TRANSFORMS[sides[0]]
-    down, down_back, down_type, first_down = _TRANSFORMS[sides[1]]
-    divergence = _divergence(slope, step, sides)
-    spectrum = across(divergence, across_type, axis=1, norm="ortho", overwrite_x=True)
-    spectrum = down(spectrum, down_type, axis=0, norm="ortho", overwrite_x=True)
-    height, width = spectrum.shape
-    eigenvalues = _eigenvalues(height, first_down)[:, None] + _eigenvalues(width, first_across)
+    transform, back, type_, first = _TRANSFORMS[sides[0]]
+    spectrum = transform(_divergence(slope, step, sides), type_, axis=1, norm="ortho", overwrite_x=True)
+    solve_down(spectrum, _eigenvalues(spectrum.shape[1], first), *(MIRROR_IMAGE[end] for end in sides[1]))
     if sides == ALL_OPEN:
-        # The mean is not known from slopes.
-        eigenvalues[0, 0] = np.inf
-    spectrum /= eigenvalues
-    spectrum = down_back(spectrum, down_type, axis=0, norm="ortho", overwrite_x=True)
-    return np.asarray(across_back(spectrum, across_type, axis=1, norm="ortho", overwrite_x=True), np.float32)
+        spectrum[:, 0] -= spectrum[:, 0].mean()
+    return np.asarray(back(spectrum, type_, axis=1, norm="ortho", overwrite_x=True), np.float32)
 
 
 @lru_cache(maxsize=256)
 def _eigenvalues(count: int, first: float) -> Floats32:
     """(count,): of the second difference, for the components of a transform."""
-    return np.asarray(2 * np.cos(np.pi * (np.arange(count) + first) / count) - 2, np.float32)
+    exact = 2 * np.cos(np.pi * (np.arange(count) + first) / count) - 2
+    return np.asarray(np.minimum(exact, LEAST_EIGENVALUE), np.float32)
+
+
+@kernel
+def solve_down(plane: Floats32, shift: Floats32, top: float, bottom: float) -> None:
+    """Solve a tridiagonal system in each column: second difference down plus `shift` times the solution.
+
+    plane : (h, w), the right sides, replaced by the solutions; h at least 2. shift : (w,), < 0. top, bottom :
+    the pixel beyond these sides, over the last one before them, see `MIRROR_IMAGE`.
+    """
+    middle = np.add.outer(np.full(len(plane), -2.0), shift)
+    middle[0] += top
+    middle[-1] += bottom
+    side = plane.astype(np.float64)
+    for row in range(1, len(plane)):
+        side[row] -= side[row - 1] / middle[row - 1]
+        middle[row] -= 1 / middle[row - 1]
+    side[-1] /= middle[-1]
+    for row in range(len(plane) - 2, -1, -1):
+        side[row] = (side[row] - side[row + 1]) / middle[row]
+    plane[:] = side
 
 
 def _divergence(slope: Floats32, step: tuple[float, float], sides: Sides) -> Floats32:

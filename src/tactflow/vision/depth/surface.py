@@ -103,6 +103,23 @@ def colour_change(image: Bytes | Floats32, rest: Rest, window: Window, gain: Flo
     return change.reshape(window.height, window.width, 3)
 
 
+class Slopes(NamedTuple):
+    """Slopes of the gel's surface in a window.
+
+    Attributes
+    ----------
+    slope : (2, h, w) float32, growth to the right and down, towards the camera.
+    window : of the picture.
+    open_sides : those that the picture cuts off, see `Window.open_sides`.
+    steep : share of the slopes that are steep, 0 to 1; None where no errors are known.
+    """
+
+    slope: Floats32
+    window: Window
+    open_sides: tuple[tuple[bool, bool], tuple[bool, bool]]
+    steep: float | None
+
+
 class Surface:
     """Height maps of a gel.
 
@@ -142,50 +159,54 @@ class Surface:
         gradients : (H, W, 2), `tactflow.ports.Gradients`, instead of those of the model; then no errors are
         known.
         """
-        slope, steep, window = self._slopes(image, rest, mask, gradients)
-        low, relative = self._integrated(slope, window, rest.window), None
-        if self._errors is not None and gradients is None:
-            unexplained = UNEXPLAINED_ERROR * self._unexplained(slope, low, mask[window.whole])
+        return self.depth_of(self.slopes(image, rest, mask, gradients), mask)
+
+    def depth_of(self, slopes: Slopes, mask: Bytes) -> Depth:
+        """The height map of slopes. mask : that of `slopes`."""
+        low, window, relative = self._integrated(slopes), slopes.window, None
+        if self._errors is not None and slopes.steep is not None:
+            unexplained = UNEXPLAINED_ERROR * self._unexplained(slopes.slope, low, mask[window.whole])
             relative = math.hypot(
-                unexplained, STEEP_ERROR * math.sqrt(steep), self._errors.between, ROUNDING_ERROR
+                unexplained, STEEP_ERROR * math.sqrt(slopes.steep), self._errors.between, ROUNDING_ERROR
             )
         return measured(low, window, mask, self._scale, relative, self._thickness)
 
     def heights(self, image: Bytes, rest: Rest, mask: Bytes) -> Floats32:
         """(h, w) float32: how far the gel is pushed in, mm >= 0, at half resolution; see `depth`."""
-        slope, _, window = self._slopes(image, rest, mask)
+        slopes = self.slopes(image, rest, mask)
         whole = np.zeros((rest.window.height, rest.window.width), np.float32)
-        whole[window.part] = self._integrated(slope, window, rest.window)
+        whole[slopes.window.part] = self._integrated(slopes)
         return whole
 
-    def is_mirrored(self, image: Bytes, rest: Rest, mask: Bytes) -> bool:
-        """Whether the slopes contradict each other less if left and right are exchanged; see `depth`.
+    def is_mirrored(self, slopes: Slopes) -> bool:
+        """Whether slopes contradict each other less if left and right are exchanged.
 
         Of slopes from a mirrored picture only those along y have the right sign. No surface has such slopes:
         it explains about half of them, and nearly all once the others are turned around.
         """
         from tactflow.vision.depth.poisson import integrate
 
-        slope, _, window = self._slopes(image, rest, mask)
-        everywhere, misfits = np.full((2 * window.height, 2 * window.width), 255, np.uint8), []
-        for sign in (1, -1):
-            turned = slope * np.array([sign, 1], np.float32)[:, None, None]
+        window = slopes.window
+        everywhere = np.full((2 * window.height, 2 * window.width), 255, np.uint8)
+
+        def misfit(slope: Floats32) -> float:
             # Not cut off at 0, so that pits and saddles count as well as bumps.
             step = (-2 * self._scale.x, -2 * self._scale.y)
-            heights = integrate(turned, step, window.open_sides(rest.window))
-            misfits.append(self._unexplained(turned, heights, everywhere))
-        return misfits[1] < MIRRORED_MISFIT and misfits[0] > MIRRORED_RATIO * misfits[1]
+            return self._unexplained(slope, integrate(slope, step, slopes.open_sides), everywhere)
 
-    def _slopes(
-        self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None
-    ) -> tuple[Floats32, float, Window]:
-        """(2, h, w) float32, the steep share of the slopes, the window."""
+        exchanged = misfit(slopes.slope * np.array([-1, 1], np.float32)[:, None, None])
+        return exchanged < MIRRORED_MISFIT and misfit(slopes.slope) > MIRRORED_RATIO * exchanged
+
+    def slopes(self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None) -> Slopes:
+        """The slopes of a frame; parameters as in `depth`."""
         at_rest = rest.around(image, mask)
         around = surroundings(mask, rest.window, at_rest.margin)
         window = around.window
+        open_sides = window.open_sides(rest.window)
         if gradients is not None:
             # The model's slopes fall where the gel is pushed in.
-            return -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32), 0.0, window
+            slope = -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32)
+            return Slopes(slope, window, open_sides, None)
         change = colour_change(image, rest, window, at_rest.gain)
         assert self._model is not None, "without a model, gradients are given"
         rows, columns = window.part
@@ -197,17 +218,15 @@ class Surface:
             around.near,
             MAX_HORIZONTAL_PART if steepest is None else steepest,
         )
-        steep = _steep_part(slope, steepest)
-        return slope, steep, window
+        return Slopes(slope, window, open_sides, _steep_part(slope, steepest))
 
-    def _integrated(self, slope: Floats32, window: Window, whole: Window) -> Floats32:
+    def _integrated(self, slopes: Slopes) -> Floats32:
         # Only here: runs without a calibration do not need SciPy's transforms.
         from tactflow.vision.depth.poisson import ALL_OPEN, integrate
 
         # A step is two processed pixels. Slopes rise towards the camera, into which the gel is pushed.
-        sides = window.open_sides(whole)
-        heights = integrate(slope, (-2 * self._scale.x, -2 * self._scale.y), sides)
-        if sides == ALL_OPEN:
+        heights = integrate(slopes.slope, (-2 * self._scale.x, -2 * self._scale.y), slopes.open_sides)
+        if slopes.open_sides == ALL_OPEN:
             # The picture shows no border at rest; most of its border lies outside the contact.
             border = np.concatenate([heights[0], heights[-1], heights[:, 0], heights[:, -1]])
             # `np.median` takes ten times as long.
