@@ -200,11 +200,20 @@ class FieldModel:
         first = (width - 1 - spacing * (columns - 1)) / 2, (height - 1 - spacing * (rows - 1)) / 2
         self.margin = MAX_OVERSHOOT_PITCHES * self.pitch + spacing
         """How much farther a cell may have moved than any tracked marker, px."""
-        self.fine = self._samples(Grid((rows, columns), first, spacing))
-        self.coarse = self._samples(Grid(((rows + 1) // 2, (columns + 1) // 2), first, 2 * spacing))
-        """For small and for large regions; the second has every other row and column of the first. Both are
-        fixed to the frame, so that the motion of a region does not depend on where its bounding box
+        self.grid = Grid((rows, columns), first, spacing)
+        """Fixed to the frame, so that the motion of a region does not depend on where its bounding box
         begins."""
+
+    @cached_property
+    def fine(self) -> Samples:
+        """For small regions."""
+        return self._samples(self.grid)
+
+    @cached_property
+    def coarse(self) -> Samples:
+        """For large regions: every other row and column of the grid."""
+        (rows, columns), first, spacing = self.grid
+        return self._samples(Grid(((rows + 1) // 2, (columns + 1) // 2), first, 2 * spacing))
 
     def _samples(self, grid: Grid) -> Samples:
         rows, columns = grid.shape
@@ -214,7 +223,9 @@ class FieldModel:
 
     def _kernel(self, points: Points) -> Floats:
         """(M, N), the kernel between points (M, 2), px, and the markers."""
-        return matern(cdist(points, self.origin) / self._length)
+        distance = cdist(points, self.origin)
+        distance /= self._length
+        return matern(distance)
 
     def __call__(self, markers: Markers) -> DisplacementField | None:
         """The field of one frame; None where fewer than three markers are seen.
@@ -246,7 +257,7 @@ class DisplacementField:
     """
 
     def __init__(self, model: FieldModel, markers: Markers, seen: Flags) -> None:
-        self.grid = model.fine.grid
+        self.grid = model.grid
         self._asked: tuple[Mask, GelMotion | None] | None = None
         self._shared: tuple[Mask, Floats] | None = None
         self._model, self._seen = model, seen
@@ -480,10 +491,18 @@ def _covered(mask: Mask, box: Sequence[int], places: Floats, spacing: float) -> 
 
 
 def matern(distance: Floats) -> Floats:
-    """The Matern kernel of order 5/2 of distances in correlation lengths: 1 at 0.
+    """The Matern kernel of order 5/2 of distances in correlation lengths, which are overwritten: 1 at 0.
+
+    New memory for each step would take most of the time.
 
     >>> float(matern(np.array(0.0)))
     1.0
     """
-    scaled = math.sqrt(5) * distance
-    return np.asarray((1 + scaled + scaled * scaled / 3) * np.exp(-scaled))
+    scaled = distance
+    scaled *= -math.sqrt(5)
+    kernel = np.asarray(scaled / 3)
+    kernel -= 1
+    kernel *= scaled
+    kernel += 1
+    kernel *= np.exp(scaled, out=scaled)
+    return kernel
