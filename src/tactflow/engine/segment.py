@@ -81,7 +81,6 @@ class Segment:
     name : in the plan.
     nodes : all open ones of the run.
     ending : of the run.
-    latency : of its data sinks.
     retake : asks the source for a new reference.
 
     Attributes
@@ -91,6 +90,7 @@ class Segment:
     nodes : in order of evaluation.
     current : id of the running node.
     calls : number of calls of nodes so far.
+    latency : from capture to the end of its data sinks.
     epoch : of the last tick; a new one resets all nodes.
     references : turns frames into references on request of its stages; None if other stages may have
         processed those frames already.
@@ -102,12 +102,11 @@ class Segment:
         plan: Plan,
         nodes: Mapping[str, RunningNode],
         ending: Ending,
-        latency: Durations,
         retake: Callable[[], None],
     ) -> None:
         self.name = name
         self._ending = ending
-        self._latency = latency
+        self.latency = Durations()
         self._retake = retake
         self.nodes = [nodes[id_] for id_ in plan.segments[name] if id_ in nodes]
         by_id = {node.id: node for node in self.nodes}
@@ -165,7 +164,7 @@ class Segment:
             stage.watched = maker not in self.nodes or tick.values[slot] is not False
         self.current = None
         if tick.demand and self._data_sinks:
-            self._latency.add(perf_counter() - tick.frame.captured)
+            self.latency.add(perf_counter() - tick.frame.captured)
 
     def _hold(self, tick: TickState) -> None:
         """Repeat the outputs of all stages with a memory, for a damaged frame. The others get the same inputs

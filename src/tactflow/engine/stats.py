@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import threading
 from bisect import bisect_left
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import accumulate
 from math import ceil, exp, log
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ _BIN_OFFSET = -log(_MIN_DURATION_S) * _BINS_PER_E
 
 
 class Durations:
-    """A histogram of durations with logarithmic bins; quantiles are accurate to 1 %. Thread-safe.
+    """A histogram of durations with logarithmic bins; quantiles are accurate to 1 %.
 
-    Covers 0.1 us to about 5 h; values outside count in the outermost bins.
+    Covers 0.1 us to about 5 h; values outside count in the outermost bins. One thread adds, any may read.
 
     Attributes
     ----------
@@ -38,14 +39,21 @@ class Durations:
     def __init__(self) -> None:
         self.total = 0.0
         self._bins = [0] * _BIN_COUNT
-        self._lock = threading.Lock()
 
     def add(self, seconds: float) -> None:
         """Count one duration, s."""
         index = int(log(seconds) * _BINS_PER_E + _BIN_OFFSET) if seconds > _MIN_DURATION_S else 0
-        with self._lock:
-            self._bins[index if index < _BIN_COUNT else -1] += 1
-            self.total += seconds
+        self._bins[index if index < _BIN_COUNT else -1] += 1
+        self.total += seconds
+
+    @classmethod
+    def joined(cls, parts: Iterable[Durations]) -> Durations:
+        """All durations of several histograms."""
+        whole = cls()
+        for part in parts:
+            whole.total += part.total
+            whole._bins = list(map(add, whole._bins, part._bins))
+        return whole
 
     @property
     def count(self) -> int:
@@ -54,8 +62,7 @@ class Durations:
 
     def quantile(self, q: float) -> float | None:
         """The quantile q in [0, 1], s; None without durations."""
-        with self._lock:
-            counts = list(accumulate(self._bins))
+        counts = list(accumulate(self._bins))
         if not counts[-1]:
             return None
         index = bisect_left(counts, max(1, ceil(q * counts[-1])))
@@ -111,8 +118,10 @@ class SignalStats:
 
     def add(self, value: bool) -> None:
         """Count one tick."""
-        self.true += value
-        self.rises += value and not self.last
+        if value:
+            self.true += 1
+            if not self.last:
+                self.rises += 1
         self.last = value
 
     def entry(self) -> dict[str, int]:

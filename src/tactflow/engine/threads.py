@@ -27,7 +27,6 @@ class Threads:
     Attributes
     ----------
     links : of the plan.
-    latency : from capture to the end of each segment with sinks.
     """
 
     def __init__(self, ending: Ending, retake: Callable[[], None]) -> None:
@@ -36,7 +35,6 @@ class Threads:
         self._segments: dict[str, Segment] = {}
         self._threads: dict[str, threading.Thread] = {}
         self.links: list[Link[TickState]] = []
-        self.latency = Durations()
 
     def start(
         self,
@@ -51,7 +49,7 @@ class Threads:
         called with the source's segment.
         """
         for name in plan.segments:
-            self._segments[name] = Segment(name, plan, nodes, self._ending, self.latency, self._retake)
+            self._segments[name] = Segment(name, plan, nodes, self._ending, self._retake)
         for link_plan in plan.links:
             link: Link[TickState] = Link(link_plan.name, link_plan.capacity, link_plan.when_full)
             self.links.append(link)
@@ -88,6 +86,11 @@ class Threads:
             first = with_stages[0]
         takers = [id_ for id_, n in nodes.items() if n.node.component.delivery.takes_references]
         first.references = NewReferences(frame_slot, takers)
+
+    @property
+    def latency(self) -> Durations:
+        """From capture to the end of each segment with sinks."""
+        return Durations.joined(segment.latency for segment in self._segments.values())
 
     @property
     def dropped(self) -> int:
