@@ -261,9 +261,11 @@ class SeparateContact(Part):
 
 def _mean_normal(_: types.Contact, result: Any) -> list[float] | None:
     """Unit vector along the sum of the normals in the contact; None without any."""
-    total = result.normals[result.contact_mask > 0].sum(axis=0, dtype=np.float64)
-    length = float(np.linalg.norm(total))
-    return (total / length).tolist() if length else None
+    # Only here: who reads messages needs no OpenCV.
+    from tactflow.vision.depth.normals import mean_normal
+
+    mean = mean_normal(result.normals, result.contact_mask)
+    return None if mean is None else mean.tolist()
 
 
 class Contact(SeparateContact):

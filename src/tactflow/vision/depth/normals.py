@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Floats32
+from tactflow.vision.arrays import Bytes, Floats, Floats32
 from tactflow.vision.types import Scale
 
 
@@ -32,9 +33,30 @@ def surface_normals(heights: Floats32, scale: Scale) -> Floats32:
     >>> [round(part, 3) for part in normals[1, 1].tolist()]
     [0.6, 0.0, 0.8]
     """
-    normals = np.empty((*heights.shape, 3), np.float32)
-    for axis, step in ((0, scale.y), (1, scale.x)):
-        normals[..., 1 - axis] = np.gradient(heights, np.float32(step), axis=axis)
-    normals[..., 2] = 1
-    normals /= np.sqrt(np.sum(normals * normals, axis=2, keepdims=True))
-    return normals
+    replicate = cv2.BORDER_REPLICATE
+    x, y = (
+        np.asarray(cv2.Sobel(heights, cv2.CV_32F, *axes, ksize=1, scale=0.5 / step, borderType=replicate))
+        for axes, step in (((1, 0), scale.x), ((0, 1), scale.y))
+    )
+    # At the border the difference is to the next pixel, not to the one after it.
+    x[:, [0, -1]] *= 2
+    y[[0, -1]] *= 2
+    # Planes: with three numbers as the inner loop, NumPy takes six times as long.
+    z = 1 / np.sqrt(x * x + y * y + 1)
+    x *= z
+    y *= z
+    return np.asarray(cv2.merge([x, y, z]), np.float32)
+
+
+def mean_normal(normals: Floats32, mask: Bytes) -> Floats | None:
+    """Unit vector (3,) along the sum of the normals where a mask is not 0; None without one.
+
+    normals : (H, W, 3) float32. mask : (H, W) uint8.
+
+    >>> up = np.tile(np.float32([0, 0, 1]), (2, 3, 1))
+    >>> mean_normal(up, np.ones((2, 3), np.uint8)).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    mean = np.array(cv2.mean(normals, mask)[:3])
+    length = float(np.linalg.norm(mean))
+    return mean / length if length else None
