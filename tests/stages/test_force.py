@@ -15,7 +15,7 @@ from tactflow.calibration.file import Calibration, DotsForceEntry, ForceEntry, L
 from tactflow.engine.contract import StageParams
 from tactflow.engine.frame import Absent
 from tactflow.stages.force import Force
-from tactflow.vision.field_force import FieldForce
+from tactflow.vision.field_force import GRID_CELLS, FieldForce
 from tactflow.vision.force import LightChange
 from tactflow.vision.types import Contact, Depth, Flow, Markers, Scale
 from tests.calibrations import bare_calibration
@@ -30,8 +30,9 @@ BY_DEPTH = LinearForceEntry(
 )  # type: ignore[arg-type]
 BY_CHANGE = LinearForceEntry(stiffness={"root_change": 0.1}, greatest={"root_change": 90}, **FIT)  # type: ignore[arg-type]
 DRAG = LinearForceEntry(stiffness={"shear_by_area": 0.5}, greatest={"shear_by_area": 4.0}, **FIT)  # type: ignore[arg-type]
+CELLS = GRID_CELLS * GRID_CELLS * 3 // 4
 BY_DOTS = FieldForce(
-    np.stack([np.tile([1 / 48, 0.0], 48), np.tile([0.0, 1 / 48], 48)]),
+    np.stack([np.tile([1 / CELLS, 0.0], CELLS), np.tile([0.0, 1 / CELLS], CELLS)]),
     np.array([[2.0, 0, 0], [0, 2, 10], [0, 0, 0], [0, 0, 0], [0, 0, 0]]),
 )
 """x and y are twice the mean displacement, z ten times that along y, N per mm."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactflow.vision.field_force import FieldForce, displacement, polynomial_terms
+from tactflow.vision.field_force import FieldForce, between_dots, displacement, polynomial_terms
 from tactflow.vision.flow.displacement_field import FieldModel
 from tactflow.vision.types import Markers, MarkerStatus, Scale
 
@@ -33,9 +33,9 @@ def test_the_displacement_hardly_depends_on_which_dots_are_seen() -> None:
     dots = pressed(20)
     known = moved(dots)
     assert known is not None
-    assert known.shape == (48, 2)
-    # The four cells around the middle: 3 px of 0.1 mm, 1 px of 0.2 mm.
-    assert known[[19, 20, 27, 28]].mean(axis=0) == pytest.approx([0.27, -0.18], abs=0.01)
+    assert known.shape == (192, 2)
+    # The four cells around the middle, where 0.97 of the drag is left: 3 px of 0.1 mm, 1 px of 0.2 mm.
+    assert known[[87, 88, 103, 104]].mean(axis=0) == pytest.approx([0.29, -0.19], abs=0.01)
     others = moved(pressed(16))
     assert others is not None
     assert np.abs(known - others).max() < 0.02
@@ -44,6 +44,15 @@ def test_the_displacement_hardly_depends_on_which_dots_are_seen() -> None:
     fewer = moved(replace(dots, status=status))
     assert fewer is not None
     assert np.abs(known - fewer).max() < 0.05
+
+
+def test_cells_beyond_the_outermost_dots_are_not_between_them() -> None:
+    dots = np.array([[30.0, 20.0], [130.0, 20.0], [130.0, 100.0], [30.0, 100.0]])
+    inside = between_dots(dots, SIZE).reshape(12, 16)
+    assert inside[2:10, 3:13].all()
+    assert inside.sum() == 8 * 10
+    # Rows and columns of dots between them change nothing.
+    assert (between_dots(np.vstack([dots, [[80.0, 60.0]]]), SIZE) == inside.ravel()).all()
 
 
 def test_without_a_majority_of_the_dots_there_is_no_displacement() -> None:

@@ -14,7 +14,7 @@ from tactflow.engine.errors import ConfigError
 from tactflow.engine.once import Once
 from tactflow.message.result import Result
 from tactflow.vision.arrays import Flags, Floats
-from tactflow.vision.field_force import displacement
+from tactflow.vision.field_force import between_dots, displacement
 from tactflow.vision.flow.displacement_field import MIN_MARKERS, FieldModel
 from tactflow.vision.force import BY_CHANGE, BY_DEPTH, BY_SHEAR, LightChange, Seen, seen
 
@@ -36,7 +36,8 @@ class Watched:
     drag : feature -> (n,) complex128, x + i y; NaN where the flow is not known. touched : (n,) bool.
     change : (n,) float64, of the light of the whole gel, touched or not, mm^2. change_at_rest : see
     `ForceModel`. field : (n, S, 2) float64, mm, see `field_force.displacement`; NaN where it is not known,
-    None where it never is. pictures : whether the frames were taken one by one, so that times mean nothing.
+    None where it never is, 0 in cells that are not `between_dots`. pictures : whether the frames were taken
+    one by one, so that times mean nothing.
     """
 
     frames: Floats
@@ -89,6 +90,8 @@ class Watcher:
         moved = None
         if markers is not None and len(markers.origin) >= MIN_MARKERS:
             moved = displacement(self._once(FieldModel, markers.origin, size), markers, scale, size)
+            if moved is not None:
+                moved = np.where(self._once(between_dots, markers.origin, size)[:, None], moved, 0.0)
         self._fields.append(moved)
         level = change if moved is None else float(_motion(moved))
         return Moment(len(self._frames) - 1, result.t, level)

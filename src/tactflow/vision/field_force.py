@@ -16,14 +16,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Floats
+from tactflow.vision.arrays import Flags, Floats
 from tactflow.vision.flow.displacement_field import MIN_MARKERS, DisplacementField, FieldModel
 from tactflow.vision.types import Markers, MarkerStatus, Scale
 
-GRID_CELLS: Final = 8
-"""Cells along the longer side of the picture. Errors of forces left out are the same with 12 and with 16."""
+GRID_CELLS: Final = 16
+"""Cells along the longer side of the picture: a few for each dot of the coarsest lattices (a FingerVision has
+seven along the longer side), so that the outline of the dots is followed."""
 SECOND_ORDER: Final = 0.1
 """Expected size of the terms of second order, relative to the linear ones at a typical load: the strain of a
 pressed gel, about a tenth."""
@@ -41,7 +43,7 @@ def displacement(model: FieldModel, markers: Markers, scale: Scale, size: tuple[
     >>> origin = np.column_stack([x.ravel(), y.ravel()])
     >>> markers = Markers(origin, origin + [2.0, 0.0], np.zeros(35, np.uint8), np.full(35, 0.01))
     >>> scale = Scale(0.1, 0.1, (0.0, 0.0), (0.0, 0.0))
-    >>> displacement(FieldModel(origin, (160, 120)), markers, scale, (160, 120))[27].round(2).tolist()
+    >>> displacement(FieldModel(origin, (160, 120)), markers, scale, (160, 120))[87].round(2).tolist()
     [0.2, 0.0]
     """
     tracked = np.count_nonzero(markers.status == int(MarkerStatus.TRACKED))
@@ -49,6 +51,21 @@ def displacement(model: FieldModel, markers: Markers, scale: Scale, size: tuple[
         return None
     field: DisplacementField | None = model(markers)
     return None if field is None else field.at(_grid(size)) * (scale.x, scale.y)
+
+
+def between_dots(origin: Floats, size: tuple[int, int]) -> Flags:
+    """(S,) bool: which cells of the grid lie in the convex hull of the dots at rest.
+
+    Beyond it the displacement is extrapolated: it repeats the outermost dots, and would count them several
+    times over. origin : (N, 2) float64, px, N >= 3. size : (width, height) of the processed frame, px.
+
+    >>> between_dots(np.array([[0.0, 0.0], [80.0, 0.0], [0.0, 119.0], [80.0, 119.0]]), (160, 120)).mean().tolist()
+    0.5
+    """
+    inside = np.zeros(size[::-1], np.uint8)
+    cv2.fillConvexPoly(inside, cv2.convexHull(np.rint(origin).astype(np.int32)), 1)
+    x, y = np.rint(_grid(size)).astype(np.intp).T
+    return np.asarray(inside[y, x] > 0)
 
 
 def _grid(size: tuple[int, int]) -> Floats:

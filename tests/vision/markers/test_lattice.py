@@ -58,6 +58,22 @@ def test_a_missing_mark_is_wanted_where_it_was() -> None:
     assert support(np.array([GRID[missing], GRID[missing] + 15.0]), wanted).tolist() == [4, 0]
 
 
+def test_the_next_row_towards_a_horizon_is_wanted_where_the_rows_draw_together() -> None:
+    columns, rows = np.arange(0, 150, 30.0), np.array([0.0, 40, 70, 92, 108])
+    points = np.array([(x, y) for y in rows[:4] for x in columns])
+    next_row = np.array([(x, rows[4]) for x in columns])
+    assert (support(next_row, Lattice(points).predicted) == 1).all()
+    # Where rows are evenly spaced, both predictions of a line are one.
+    even = np.array([(x, y) for y in np.arange(0, 120, 30.0) for x in columns])
+    assert support(np.array([[60.0, 120.0]]), Lattice(even).predicted).tolist() == [1]
+
+
+def test_a_step_over_a_missing_mark_does_not_make_the_next_one_longer() -> None:
+    points = np.array([(x, y) for y in (0.0, 30.0, 60.0) for x in (0.0, 30.0, 60.0, 115.0)])
+    wanted = Lattice(points).predicted
+    assert support(np.array([[170.0, 30.0], [215.0, 30.0]]), wanted).tolist() == [1, 0]
+
+
 def test_no_marks_and_one_mark_form_no_lattice() -> None:
     for count in (0, 1, 2):
         points = GRID[:count]

@@ -123,16 +123,37 @@ class Lattice:
 
     @property
     def predicted(self) -> Corners:
-        """Where marks are predicted: at corners of parallelograms, and one step further along each line."""
+        """Where marks are predicted: at corners of parallelograms, and one step further along each line.
+
+        A step is as long as the one before it; or, as towards a horizon, shorter by the same factor as that
+        one. Of these two predictions, `support` counts one.
+        """
         found, (first, last) = self.corners, np.concatenate([self.links, self.links[:, ::-1]]).T
-        step = self.points[last] - self.points[first]
+        scales = np.stack([np.ones(len(first)), self._foreshortening(first, last)])
+        steps = (self.points[last] - self.points[first]) * scales[:, :, None]
         return Corners(
-            np.concatenate([found.points, self.points[last] + step]),
-            np.concatenate([found.reach, CLOSING_DISTANCE_SIDES * np.hypot(*step.T)]),
-            np.concatenate([found.first, first]),
-            np.concatenate([found.middle, last]),
-            np.concatenate([found.last, last]),
+            np.concatenate([found.points, *(self.points[last] + steps)]),
+            np.concatenate([found.reach, *(CLOSING_DISTANCE_SIDES * np.linalg.norm(steps, axis=2))]),
+            np.concatenate([found.first, first, first]),
+            np.concatenate([found.middle, last, last]),
+            np.concatenate([found.last, last, last]),
         )
+
+    def _foreshortening(self, first: Indices, last: Indices) -> Floats:
+        """(L,) length of each link from `first` to `last`, (L,), over that of the link before it in line; 1
+        without one, or where it is longer, which tells of a missing mark."""
+        middle, one, other = pairs_of_links(self.links)
+        before, after = self.points[one] - self.points[middle], self.points[other] - self.points[middle]
+        lengths = np.hypot(*before.T), np.hypot(*after.T)
+        straight = (before * after).sum(axis=1) < -MAX_CORNER_COSINE * lengths[0] * lengths[1]
+        middle, ratio = middle[straight], (lengths[1] / lengths[0])[straight]
+        count, result = len(self.points), np.ones(len(first))
+        number = first * count + last
+        order = np.argsort(number)
+        for end, scale in ((other[straight], ratio), (one[straight], 1 / ratio)):
+            link = order[np.searchsorted(number, middle * count + end, sorter=order)]
+            result[link] = np.minimum(scale, 1)
+        return result
 
     @cached_property
     def _closing(self) -> Indices:
@@ -212,6 +233,20 @@ def corners(centers: Floats, edges: Indices) -> Corners:
     >>> corners(square, np.array([[0, 1], [0, 2]])).points.tolist()
     [[10.0, 10.0]]
     """
+    c, a, b = pairs_of_links(edges)
+    one, other = centers[a] - centers[c], centers[b] - centers[c]
+    lengths = np.hypot(*one.T), np.hypot(*other.T)
+    open_ = np.abs((one * other).sum(axis=1)) < MAX_CORNER_COSINE * lengths[0] * lengths[1]
+    reach = CLOSING_DISTANCE_SIDES * (lengths[0] + lengths[1])[open_] / 2
+    return Corners((centers[c] + one + other)[open_], reach, a[open_], c[open_], b[open_])
+
+
+def pairs_of_links(edges: Indices) -> tuple[Indices, Indices, Indices]:
+    """All pairs of links (E, 2) that meet: the mark where they do, and the two at their other ends, (P,) each.
+
+    >>> [part.tolist() for part in pairs_of_links(np.array([[0, 1], [1, 2]]))]
+    [[1], [0], [2]]
+    """
     both = np.concatenate([edges, edges[:, ::-1]])
     both = both[np.lexsort((both[:, 1], both[:, 0]))]
     middle, first, last = ([np.zeros(0, np.int64)] for _ in range(3))
@@ -222,11 +257,7 @@ def corners(centers: Floats, edges: Indices) -> Corners:
         first.append(both[same, 1])
         last.append(both[same + step, 1])
     c, a, b = (np.concatenate(part) for part in (middle, first, last))
-    one, other = centers[a] - centers[c], centers[b] - centers[c]
-    lengths = np.hypot(*one.T), np.hypot(*other.T)
-    open_ = np.abs((one * other).sum(axis=1)) < MAX_CORNER_COSINE * lengths[0] * lengths[1]
-    reach = CLOSING_DISTANCE_SIDES * (lengths[0] + lengths[1])[open_] / 2
-    return Corners((centers[c] + one + other)[open_], reach, a[open_], c[open_], b[open_])
+    return c, a, b
 
 
 def components(groups: Indices, count: int) -> Indices:
@@ -237,8 +268,10 @@ def components(groups: Indices, count: int) -> Indices:
 
 
 def support(points: Floats, expected: Corners) -> Indices:
-    """Number (n,) of corners that each point (n, 2) closes."""
+    """Number (n,) of corners that each point (n, 2) closes; those that the same marks span count once."""
     if not (len(points) and len(expected.points)):
         return np.zeros(len(points), np.int64)
     closing = KDTree(points).query_ball_point(expected.points, expected.reach)
-    return np.bincount(np.concatenate(closing).astype(np.int64), minlength=len(points))
+    corner = np.repeat(np.arange(len(closing)), [len(near) for near in closing])
+    pairs = np.column_stack([np.concatenate(closing).astype(np.int64), *(part[corner] for part in expected[2:])])
+    return np.bincount(np.unique(pairs, axis=0)[:, 0], minlength=len(points))

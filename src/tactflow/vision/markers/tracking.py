@@ -26,7 +26,7 @@ from tactflow.vision.markers.matching import (
     grow,
 )
 from tactflow.vision.markers.motion import MotionEvidence
-from tactflow.vision.markers.selection import MIN_STRENGTH_RATIO
+from tactflow.vision.markers.selection import MIN_STRENGTH_RATIO, MIN_SUPPORT
 from tactflow.vision.markers.spots import MIN_SIGMA_PX, RADIUS_PER_SIGMA, find_peaks
 from tactflow.vision.markers.template import Alignment, MarkerTemplates
 from tactflow.vision.types import Markers, MarkerStatus
@@ -205,7 +205,7 @@ class MarkerTracker:
         if found.probability is None or self._prior is None:
             return False
         joins = (found.probability > JOINING_PROBABILITY) & (
-            lattice.support(found.centers, lattice.Lattice(self._position).predicted) > 0
+            lattice.support(found.centers, lattice.Lattice(self._position).predicted) >= MIN_SUPPORT
         )
         joins &= _are_apart(found.centers, self._position, self._pitch / 2)
         if not joins.any():
