@@ -59,7 +59,8 @@ def between_dots(origin: Floats, size: tuple[int, int]) -> Flags:
     Beyond it the displacement is extrapolated: it repeats the outermost dots, and would count them several
     times over. origin : (N, 2) float64, px, N >= 3. size : (width, height) of the processed frame, px.
 
-    >>> between_dots(np.array([[0.0, 0.0], [80.0, 0.0], [0.0, 119.0], [80.0, 119.0]]), (160, 120)).mean().tolist()
+    >>> dots = np.array([[0.0, 0.0], [80.0, 0.0], [0.0, 119.0], [80.0, 119.0]])
+    >>> between_dots(dots, (160, 120)).mean().tolist()
     0.5
     """
     inside = np.zeros(size[::-1], np.uint8)

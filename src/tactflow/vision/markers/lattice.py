@@ -242,7 +242,7 @@ def corners(centers: Floats, edges: Indices) -> Corners:
 
 
 def pairs_of_links(edges: Indices) -> tuple[Indices, Indices, Indices]:
-    """All pairs of links (E, 2) that meet: the mark where they do, and the two at their other ends, (P,) each.
+    """All pairs of links (E, 2) that meet: the mark where they do, and their two other ends, (P,) each.
 
     >>> [part.tolist() for part in pairs_of_links(np.array([[0, 1], [1, 2]]))]
     [[1], [0], [2]]
@@ -273,5 +273,7 @@ def support(points: Floats, expected: Corners) -> Indices:
         return np.zeros(len(points), np.int64)
     closing = KDTree(points).query_ball_point(expected.points, expected.reach)
     corner = np.repeat(np.arange(len(closing)), [len(near) for near in closing])
-    pairs = np.column_stack([np.concatenate(closing).astype(np.int64), *(part[corner] for part in expected[2:])])
+    pairs = np.column_stack(
+        [np.concatenate(closing).astype(np.int64), *(part[corner] for part in expected[2:])]
+    )
     return np.bincount(np.unique(pairs, axis=0)[:, 0], minlength=len(points))
