@@ -21,8 +21,10 @@ from tactflow.vision.contact.contact_outline import draw_level, largest_nearby, 
 from tactflow.vision.contact.heights import smooth_range
 from tactflow.vision.contact.level_lines import select_contacts
 from tactflow.vision.contact.level_tree import grow_level_lines
-from tactflow.vision.depth.poisson import solve_down
+from tactflow.vision.depth.poisson import divergence, solve_down
 from tactflow.vision.depth.slopes import BAND_ROWS, coordinates, slopes_of_colour
+from tactflow.vision.depth.surface import relative_change, slope_misfit
+from tactflow.vision.depth.surroundings import light_around
 from tactflow.vision.geometry.downsample import halve
 
 needs_compiler = pytest.mark.skipif(
@@ -135,21 +137,31 @@ def test_outlines_are_the_same_in_c_and_in_numpy(seed: int) -> None:
 
 
 @needs_compiler
-def test_slopes_and_heights_are_the_same_in_c_and_in_numpy() -> None:
+def test_loops_of_the_height_map_are_the_same_in_c_and_in_numpy() -> None:
     random = np.random.default_rng(0)
     change = random.normal(0, 0.3, (37, 61, 3)).astype(np.float32)
+    level = random.uniform(0.3, 1, change.shape).astype(np.float32)
+    picture = random.integers(0, 256, (37, 183), np.uint8)
     near = np.ones((5, 61), np.uint8)
     near[1, :20] = near[3] = 0
     coefficients = random.normal(0, 0.3, (2, 19, 6)).astype(np.float32)
     shift = -random.uniform(1e-4, 4, 61).astype(np.float32)
+    distance = random.uniform(0, 9, (37, 61)).astype(np.float32)
+    gain = np.array([0.9, 1.0, 1.2], np.float32)
     found = []
     for name in ("compiled", "plain"):
+        growth, rings = np.empty(3, np.float32), np.zeros((2, 9))
+        getattr(light_around, name)(change, level, distance, 2, 0.5, growth, rings)
+        relative = np.empty((30, 90), np.float32)
+        getattr(relative_change, name)(picture[:30, 60:150].copy(), picture, 5, 30, gain, 20.0, relative)
         slope = np.zeros((2, 37, 61), np.float32)
         place = coordinates((61, 37))
         getattr(slopes_of_colour, name)(change, coefficients, *place, near, 0.6, slope, BAND_ROWS, 12, 0.95)
-        heights = change[..., 0].copy()
+        heights = np.empty((37, 61), np.float32)
+        getattr(divergence, name)(slope, -0.1, -0.2, 1, -1, -1, 1, heights)
         getattr(solve_down, name)(heights, shift, -1, 1)
-        found.append((slope, heights))
+        misfit = getattr(slope_misfit, name)(slope, heights, picture[:, :61] // 200, 0.1, 0.2)
+        found.append((growth, rings, relative, slope, heights, np.array(misfit)))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4 * np.abs(other).max())
 

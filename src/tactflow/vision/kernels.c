@@ -1510,8 +1510,8 @@ LOOP align_marks(const Arg *a, double *out)
 
 /* ---- flow/motion.py ---------------------------------------------------------------------------------------- */
 
-/* The median of values, which are reordered (Hoare's selection). */
-static double median_of(double *values, i64 count)
+/* The upper one of the middle values, which are reordered (Hoare's selection). */
+static double upper_median_of(double *values, i64 count)
 {
     const i64 upper = count / 2;
     i64 first = 0, last = count - 1;
@@ -1534,12 +1534,20 @@ static double median_of(double *values, i64 count)
         if (i > upper)
             last = j;
     }
+    return values[upper];
+}
+
+/* The median of values, which are reordered. */
+static double median_of(double *values, i64 count)
+{
+    const i64 upper = count / 2;
+    const double middle = upper_median_of(values, count);
     if (count % 2)
-        return values[upper];
+        return middle;
     double below = values[0];
     for (i64 k = 1; k < upper; k++)
         below = MAX(below, values[k]);
-    return (below + values[upper]) / 2;
+    return (below + middle) / 2;
 }
 
 LOOP rate_motion(const Arg *a, double *out)
@@ -1865,7 +1873,117 @@ LOOP slopes_of_colour(const Arg *a, double *out)
     return 0;
 }
 
+/* ---- depth/surroundings.py, depth/surface.py ----------------------------------------------------------------- */
+
+LOOP light_around(const Arg *a, double *out)
+{
+    const float *change = a[0].data, *level = a[1].data, *distance = a[2].data;
+    const float nearest = (float)a[3].number, least = (float)a[4].number;
+    float *growth = a[5].data;
+    double *profile = a[6].data, *counts = profile + a[6].shape[1];
+    const i64 cells = a[2].shape[0] * a[2].shape[1];
+    double *ratios = malloc((cells + 1) * sizeof(double));
+    (void)out;
+    if (!ratios)
+        return OUT_OF_MEMORY;
+    for (int k = 0; k < 3; k++) {
+        i64 count = 0;
+        for (i64 i = 0; i < cells; i++)
+            if (distance[i] >= nearest && level[3 * i + k] >= least)
+                ratios[count++] = change[3 * i + k] / level[3 * i + k];
+        growth[k] = count ? (float)upper_median_of(ratios, count) : 0;
+    }
+    free(ratios);
+    for (i64 i = 0; i < cells; i++) {
+        const i64 ring = (i64)distance[i];
+        float square = 0;
+        for (int k = 0; k < 3; k++) {
+            const float off = change[3 * i + k] - growth[k] * level[3 * i + k];
+            square += off * off;
+        }
+        profile[ring] += sqrtf(square);
+        counts[ring] += 1;
+    }
+    return 0;
+}
+
+LOOP relative_change(const Arg *a, double *out)
+{
+    const u8 *picture = a[0].data, *untouched = a[1].data;
+    const float *gain = a[4].data, offset = (float)a[5].number;
+    float *change = a[6].data;
+    const i64 stride = a[1].shape[1], top = a[2].whole, left = a[3].whole, high = a[0].shape[0], wide = a[0].shape[1];
+    float *restrict inverse = malloc((wide + 1) * sizeof(float));
+    (void)out;
+    if (!inverse)
+        return OUT_OF_MEMORY;
+    for (i64 i = 0; i < wide; i++)
+        inverse[i] = 1 / gain[i % 3];
+    for (i64 y = 0; y < high; y++) {
+        const u8 *restrict now = picture + y * wide, *restrict light = untouched + (top + y) * stride + left;
+        float *restrict row = change + y * wide;
+        for (i64 i = 0; i < wide; i++)
+            row[i] = (now[i] * inverse[i] - light[i]) / (light[i] + offset);
+    }
+    free(inverse);
+    return 0;
+}
+
+/* Adds the squares of the mean slope of two pixels, twice each, where the second is in contact; and of what the heights
+ * leave of it, `step` apart. */
+INLINE void add_misfit(const float *first, const float *second, const float *low, const float *high, const u8 *contact,
+                       float step, i64 count, double *total, double *left)
+{
+    float whole = 0, rest = 0;
+    for (i64 i = 0; i < count; i++) {
+        const float inside = contact[i] != 0, slope = first[i] + second[i], off = slope + (high[i] - low[i]) / step;
+        whole += inside * slope * slope;
+        rest += inside * off * off;
+    }
+    *total += whole;
+    *left += rest;
+}
+
+LOOP slope_misfit(const Arg *a, double *out)
+{
+    const float *right = a[0].data, *height = a[1].data;
+    const u8 *contact = a[2].data;
+    const i64 high = a[1].shape[0], wide = a[1].shape[1];
+    const float *down = right + high * wide, across = (float)a[3].number, along = (float)a[4].number;
+    for (i64 y = 0; y < high; y++) {
+        const i64 k = y * wide, before = k - wide;
+        add_misfit(right + k, right + k + 1, height + k, height + k + 1, contact + k + 1, across, wide - 1, out, out + 1);
+        if (y > 0)
+            add_misfit(down + before, down + k, height + before, height + k, contact + k, along, wide, out, out + 1);
+    }
+    return 0;
+}
+
 /* ---- depth/poisson.py -------------------------------------------------------------------------------------- */
+
+LOOP divergence(const Arg *a, double *out)
+{
+    const float *right = a[0].data, across = (float)a[1].number / 2, along = (float)a[2].number / 2;
+    const float ends[4] = {(float)a[3].number, (float)a[4].number, (float)a[5].number, (float)a[6].number};
+    float *total = a[7].data;
+    const i64 high = a[7].shape[0], wide = a[7].shape[1];
+    const float *down = right + high * wide;
+    (void)out;
+    for (i64 y = 0; y < high; y++) {
+        const float *restrict row = right + y * wide;
+        const float *restrict above = down + MAX(y - 1, 0) * wide, *restrict below = down + MIN(y + 1, high - 1) * wide;
+        /* The pixel beyond a side is the mirror image of the last one before it. */
+        const float up = y > 0 ? along : -along * ends[2], low = y < high - 1 ? along : -along * ends[3];
+        float *restrict sum = total + y * wide;
+        for (i64 x = 0; x < wide; x++)
+            sum[x] = low * below[x] - up * above[x];
+        for (i64 x = 1; x < wide - 1; x++)
+            sum[x] += across * (row[x + 1] - row[x - 1]);
+        sum[0] += across * (row[1] + ends[0] * row[0]);
+        sum[wide - 1] -= across * (row[wide - 2] + ends[1] * row[wide - 1]);
+    }
+    return 0;
+}
 
 LOOP solve_down(const Arg *a, double *out)
 {
@@ -1942,6 +2060,10 @@ static const Loop LOOPS[] = {
     {"sum_cells", "d2 d3 x d3 n d2 d2! d2! d2!", '-', sum_cells},
     {"compare_light", "f3 d1 x f2 f2 f3 q1 f2! d1!", 'n', compare_light},
     {"compare_points", "f3 d1 d1 d2 d2 d3 x d2! d1! d2! d1! d1!", '-', compare_points},
+    {"light_around", "f3 f3 f2 x x f1! d2!", '-', light_around},
+    {"relative_change", "B2 B2 n n f1 x f2!", '-', relative_change},
+    {"slope_misfit", "f3 f2 B2 x x", '2', slope_misfit},
+    {"divergence", "f3 x x x x x x f2!", '-', divergence},
     {"solve_down", "f2! f1 x x", '-', solve_down},
     {"slopes_of_colour", "f3 f3 f1 f1 B2 x f3! n n x", '-', slopes_of_colour},
 };

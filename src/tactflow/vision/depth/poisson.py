@@ -65,8 +65,11 @@ def integrate(
     [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
     """
     transform, back, type_, first = _TRANSFORMS[sides[0]]
-    spectrum = transform(_divergence(slope, step, sides), type_, axis=1, norm="ortho", overwrite_x=True)
-    solve_down(spectrum, _eigenvalues(spectrum.shape[1], first), *(MIRROR_IMAGE[end] for end in sides[1]))
+    left, right, top, bottom = (MIRROR_IMAGE[end] for pair in sides for end in pair)
+    spectrum: Floats32 = np.empty(slope.shape[1:], np.float32)
+    divergence(np.ascontiguousarray(slope), *step, left, right, top, bottom, spectrum)
+    spectrum = transform(spectrum, type_, axis=1, norm="ortho", overwrite_x=True)
+    solve_down(spectrum, _eigenvalues(spectrum.shape[1], first), top, bottom)
     if sides == ALL_OPEN:
         spectrum[:, 0] -= spectrum[:, 0].mean()
     return np.asarray(back(spectrum, type_, axis=1, norm="ortho", overwrite_x=True), np.float32)
@@ -99,19 +102,29 @@ def solve_down(plane: Floats32, shift: Floats32, top: float, bottom: float) -> N
     plane[:] = side
 
 
-def _divergence(slope: Floats32, step: tuple[float, float], sides: Sides) -> Floats32:
-    """(h, w): by how much more the surface rises behind each pixel than before it, in both directions.
+@kernel
+def divergence(
+    slope: Floats32,
+    across: float,
+    along: float,
+    left: float,
+    right: float,
+    top: float,
+    bottom: float,
+    total: Floats32,
+) -> None:
+    """By how much more the surface rises behind each pixel than before it, in both directions.
 
-    Between two pixels it rises by the mean of their slopes. Beyond an open side the slope is that of the
+    Between two pixels it rises by the mean of their slopes; beyond an open side the slope is that of the
     mirror image, and beyond a side at rest that of the mirror image upside down.
+
+    slope : (2, h, w), growth to the right and down. across, along : steps, see `integrate`. left, ... : see
+    `MIRROR_IMAGE`. total : (h, w), filled.
     """
-    across, down = slope * (np.array(step, np.float32) / 2)[:, None, None]
-    (left, right), (top, bottom) = ((1 if is_open else -1 for is_open in pair) for pair in sides)
-    total: Floats32 = np.empty_like(down)
-    np.subtract(down[2:], down[:-2], out=total[1:-1])
-    total[0] = down[1] + top * down[0]
-    total[-1] = -down[-2] - bottom * down[-1]
-    total[:, 1:-1] += across[:, 2:] - across[:, :-2]
-    total[:, 0] += across[:, 1] + left * across[:, 0]
-    total[:, -1] -= across[:, -2] + right * across[:, -1]
-    return total
+    x, y = slope[0] * (across / 2), slope[1] * (along / 2)
+    total[1:-1] = y[2:] - y[:-2]
+    total[0] = y[1] + top * y[0]
+    total[-1] = -y[-2] - bottom * y[-1]
+    total[:, 1:-1] += x[:, 2:] - x[:, :-2]
+    total[:, 0] += x[:, 1] + left * x[:, 0]
+    total[:, -1] -= x[:, -2] + right * x[:, -1]

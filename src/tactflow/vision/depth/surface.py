@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from tactflow.vision.arrays import Bytes, Floats32
+from tactflow.vision.compiled import kernel
 from tactflow.vision.depth.possible import deepest_possible
 from tactflow.vision.depth.slopes import MAX_HORIZONTAL_PART, SlopeModel, coordinates
 from tactflow.vision.depth.surroundings import CELL_PX, MIN_GAIN, Resting, Window, resting, surroundings
@@ -69,9 +70,7 @@ class Rest:
     def __init__(self, untouched: Bytes | Floats32) -> None:
         self.window = Window(0, untouched.shape[0] // 4 * 2, 0, untouched.shape[1] // 4 * 2)
         self.light = _halved(untouched, self.window)
-        self.weight: Floats32 = np.reciprocal(self.light + np.float32(LIGHT_OFFSET_GREY), dtype=np.float32)
         self.x, self.y = coordinates((self.window.right, self.window.bottom))
-        self.level: Floats32 = self.light * self.weight
         self._cells = cell_means(untouched, CELL_PX)
         self._cell_weight = np.reciprocal(self._cells + np.float32(LIGHT_OFFSET_GREY), dtype=np.float32)
         self._cell_level: Floats32 = self._cells * self._cell_weight
@@ -91,16 +90,25 @@ def colour_change(image: Bytes | Floats32, rest: Rest, window: Window, gain: Flo
     rounded. gain : (3,), `Resting.gain`: the picture is divided by it, so that a change of exposure or white
     balance is not a change of colour, and does not make slopes steeper or flatter.
     """
-    rows, columns = window.part
-    # Whole rows: with three channels as the inner loop, NumPy takes several times as long.
-    part = rows, slice(3 * columns.start, 3 * columns.stop)
-    gains = np.tile(np.maximum(gain, np.float32(MIN_GAIN)), window.width)
-    change = _rows(_halved(image, window)).astype(np.float32)
-    change *= _rows(rest.weight)[part]
-    change /= gains
-    # A gel that has not changed gives 0 exactly.
-    change -= _rows(rest.level)[part]
+    half, light = _rows(_halved(image, window)), _rows(rest.light)
+    change: Floats32 = np.empty(half.shape, np.float32)
+    loop = relative_change if half.dtype == light.dtype == np.uint8 else relative_change.plain
+    gain = np.maximum(gain, np.float32(MIN_GAIN))
+    loop(half, light, window.top, 3 * window.left, gain, LIGHT_OFFSET_GREY, change)  # type: ignore[arg-type]
     return change.reshape(window.height, window.width, 3)
+
+
+@kernel
+def relative_change(
+    half: Bytes, light: Bytes, top: int, left: int, gain: Floats32, offset: float, change: Floats32
+) -> None:
+    """Fill `change`, (h, 3 w), of `colour_change`; exactly 0 where the gel has not changed.
+
+    half : (h, 3 w), of the picture. light : (H, 3 W), of the untouched gel, used from row `top` and element
+    `left` on. gain : (3,). offset : grey levels, `LIGHT_OFFSET_GREY`.
+    """
+    resting = light[top : top + len(half), left : left + half.shape[1]].astype(np.float32)
+    change[:] = (half / np.tile(gain, half.shape[1] // 3) - resting) / (resting + np.float32(offset))
 
 
 class Slopes(NamedTuple):
@@ -241,15 +249,27 @@ class Surface:
         Between two pixels heights fall by the mean of their slopes, as `integrate` has it.
         """
         contact = np.ascontiguousarray(mask[::2, ::2])
-        total = left = 0.0
-        for axis, plane, step in ((1, slope[0], self._scale.x), (0, slope[1], self._scale.y)):
-            first, second = (np.s_[:, :-1], np.s_[:, 1:]) if axis else (np.s_[:-1], np.s_[1:])
-            # Twice the mean slope of two neighbours, and what their heights leave of it.
-            twice = plane[first] + plane[second]
-            total += cv2.norm(twice, cv2.NORM_L2SQR, contact[second])
-            twice += (heights[second] - heights[first]) * np.float32(1 / step)
-            left += cv2.norm(twice, cv2.NORM_L2SQR, contact[second])
+        total, left = slope_misfit(slope, heights, contact, self._scale.x, self._scale.y)
         return left / total if total else 0.0
+
+
+@kernel
+def slope_misfit(
+    slope: Floats32, heights: Floats32, contact: Bytes, across: float, along: float
+) -> tuple[float, float]:
+    """Sums of squares, of twice the mean slope of two neighbours, and of what their heights leave of it.
+
+    slope : (2, h, w). heights, contact : (h, w); pairs whose second pixel is not in contact do not count.
+    across, along : half the steps to the right and down.
+    """
+    total = left = 0.0
+    for axis, step in ((1, across), (0, along)):
+        first, second = (np.s_[:, :-1], np.s_[:, 1:]) if axis else (np.s_[:-1], np.s_[1:])
+        twice, inside = slope[1 - axis][first] + slope[1 - axis][second], contact[second] > 0
+        total += float((twice[inside] ** 2).sum())
+        twice += (heights[second] - heights[first]) / np.float32(step)
+        left += float((twice[inside] ** 2).sum())
+    return total, left
 
 
 def measured(

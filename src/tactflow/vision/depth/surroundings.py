@@ -7,7 +7,8 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Bytes, Flags, Floats32
+from tactflow.vision.arrays import Bytes, Floats, Floats32
+from tactflow.vision.compiled import kernel
 from tactflow.vision.depth.slopes import BAND_ROWS
 from tactflow.vision.geometry.region import measure_region
 
@@ -114,30 +115,42 @@ def resting(change: Floats32, level: Floats32, mask: Bytes) -> Resting:
     contact = mask[middle : height * CELL_PX : CELL_PX, middle : width * CELL_PX : CELL_PX]
     if contact.all() or not contact.any():
         return Resting(MIN_MARGIN_PX, np.ones(3, np.float32))
-    ring = cv2.distanceTransform((contact == 0).view(np.uint8), cv2.DIST_L2, 5).astype(np.intp)
-    outside = ring >= min(2 * MIN_MARGIN_PX // CELL_PX, ring.max())
-    more = _relative_growth(change, level, outside)
-    off = change - more * level
-    strength = np.sqrt(np.einsum("ijk,ijk->ij", off, off)).ravel()
-    rings = ring.ravel()
-    profile = np.bincount(rings, strength) / np.maximum(np.bincount(rings), 1)
-    far = float(profile[1:].min())
-    faded = np.flatnonzero(profile[1:] <= far + REST_CHANGE_RATIO * (profile[1] - far))
-    return Resting(max(MIN_MARGIN_PX, (int(faded[0]) + 1) * CELL_PX // 2), 1 + more)
+    distance = np.asarray(cv2.distanceTransform((contact == 0).view(np.uint8), cv2.DIST_L2, 5), np.float32)
+    last = int(distance.max())
+    growth, rings = np.empty(3, np.float32), np.zeros((2, last + 1))
+    nearest = min(2 * MIN_MARGIN_PX // CELL_PX, last)
+    light_around(change, level, distance, nearest, MIN_LIT_LEVEL, growth, rings)
+    profile = rings[0, 1:] / np.maximum(rings[1, 1:], 1)
+    far = float(profile.min())
+    faded = np.flatnonzero(profile <= far + REST_CHANGE_RATIO * (profile[0] - far))
+    return Resting(max(MIN_MARGIN_PX, (int(faded[0]) + 1) * CELL_PX // 2), 1 + growth)
 
 
-def _relative_growth(change: Floats32, level: Floats32, outside: Flags) -> Floats32:
-    """(3,): by which part of itself each channel has grown, the median of the cells of the gel at rest.
+@kernel
+def light_around(
+    change: Floats32,
+    level: Floats32,
+    distance: Floats32,
+    nearest: float,
+    least: float,
+    growth: Floats32,
+    rings: Floats,
+) -> None:
+    """How the light has changed at each distance from a contact, less what has changed far from it.
 
-    change, level : see `resting`. outside : (h, w), the gel at rest. Dark cells show noise instead; without
-    others, nothing has grown.
+    change, level : see `resting`. distance : (h, w), cells, from the contact. nearest : of the gel at rest.
+    least : `MIN_LIT_LEVEL`.
+    growth : (3,), filled: by which part of itself each channel has grown, the upper median of the gel at
+        rest. Dark cells show noise instead; without others, nothing has grown.
+    rings : (2, n) of 0, to which are added: change of the light in each ring of cells, and their number.
     """
-    lit = outside[..., None] & (level >= MIN_LIT_LEVEL)
-    # All others come last when sorted. `np.median` takes three times as long.
-    ratios = np.where(lit, change, np.float32(np.inf)) / level
-    ratios = np.sort(ratios.reshape(-1, 3).T, axis=1)
-    medians = [channel[np.searchsorted(channel, np.inf) // 2] for channel in ratios]
-    return np.array([growth if np.isfinite(growth) else 0 for growth in medians], np.float32)
+    for channel in range(3):
+        lit = (distance >= nearest) & (level[..., channel] >= least)
+        ratios = change[lit, channel] / level[lit, channel]
+        growth[channel] = np.sort(ratios)[ratios.size // 2] if ratios.size else 0
+    strength = np.sqrt(((change - growth * level) ** 2).sum(axis=2))
+    ring, count = distance.astype(np.intp).ravel(), rings.shape[1]
+    rings += np.bincount(ring, strength.ravel(), count), np.bincount(ring, minlength=count)
 
 
 def _near(mask: Bytes, window: Window, margin: int) -> Bytes:
