@@ -25,7 +25,10 @@ from tactflow.vision.depth.poisson import divergence, solve_down
 from tactflow.vision.depth.slopes import BAND_ROWS, coordinates, slopes_of_colour
 from tactflow.vision.depth.surface import relative_change, slope_misfit
 from tactflow.vision.depth.surroundings import light_around
+from tactflow.vision.geometry.direction import sum_harmonics
 from tactflow.vision.geometry.downsample import halve
+from tactflow.vision.geometry.hull import convex_hull
+from tactflow.vision.geometry.region import sum_pixels
 
 needs_compiler = pytest.mark.skipif(
     not compiled.are_compiled(), reason="tactflow was installed without a C compiler"
@@ -164,6 +167,35 @@ def test_loops_of_the_height_map_are_the_same_in_c_and_in_numpy() -> None:
         found.append((growth, rings, relative, slope, heights, np.array(misfit)))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4 * np.abs(other).max())
+
+
+@needs_compiler
+@pytest.mark.parametrize("seed", range(12))
+def test_the_shape_of_a_mask_is_the_same_in_c_and_in_numpy(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    size = tuple(draw.integers(1, 40, 2))
+    mask = (draw.random(size) > draw.random()).astype(np.uint8) * np.uint8(7)
+    totals = np.empty((2, 10), np.int64)
+    sum_pixels.compiled(mask, totals[0])
+    sum_pixels.plain(mask, totals[1])
+    np.testing.assert_array_equal(*totals)
+    points = np.ascontiguousarray(np.argwhere(mask)[:, ::-1], np.int32)
+    if not len(points):
+        return
+    corners = np.zeros((2, *points.shape), np.int32)
+    found = [
+        hull(points, into)
+        for hull, into in zip((convex_hull.compiled, convex_hull.plain), corners, strict=True)
+    ]
+    assert found[0] == found[1]
+    hulls = [part[: int(found[0][0])].tolist() for part in corners]
+    start = hulls[1].index(hulls[0][0])
+    assert hulls[0] == hulls[1][start:] + hulls[1][:start]
+    harmonics = np.ones((2, 7, 2))
+    to_circle = np.array([*points.mean(axis=0), 3.0, 0.4, 2.5])
+    sum_harmonics.compiled(points, to_circle, 1e-9, 3, harmonics[0])
+    sum_harmonics.plain(points, to_circle, 1e-9, 3, harmonics[1])
+    np.testing.assert_allclose(*harmonics, rtol=1e-9, atol=1e-9 * np.abs(harmonics).max())
 
 
 @needs_compiler

@@ -39,11 +39,10 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
     (n, 2) : logarithm of the share of colour in the region's largest change; 1 if markers moved as well, else
         0.
     """
-    high, wide = deviations.shape[1:]
-    inside = np.asarray(cv2.resize(mask, (wide, high), interpolation=cv2.INTER_NEAREST), np.uint8)
+    inside = np.ascontiguousarray(mask[::CELL_PX, ::CELL_PX])
     evidence = np.empty((len(parts), 2))
     for row, part in zip(evidence, parts, strict=True):
-        cells = np.zeros((high, wide), np.uint8)
+        cells = np.zeros_like(inside)
         cv2.fillConvexPoly(cells, (part.hull / CELL_PX).astype(np.int32), (1.0,))
         light, colour = (cv2.minMaxLoc(values, cells & inside)[1] for values in deviations)
         row[:] = math.log(max(colour / max(light, 1e-9), MIN_COLOUR_SHARE)), part.evidence == "both"
@@ -55,10 +54,13 @@ def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
 
     Regions that only the markers show have none, because there is no change of light to judge.
     """
-    odds = EVIDENCE_WEIGHTS[0] + contact_evidence(parts, mask, deviations) @ EVIDENCE_WEIGHTS[1:]
+    constant, colour, motion = EVIDENCE_WEIGHTS
+    evidence = contact_evidence(parts, mask, deviations).tolist()
     return [
-        part if part.evidence == "dots" else replace(part, probability=1 / (1 + math.exp(-value)))
-        for part, value in zip(parts, odds.tolist(), strict=True)
+        part
+        if part.evidence == "dots"
+        else replace(part, probability=1 / (1 + math.exp(-(constant + colour * share + motion * moved))))
+        for part, (share, moved) in zip(parts, evidence, strict=True)
     ]
 
 

@@ -18,7 +18,7 @@ from tactflow.vision.arrays import Floats32, Mask
 from tactflow.vision.contact.background import CELL_PX
 from tactflow.vision.flow.inside import inside_mask
 from tactflow.vision.flow.motion import Motion, MotionTest
-from tactflow.vision.geometry.region import Region, measure_region
+from tactflow.vision.geometry.region import measure_region
 from tactflow.vision.types import Evidence, Markers, MarkerStatus
 
 MIN_RESTING_MARKERS: Final = 6
@@ -79,8 +79,8 @@ def fuse_contact(
     >>> fused.evidence, fused.mask[20, 40]
     ('dots', np.uint8(255))
     """
-    motion, region = test(markers), measure_region(light)
-    if not region.pixels:
+    motion = test(markers)
+    if not cv2.hasNonZero(light):
         if not motion.clearly:
             return FusedContact(light, None)
         return FusedContact(_hull_of(test.stretched(markers), test.pitch, light), "dots")
@@ -89,9 +89,9 @@ def fuse_contact(
     changed = light if deviations is None else changed_mask(deviations, light.shape)
     if _rests(changed, markers, motion):
         return FusedContact(np.zeros_like(light), None, light_changed=True)
-    if deviations is not None and not _without_rims(changed, measure_region(changed), markers, CELL_PX).any():
+    if deviations is not None and not _without_rims(changed, markers, CELL_PX).any():
         return FusedContact(np.zeros_like(light), None)
-    mask = _without_rims(light, region, markers)
+    mask = _without_rims(light, markers)
     return FusedContact(mask, "light" if cv2.countNonZero(mask) else None)
 
 
@@ -109,17 +109,17 @@ def _rests(light: Mask, markers: Markers, motion: Motion) -> bool:
     return len(resting) >= MIN_RESTING_MARKERS and bool(resting.all())
 
 
-def _without_rims(light: Mask, region: Region, markers: Markers, coarse: int = 0) -> Mask:
+def _without_rims(light: Mask, markers: Markers, coarse: int = 0) -> Mask:
     """Remove regions that are residue of inpainting at the rim of a marker; the same array if there are none.
 
-    region : of the whole mask. coarse : side of the cells that the mask consists of, px.
+    coarse : side of the cells that the mask consists of, px.
     A marker that has moved by a fraction of a pixel is not quite where it is painted over.
     """
     radius = markers.radius
     if radius is None or not len(markers.position):
         return light
     # OpenCV takes twenty times as long for the whole frame as for the box around a first touch.
-    left, top, width, height = region[:4]
+    left, top, width, height = measure_region(light)[:4]
     window = light[top : top + height, left : left + width]
     count, labels, boxes, centers = cv2.connectedComponentsWithStats(window)
     small = np.flatnonzero(

@@ -14,10 +14,10 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats32, Mask
+from tactflow.vision.arrays import Flags, Floats32, Mask, Numbers
 from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.heights import Heights
-from tactflow.vision.contact.level_tree import Numbers, grow_level_lines
+from tactflow.vision.contact.level_tree import grow_level_lines
 
 LEVEL_COUNT: Final = 12
 """Levels between the gel at rest and its highest point: their distance is a 13th of that height."""

@@ -8,13 +8,10 @@ IEEE Transactions on Image Processing 15, 2006).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes, label
 
-from tactflow.vision.arrays import Floats32, Mask
+from tactflow.vision.arrays import Floats32, Mask, Numbers
 from tactflow.vision.compiled import kernel
-
-Numbers = NDArray[np.int32]
 
 
 @kernel

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import statistics
 from typing import Final
 
 import numpy as np
 
-from tactflow.vision.arrays import Floats
+from tactflow.vision.arrays import Floats, Numbers
+from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.region import Contours, Moments
 
 FALSE_DIRECTION_RATE: Final = 1e-3
@@ -92,24 +92,28 @@ def _outline_power(contours: Contours, moments: Moments) -> Floats:
     l11 = math.sqrt(xx)
     l21 = xy / l11
     l22 = math.sqrt(max(yy - l21 * l21, _MIN_VARIANCE_PX2))
-    deviations = []
-    turns = []
+    to_circle = np.array([center_x, center_y, l11, l21, l22])
+    harmonics = np.zeros((len(_ROUGHNESS_HARMONICS), 2))
     for contour in contours:
-        z = np.empty(len(contour), np.complex128)
-        z.real = (contour[:, 0, 0] - center_x) / l11
-        z.imag = (contour[:, 0, 1] - center_y - l21 * z.real) / l22
-        distance = np.maximum(np.abs(z), _MIN_RELATIVE_RADIUS)
-        turn = z / distance
-        # Fraction of the full turn that each outline point stands for.
-        around = np.concatenate([turn[-1:], turn, turn[:1]])
-        fraction = np.imag(np.conj(around[:-2]) * around[2:]) / (4 * math.pi)
-        deviations.append((distance / 2 - 1) * fraction)
-        turns.append(turn)
-    # Products and sums of rows: a product of matrices would wake the threads of BLAS.
-    turn = np.concatenate(turns)
-    terms = np.empty((len(_ROUGHNESS_HARMONICS), len(turn)), np.complex128)
-    np.multiply(np.concatenate(deviations), turn**_ROUGHNESS_HARMONICS.start, out=terms[0])
-    for before, after in itertools.pairwise(terms):
-        np.multiply(before, turn, out=after)
-    harmonics = terms.sum(axis=1)
-    return np.asarray(harmonics.real**2 + harmonics.imag**2)
+        sum_harmonics(contour[:, 0], to_circle, _MIN_RELATIVE_RADIUS, _ROUGHNESS_HARMONICS.start, harmonics)
+    return np.asarray((harmonics * harmonics).sum(axis=1))
+
+
+@kernel
+def sum_harmonics(outline: Numbers, to_circle: Floats, least: float, first: int, harmonics: Floats) -> None:
+    """Add the Fourier coefficients of an outline's distance from its centre, relative to that of a circle.
+
+    outline : (n, 2), pixels. to_circle : (5,), centre, and l11, l21 and l22 of the matrix whose inverse makes
+    it a circle of radius 2. least : smallest distance that is divided by. first : number of the first
+    harmonic. harmonics : (m, 2), real and imaginary parts, added to.
+    """
+    z = np.empty(len(outline), np.complex128)
+    z.real = (outline[:, 0] - to_circle[0]) / to_circle[2]
+    z.imag = (outline[:, 1] - to_circle[1] - to_circle[3] * z.real) / to_circle[4]
+    distance = np.maximum(np.abs(z), least)
+    turn = z / distance
+    # Fraction of the full turn that each outline point stands for.
+    fraction = np.imag(np.conj(np.roll(turn, 1)) * np.roll(turn, -1)) / (4 * math.pi)
+    for power, harmonic in enumerate(harmonics, first):
+        total = ((distance / 2 - 1) * fraction * turn**power).sum()
+        harmonic += total.real, total.imag

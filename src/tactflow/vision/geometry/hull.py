@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tactflow.vision.arrays import Mask, Points, check_mask
+from tactflow.vision.arrays import Mask, Numbers, Points, check_mask
+from tactflow.vision.compiled import kernel
 from tactflow.vision.geometry.direction import anisotropy_limit, axis_direction
 from tactflow.vision.geometry.region import Contours, Region, measure_region
 from tactflow.vision.types import Contact, Ellipse, Evidence
@@ -195,11 +196,25 @@ def _core_area(core: Mask, region: Region) -> float | None:
 
 def _hull(contours: Contours) -> tuple[Points, float]:
     """Convex hull of some components: its corners (m, 2), clockwise on the screen; pixels in it."""
-    corners = cv2.convexHull(np.concatenate(contours))[:, 0]
-    steps = corners - np.concatenate([corners[-1:], corners[:-1]])
-    # Pick's theorem, with the pixels on the border.
-    on_border = int(np.gcd(steps[:, 0], steps[:, 1]).sum())
-    return corners.astype(np.float64), cv2.contourArea(corners) + on_border / 2 + 1
+    points = np.concatenate(contours)[:, 0]
+    corners = np.empty_like(points)
+    count, area = convex_hull(points, corners)
+    return corners[: int(count)].astype(np.float64), area
+
+
+@kernel
+def convex_hull(points: Numbers, corners: Numbers) -> tuple[float, float]:
+    """The number of corners of a convex hull, and of the pixels in it, by Pick's theorem.
+
+    points : (n, 2), pixels, n >= 1. corners : (n, 2), filled from its start, clockwise on the screen.
+
+    A. Andrew, "Another efficient algorithm for convex hulls in two dimensions", Information Processing
+    Letters 9 (1979).
+    """
+    hull = cv2.convexHull(points)[:, 0]
+    steps = hull - np.roll(hull, 1, axis=0)
+    corners[: len(hull)] = hull
+    return len(hull), cv2.contourArea(hull) + int(np.gcd(steps[:, 0], steps[:, 1]).sum()) / 2 + 1
 
 
 def _filled_area(contour: NDArray[Any]) -> float:
