@@ -1512,45 +1512,44 @@ LOOP weigh_motion(const Arg *a, double *out)
 
 #define PHASES 4
 
-/* Products of 16 and 8 bits whose sum fits in 32 bits. */
-#define SUMMED 256
-
-#define ABREAST 16
-
-/* Fill `patch` with the grey levels, minus 128, of a disc around a px, the border replicated; returns the sum of
- * squares about the mean. patch : for `ABREAST` values more than the disc has. */
-INLINE double read_patch(const u8 *gray, i64 high, i64 wide, i64 left, i64 top, const i64 *widths, i64 rows,
-                         i16 *restrict patch, i64 size)
+/* Fill `levels` with grey levels minus 128; BGR is converted as in OpenCV. */
+INLINE void to_gray(const u8 *restrict pixels, i64 channels, i64 count, float *restrict levels)
 {
-    const i64 reach = rows / 2;
-    /* Whole vectors are read, beyond the end of a row, and written over by the next row. */
-    const int inside = left >= reach && top >= reach && left + reach < wide && top + reach + 1 < high && wide >= ABREAST;
-    i16 *line = patch;
+    if (channels == 1)
+        for (i64 x = 0; x < count; x++)
+            levels[x] = (float)pixels[x] - 128;
+    else
+        for (i64 x = 0; x < count; x++) {
+            const i32 level = 3735 * pixels[3 * x] + 19235 * pixels[3 * x + 1] + 9798 * pixels[3 * x + 2] + 16384;
+            levels[x] = (float)(level >> 15) - 128;
+        }
+}
+
+/* Fill `patch` with the grey levels of a disc around a px, the border replicated; returns the sum of squares about
+ * the mean. */
+INLINE double read_patch(const u8 *image, const i64 *shape, i64 left, i64 top, const i64 *widths, i64 rows,
+                                float *restrict patch, i64 size)
+{
+    const i64 high = shape[0], wide = shape[1], channels = shape[2], reach = rows / 2;
+    const int inside = left >= reach && top >= reach && left + reach < wide && top + reach < high;
+    float *line = patch;
     for (i64 row = 0; row < rows; row++) {
         const i64 count = widths[row], begin = left - count / 2;
-        if (inside) {
-            const u8 *levels = gray + (top - reach + row) * wide + begin;
-            for (i64 k = 0; k < count; k += ABREAST)
-                for (i64 i = k; i < k + ABREAST; i++)
-                    line[i] = (i16)(levels[i] - 128);
-        } else {
+        if (inside)
+            to_gray(image + ((top - reach + row) * wide + begin) * channels, channels, count, line);
+        else {
             const i64 y = MIN(MAX(top - reach + row, 0), high - 1);
             for (i64 k = 0; k < count; k++)
-                line[k] = (i16)(gray[y * wide + MIN(MAX(begin + k, 0), wide - 1)] - 128);
+                to_gray(image + (y * wide + MIN(MAX(begin + k, 0), wide - 1)) * channels, channels, 1, line + k);
         }
         line += count;
     }
-    double total = 0, squares = 0;
-    for (i64 p = 0; p < size; p += SUMMED) {
-        i32 some = 0, square = 0;
-        for (i64 i = p; i < MIN(p + SUMMED, size); i++) {
-            some += patch[i];
-            square += patch[i] * patch[i];
-        }
-        total += some;
-        squares += square;
+    float total = 0, squares = 0;
+    for (i64 p = 0; p < size; p++) {
+        total += patch[p];
+        squares += patch[p] * patch[p];
     }
-    return squares - total * total / (double)size;
+    return (double)squares - (double)total * total / (double)size;
 }
 
 /* The nearest phase to a coordinate: PHASES times the px plus the phase. NaN becomes a point inside. */
@@ -1565,23 +1564,18 @@ typedef struct {
     double r_squared, rest;
 } Fit;
 
-INLINE Fit fit_template(const i16 *weight, const float *term, const i16 *restrict patch, i64 size,
+INLINE Fit fit_template(const i16 *weight, const float *term, const float *restrict patch, i64 size,
                                double varies)
 {
     const i16 *restrict w0 = weight, *restrict w1 = w0 + size, *restrict w2 = w1 + size, *restrict w3 = w2 + size;
     const i16 *restrict w4 = w3 + size;
     float sum[5] = {0, 0, 0, 0, 0};
-    for (i64 p = 0; p < size; p += SUMMED) {
-        i32 some[5] = {0, 0, 0, 0, 0};
-        for (i64 i = p; i < MIN(p + SUMMED, size); i++) {
-            some[0] += w0[i] * patch[i];
-            some[1] += w1[i] * patch[i];
-            some[2] += w2[i] * patch[i];
-            some[3] += w3[i] * patch[i];
-            some[4] += w4[i] * patch[i];
-        }
-        for (int k = 0; k < 5; k++)
-            sum[k] += (float)some[k];
+    for (i64 p = 0; p < size; p++) {
+        sum[0] += (float)w0[p] * patch[p];
+        sum[1] += (float)w1[p] * patch[p];
+        sum[2] += (float)w2[p] * patch[p];
+        sum[3] += (float)w3[p] * patch[p];
+        sum[4] += (float)w4[p] * patch[p];
     }
     for (int k = 0; k < 5; k++)
         sum[k] *= term[10 + k];
@@ -1595,7 +1589,7 @@ INLINE Fit fit_template(const i16 *weight, const float *term, const i16 *restric
 
 LOOP align_marks(const Arg *a, double *out)
 {
-    const u8 *gray = a[0].data;
+    const u8 *image = a[0].data;
     const double *start = a[1].data;
     const i64 *marks = a[2].data, *places = a[3].data, *widths = a[6].data, rows = a[6].shape[0];
     const i16 *weights = a[4].data;
@@ -1606,7 +1600,7 @@ LOOP align_marks(const Arg *a, double *out)
     const float least_gain = (float)a[11].number, least_fit = (float)a[12].number, sampling = (float)a[13].number;
     const i64 most_steps = a[14].whole, size = a[4].shape[2], count = a[4].shape[0] / (PHASES * PHASES);
     const i64 high = a[0].shape[0], wide = a[0].shape[1];
-    i16 *patch = malloc((size + ABREAST) * sizeof(i16));
+    float *patch = malloc((size + 1) * sizeof(float));
     (void)out;
     if (!patch)
         return OUT_OF_MEMORY;
@@ -1623,7 +1617,7 @@ LOOP align_marks(const Arg *a, double *out)
             if (left != seen_left || top != seen_top) {
                 seen_left = left;
                 seen_top = top;
-                varies = read_patch(gray, high, wide, left, top, widths, rows, patch, size);
+                varies = read_patch(image, a[0].shape, left, top, widths, rows, patch, size);
             }
             const Fit fit = fit_template(weights + 5 * size * which, term, patch, size, varies);
             seen[n] = fit.gain > least_gain && fit.r_squared > least_fit;
@@ -2205,7 +2199,7 @@ static const Loop LOOPS[] = {
     {"cover_spots", "B3 n n B2!", '-', cover_spots},
     {"fill_masked", "B2! B2 B2 q1 q1 n x x x", '-', fill_masked},
     {"weigh_motion", "d2 f1 ?1 q2 d2 x d1! n x x", '?', weigh_motion},
-    {"align_marks", "B2 d2 q1 q1 h3 f2 q1 x d2! f1! ?1! x x x n", '-', align_marks},
+    {"align_marks", "B3 d2 q1 q1 h3 f2 q1 x d2! f1! ?1! x x x n", '-', align_marks},
     {"rate_motion", "d2 ?1 d1 d2 q2 x x x d1! d1! n", '2', rate_motion},
     {"sum_cells", "d2 d3 x d3 n d2 d2! d2! d2!", '-', sum_cells},
     {"compare_light", "f3 d1 x f2 f2 f3 q1 f2! d1!", 'n', compare_light},

@@ -159,14 +159,13 @@ class MarkerTemplates:
         image : (H, W, 3) uint8 BGR or (H, W) uint8. start : (n, 2) float64, px. marks : (n,) int64, their
         indices; None for all.
         """
-        color = image.ndim == 3
-        gray = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if color else image, np.uint8)
+        picture = np.ascontiguousarray(image if image.ndim == 3 else image[:, :, None])
         start, count = np.ascontiguousarray(start), len(start)
         found = Alignment(np.empty((count, 2)), np.empty(count, np.float32), np.empty(count, np.bool_))
         for number, model in enumerate(self._models):
             which, places = self._all[number] if marks is None else self._those_of(number, marks)
             align_marks(
-                gray,
+                picture,
                 start,
                 which,
                 places,
@@ -254,7 +253,7 @@ def _patches(levels: Floats32, corner: Indices, widths: Indices) -> Floats:
 
 @kernel
 def align_marks(
-    gray: Bytes,
+    image: Bytes,
     start: Floats,
     marks: Indices,
     places: Indices,
@@ -272,11 +271,12 @@ def align_marks(
 ) -> None:
     """Align `marks`; fill `position` (n, 2), `stderr` (n,) and `seen` (n,).
 
-    gray : (H, W). start : (n, 2). places : indices of the marks in the model (see
+    image : (H, W, 3) BGR or (H, W, 1). start : (n, 2). places : indices of the marks in the model (see
     `_Model`). Steps are limited to a radius along each axis. min_gain, min_r_squared : of a visible mark.
     sampling_error : px, of a picture without noise. max_steps : after the first one.
     """
-    height, width = gray.shape
+    height, width, channels = image.shape
+    gray = image[:, :, 0] if channels == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     levels, count = gray.astype(np.float32) - 128, len(weights) // PHASES**2
     phase = _nearest_phase(start[marks], width, height)
     before, going = np.full_like(phase, -1), np.arange(len(marks))

@@ -160,14 +160,14 @@ class MarkerTracker:
         if image.shape not in self._shapes or image.dtype != np.uint8:
             require_image(image)
             raise ValueError(f"required a frame of (height, width) {self._shape}, got {image.shape[:2]}")
-        gray = to_gray(image)
-        found = self._align(gray, self._position)
+        image = np.ascontiguousarray(image)
+        found = self._align(image, self._position)
         smooth, torn = self._graph.check(found.position, found.seen)
         # If marks stay missing, search again from time to time.
         missing = np.count_nonzero(found.seen) < self._count - len(self._evidence.left)
         self._age = self._age + 1 if missing else 0
         if torn or self._age >= SEARCH_INTERVAL_FRAMES or (missing and (self._seen & ~found.seen).any()):
-            found = self._search(gray, found, smooth)
+            found = self._search(image, found, smooth)
             self._age = 0
         position, stderr, seen = found
         # All TRACKED, which is 0; `np.full` takes three times as long.
@@ -189,9 +189,9 @@ class MarkerTracker:
         probability = None if self._prior is None else self._evidence.probability
         return Markers(self._origin.copy(), position.copy(), status, errors, self._radius, probability)
 
-    def _align(self, gray: NDArray[np.uint8], start: Floats) -> Alignment:
+    def _align(self, image: NDArray[np.uint8], start: Floats) -> Alignment:
         """Align the marks from starting points (N, 2), px; rejected marks count as invisible."""
-        found = self._templates.align(gray, start)
+        found = self._templates.align(image, start)
         found.seen[self._evidence.left] = False
         return found
 
@@ -224,10 +224,11 @@ class MarkerTracker:
         self._seen = np.concatenate([self._seen, known[~known]])
         return True
 
-    def _search(self, gray: NDArray[np.uint8], found: Alignment, smooth: Flags) -> Alignment:
+    def _search(self, image: NDArray[np.uint8], found: Alignment, smooth: Flags) -> Alignment:
         """Assign spots to the marks outside the largest smooth component of the field, and align them."""
-        spots, _ = find_peaks(gray.astype(np.float32), self._sigma, self._polarity, self._least)
-        inliers = self._best_start(gray, found, smooth, spots)
+        gray = to_gray(image).astype(np.float32)
+        spots, _ = find_peaks(gray, self._sigma, self._polarity, self._least)
+        inliers = self._best_start(image, found, smooth, spots)
         # The position of a visible mark that is not an inlier is a spot like any other.
         own = found.position[found.seen & ~inliers]
         spots = np.concatenate([spots, own[_are_apart(own, spots, SEARCH_RADIUS_PITCHES * self._pitch)]])
@@ -236,11 +237,11 @@ class MarkerTracker:
         reach = np.minimum(SEARCH_RADIUS_PITCHES * self._apart, self._farthest)
         marks, chosen = grow(found.position, inliers, spots, self._interpolator, reach)
         if len(marks):
-            found.put(marks, self._templates.align(gray, spots[chosen], marks))
+            found.put(marks, self._templates.align(image, spots[chosen], marks))
             found.seen[self._evidence.left] = False
         return found
 
-    def _best_start(self, gray: NDArray[np.uint8], found: Alignment, smooth: Flags, spots: Floats) -> Flags:
+    def _best_start(self, image: NDArray[np.uint8], found: Alignment, smooth: Flags, spots: Floats) -> Flags:
         """Align each grid from the start with the most inliers, in place; returns the inliers, (N,): the
         largest smooth component.
 
@@ -257,7 +258,7 @@ class MarkerTracker:
         for grid in torn:
             jumped[grid] += common_displacement(jumped[grid], spots, self._pitch, self._farthest)
         for start in (self._origin, jumped):
-            other = self._align(gray, start)
+            other = self._align(image, start)
             smooth, _ = self._graph.check(other.position, other.seen)
             there = self._graph.largest_component(other.seen, smooth)
             for grid in torn:
