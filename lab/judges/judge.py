@@ -5,24 +5,27 @@
     python -m lab.judges.judge --data RECORDINGS --set stages.difference.use=otsu --set stages.fusion=null
     python -m lab.judges.judge --data RECORDINGS --fit stages.difference.border=0.55,0.7,0.85
     python -m lab.judges.judge --data RECORDINGS --gray --every 2
+    python -m lab.judges.judge --data RECORDINGS --dirt 3
 
 A person outlined the contacts (`python -m lab.judges.label`); `outlines.json` beside this file has
 outlines of recordings of fifteen labs. A recording runs as a whole, as a user would run it; pictures of
 separate presses run one after the other, after their reference. `--gray` judges as if all cameras recorded no
-colours.
+colours; `--dirt` as if specks had landed on the lens before the first labelled frame of each recording.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,10 +37,12 @@ from tactflow.engine.errors import ConfigError, TactflowError
 from tactflow.message.result import Result
 from tactflow.sources import open_source
 from tactflow.sources.files import load_image
+from tactflow.stages.capture import Capture
 from tactflow.streaming import stream
 from tactflow.system.terminal import say, table
 from tactflow.tools.bench import metrics
 from tactflow.tools.bench.score import MIN_DIRECTED_AXIS_RATIO
+from tactflow.tools.stress.perturbation import specks
 from tactflow.vision.geometry import PixelMapping
 from tactflow.vision.geometry.hull import contact_geometry
 from tactflow.vision.markers.detection import to_gray
@@ -63,6 +68,20 @@ MAX_WHOLE_SIDE_PX: Final = 500
 """Pictures with a longer side, px, are halved, as the documentation advises."""
 Pictures = list[NDArray[np.uint8]]
 """(H, W, 3) BGR each."""
+
+
+class Camera(NamedTuple):
+    """What is wrong with the camera.
+
+    gray : it records no colours. specks : number of specks on its lens; its reference is clean.
+    """
+
+    gray: bool = False
+    specks: int = 0
+
+
+AS_RECORDED: Final = Camera()
+
 RESAMPLE_COUNT: Final = 1000
 """Bootstrap samples: enough for two digits of the bounds."""
 
@@ -121,13 +140,13 @@ def judge(
     data: Path,
     report: Callable[[str], None] = say,
     settings: Mapping[str, Any] = MappingProxyType({}),
-    gray: bool = False,
+    camera: Camera = AS_RECORDED,
 ) -> Iterator[Judged]:
     """Run each recording, and compare its labelled frames; arguments and errors as for `labelled`.
 
     Frames that a failing pipeline did not reach count as missed contacts.
     """
-    for label, result in labelled(pipeline, labels, data, report, settings=settings, gray=gray):
+    for label, result in labelled(pipeline, labels, data, report, settings=settings, camera=camera):
         if result is None:
             yield Judged(label.lab, label.recording, bool(label.contact), False, hull=0.0, region=0.0)
         else:
@@ -141,15 +160,15 @@ def labelled(
     report: Callable[[str], None] = say,
     images: bool = False,
     settings: Mapping[str, Any] = MappingProxyType({}),
-    gray: bool = False,
+    camera: Camera = AS_RECORDED,
 ) -> Iterator[tuple[FrameLabel, Result | None]]:
     """Run each recording that exists, and return its labels and the results of these frames.
 
     pipeline : a file or the name of a shipped pipeline; see `PLAIN` for "default". labels : those with
     `contact` None are left out. data : folder that holds the recordings. report : called with what could not
     be judged, and why; frames that a failing pipeline did not reach have no result. images : whether the
-    results hold the pictures. settings : of the pipeline, as for `tactflow.stream`. gray : whether to remove
-    the colours of all pictures first.
+    results hold the pictures. settings : of the pipeline, as for `tactflow.stream`. camera : what is wrong
+    with it.
 
     Raises
     ------
@@ -170,7 +189,7 @@ def labelled(
         else:
             missing = {label.index: label for label in wanted}
         try:
-            for result in _results(chosen, source, max(missing), images, settings, gray):
+            for result in _results(chosen, source, max(missing), images, settings, camera):
                 if result.seq in missing and not result.frame.reference:
                     yield missing.pop(result.seq), result
         except ConfigError:
@@ -187,16 +206,16 @@ def draw_worst(
     data: Path,
     path: Path,
     blank: bool = False,
-    gray: bool = False,
+    camera: Camera = AS_RECORDED,
 ) -> None:
     """Draw the frames whose hulls (red) overlap least with the outlines (green).
 
-    blank : leave the frames themselves out. gray : as for `labelled`.
+    blank : leave the frames themselves out. camera : as for `labelled`.
     Raises ConfigError if there are no outlined frames, or the file cannot be written.
     """
     worst: list[tuple[float, int, NDArray[np.uint8]]] = []
     outlined = [label for label in labels if label.outlines]
-    for number, (label, result) in enumerate(labelled(pipeline, outlined, data, images=True, gray=gray)):
+    for number, (label, result) in enumerate(labelled(pipeline, outlined, data, images=True, camera=camera)):
         if result is not None and result.image is not None:
             overlap = compare(label, result).hull
             worst.append((overlap, number, _tile(label, result, f"{label.lab} {overlap:.2f}", blank)))
@@ -262,7 +281,7 @@ def _results(
     last: int,
     images: bool,
     changed: Mapping[str, Any],
-    gray: bool,
+    camera: Camera,
 ) -> Iterator[Result]:
     still = {}
     if isinstance(source, Path):
@@ -278,23 +297,43 @@ def _results(
         "stages.preprocess.downsample": 2 if size > MAX_WHOLE_SIDE_PX else 1,
     }
     settings = geometry | still | dict(changed)
-    pictures = _gray_pictures(source) if gray else source
-    running = stream(pipeline, source=pictures, settings=settings, max_frames=last + 1, images=images)
-    with closing(running) as results:
-        yield from results
-
-
-def _gray_pictures(source: Path | Pictures) -> Iterator[NDArray[np.uint8]]:
-    """(H, W) uint8 each: the brightness of the pictures."""
     with ExitStack() as stack:
-        pictures: Iterable[NDArray[np.uint8]]
-        if isinstance(source, Path):
-            reader = stack.enter_context(closing(open_source(str(source))))
-            pictures = (frame for frame, *_ in iter(reader.read, None))
-        else:
-            pictures = source
-        for picture in pictures:
-            yield picture if picture.ndim == 2 else to_gray(picture)
+        pictures: Path | Iterator[NDArray[np.uint8]] | Pictures = source
+        if camera != AS_RECORDED:
+            if camera.specks and isinstance(source, Path):
+                settings["stages.capture.reference"] = _saved_reference(source, camera, stack)
+            pictures = _pictures_of(source, camera, stack)
+        running = stream(pipeline, source=pictures, settings=settings, max_frames=last + 1, images=images)
+        yield from stack.enter_context(closing(running))
+
+
+def _saved_reference(source: Path, camera: Camera, stack: ExitStack) -> str:
+    """File of the untouched gel of a video under a clean lens; the stack removes it."""
+    capture = Capture(Capture.Params(source=str(source)))
+    capture.open()
+    with closing(capture):
+        reference = next(frame.image for frame in capture.frames() if frame.reference)
+    path = str(Path(stack.enter_context(TemporaryDirectory())) / "reference.png")
+    cv2.imwrite(path, to_gray(reference) if camera.gray and reference.ndim == 3 else reference)
+    return path
+
+
+def _pictures_of(source: Path | Pictures, camera: Camera, stack: ExitStack) -> Iterator[NDArray[np.uint8]]:
+    """(H, W) or (H, W, 3) uint8 each: the pictures as such a camera shows them, the first of a list clean."""
+    pictures: Iterable[NDArray[np.uint8]] = source if isinstance(source, list) else ()
+    if isinstance(source, Path):
+        reader = stack.enter_context(closing(open_source(str(source))))
+        pictures = (frame for frame, *_ in iter(reader.read, None))
+    passes: NDArray[np.float32] | None = None
+    for number, picture in enumerate(pictures):
+        if passes is None:
+            passes = specks(
+                picture.shape, camera.specks, np.random.default_rng(zlib.crc32(picture.tobytes()))
+            )
+        shown = to_gray(picture) if camera.gray and picture.ndim == 3 else picture
+        if number or isinstance(source, Path):
+            shown = np.rint(shown * (passes if shown.ndim == 2 else passes[..., None])).astype(np.uint8)
+        yield shown
 
 
 def summary(judged: Sequence[Judged]) -> Iterator[str]:
@@ -463,6 +502,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="take the best value for each lab by every second outline, and judge it on the others",
     )
     parser.add_argument("--gray", action="store_true", help="remove the colours of all pictures first")
+    parser.add_argument("--dirt", type=int, default=0, metavar="N", help="so many specks land on the lens")
     parser.add_argument(
         "--every",
         type=int,
@@ -474,12 +514,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         settings = settings_of(options.set)
+        camera = Camera(options.gray, options.dirt)
         labels = load_labels(options.labels)
         first = every([label for label in labels if label.round == 1], options.every)
         if options.picture is not None:
-            draw_worst(
-                options.pipelines[0], first, options.data, options.picture, options.blank, options.gray
-            )
+            draw_worst(options.pipelines[0], first, options.data, options.picture, options.blank, camera)
             return 0
         if options.fit is not None:
             key, _, values = options.fit.partition("=")
@@ -491,7 +530,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                         first,
                         options.data,
                         settings=settings | choice,
-                        gray=options.gray,
+                        camera=camera,
                     )
                 )
                 for name, choice in choices.items()
@@ -499,7 +538,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(*fitted(runs), sep="\n")
             return 0
         results = {
-            name: list(judge(name, first, options.data, settings=settings, gray=options.gray))
+            name: list(judge(name, first, options.data, settings=settings, camera=camera))
             for name in options.pipelines
         }
         if not any(results.values()):

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.judges.judge import OUTLINES, Judged, every, fitted, interval, judge, main, scatter
+from lab.judges.judge import OUTLINES, Camera, Judged, every, fitted, interval, judge, main, scatter
+from lab.judges.judge import labelled as labelled_frames
 from lab.judges.label_file import FrameLabel, load_labels, save_labels
 from tactflow.engine.errors import ConfigError
 from tactflow.sim import open_scene
@@ -54,11 +55,27 @@ def test_true_outlines_are_found(labelled: tuple[Path, list[FrameLabel]]) -> Non
 
 def test_true_outlines_are_found_without_colours(labelled: tuple[Path, list[FrameLabel]]) -> None:
     data, labels = labelled
-    judged = list(judge("default", labels, data, gray=True))
+    judged = list(judge("default", labels, data, camera=Camera(gray=True)))
     assert [one.found for one in judged] == [label.contact for label in labels]
     coloured = list(judge("default", labels, data))
     for one, other in zip(judged, coloured, strict=True):
         assert not one.touched or 0.8 < one.hull < other.hull
+
+
+def test_dirt_lies_on_the_lens_after_the_reference(labelled: tuple[Path, list[FrameLabel]]) -> None:
+    data, labels = labelled
+    camera = Camera(specks=3)
+    pictures = {}
+    for kind in (Camera(), camera):
+        results = labelled_frames("default", labels, data, images=True, camera=kind)
+        pictures[kind] = [np.asarray(result.image, int) for _, result in results if result is not None]
+    assert len(pictures[camera]) == len(labels)
+    for clean, dirty in zip(*pictures.values(), strict=True):
+        assert (dirty <= clean).all()
+        assert (clean - dirty).max() > 40
+    for one, label in zip(judge("default", labels, data, camera=camera), labels, strict=True):
+        assert one.found == label.contact
+        assert not one.touched or one.hull > 0.9
 
 
 def test_every_other_label_of_each_lab() -> None:

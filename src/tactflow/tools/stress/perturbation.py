@@ -127,20 +127,26 @@ COVER_RADIUS_PX: Final = 13
 """Radius of what covers a dot, px: twice that of the dot."""
 
 
-DIRT_SIGMA_PX: Final = 4.0
+DIRT_SIGMA_SHARE: Final = 0.01
 DIRT_DARKNESS: Final = 0.8
-"""Standard deviation of a speck before the lens, which is out of focus, px; and share of the light that it
-takes in its middle. Specks are of the size of dots."""
+"""Standard deviation of a speck before the lens, which is out of focus, relative to the longer side of the
+picture; and share of the light that it takes in its middle. Specks are of the size of dots."""
+
+
+def specks(shape: tuple[int, ...], count: int, random: Random) -> NDArray[np.float32]:
+    """Share of the light, (H, W) in 0..1, that specks on the lens let pass; shape : of the picture, px."""
+    height, width = shape[:2]
+    sigma = DIRT_SIGMA_SHARE * max(height, width)
+    points = np.zeros((height, width), np.float32)
+    for x, y in random.uniform(0, 1, (count, 2)) * (width - 1, height - 1):
+        points[round(y), round(x)] = 1
+    blurred = cv2.GaussianBlur(points, (0, 0), sigma) * (2 * np.pi * sigma**2)
+    return np.asarray(1 - DIRT_DARKNESS * np.minimum(blurred, 1), np.float32)
 
 
 def _dirty(plain: Clip, level: float, random: Random) -> Clip:
     """So many specks lie on the lens after the first two frames."""
-    height, width = plain.frames[0].shape[:2]
-    specks = np.zeros((height, width), np.float32)
-    for x, y in random.uniform(0, 1, (int(level), 2)) * (width - 1, height - 1):
-        specks[round(y), round(x)] = 1
-    blurred = cv2.GaussianBlur(specks, (0, 0), DIRT_SIGMA_PX) * (2 * np.pi * DIRT_SIGMA_PX**2)
-    passes = 1 - DIRT_DARKNESS * np.minimum(blurred, 1)[..., None]
+    passes = specks(plain.frames[0].shape, int(level), random)[..., None]
     dirty = [np.rint(frame * passes).astype(np.uint8) for frame in plain.frames[2:]]
     return plain.changed([*plain.frames[:2], *dirty])
 

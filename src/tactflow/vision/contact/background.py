@@ -20,6 +20,7 @@ from tactflow.vision.contact.background_kernels import (
     weigh_change,
     window_change,
 )
+from tactflow.vision.contact.dirt import light_directions
 from tactflow.vision.contact.illumination import IlluminationModel, under_illumination
 from tactflow.vision.geometry.downsample import halved
 from tactflow.vision.geometry.valid_area import lit_area
@@ -59,6 +60,7 @@ class Change(NamedTuple):
     largest, largest_colour : maxima of the first two.
     remaining : ratio of this change to that of the previous frame, over the cells that were in contact
         then; 1 if none was.
+    dirt : (h, w) bool, cells that have been left out, or None.
     """
 
     half: NDArray[np.uint8]
@@ -68,6 +70,13 @@ class Change(NamedTuple):
     largest: float
     largest_colour: float
     remaining: float
+    dirt: Flags | None = None
+
+    def without(self, dirt: Flags) -> Change:
+        """The same change but for some cells, (h, w) bool, which are set to 0 in place."""
+        self.cells[:, dirt] = self.deviations[:, dirt] = 0
+        largest, largest_colour = (float(values.max()) for values in self.deviations[:2])
+        return self._replace(largest=largest, largest_colour=largest_colour, dirt=dirt)
 
 
 class Derived(NamedTuple):
@@ -79,11 +88,13 @@ class Derived(NamedTuple):
         each; one over the squared length of the weighted mean; how much more a change of colour counts than
         one of brightness; and the factor of `Change.cells`, one over the standard deviation.
     gray : whether all channels are the same.
+    colours : from `light_directions`.
     """
 
     illumination: IlluminationModel
     planes: Floats32
     gray: bool
+    colours: Floats32 | None
 
     @classmethod
     def of(
@@ -109,7 +120,8 @@ class Derived(NamedTuple):
         if gel is not None:
             weight, scale = weight * gel, scale * gel
         planes = np.concatenate([mean, weight, [1 / length**2, factor, scale]])
-        return cls(illumination, np.asarray(planes, np.float32), bool((mean == mean[0]).all()))
+        gray, colours = bool((mean == mean[0]).all()), light_directions(mean, gel)
+        return cls(illumination, np.asarray(planes, np.float32), gray, colours)
 
     def weigh(
         self, cells: Floats32, before: Floats32, change: Floats32, deviations: Floats32
@@ -178,6 +190,11 @@ class BackgroundModel:
     def gray(self) -> bool:
         """Whether all channels are the same."""
         return self._derived().gray
+
+    @property
+    def colours(self) -> Floats32 | None:
+        """Colours of the light of each cell, see `light_directions`."""
+        return self._derived().colours
 
     def add(self, image: NDArray[np.uint8]) -> None:
         """Learn from one more frame of the same size; more frames estimate the noise better."""

@@ -45,6 +45,7 @@ from tactflow.vision.contact.contact_outline import (
     draw_level,
     relative_change,
 )
+from tactflow.vision.contact.dirt import attenuated_cells
 from tactflow.vision.contact.heights import HeightModel
 from tactflow.vision.contact.level_lines import ContactFinder
 
@@ -227,6 +228,11 @@ class ContactDetector:
         before, self._before = None if self._before is None else self._before > 0, None
         strength = math.sqrt(max(change.largest, change.largest_colour))
         found = self._clear(change, before)
+        if found is not None and self._background.colours is not None:
+            dirt = attenuated_cells(change.cells, self._background.colours, found)
+            if dirt is not None:
+                change = change.without(dirt)
+                found = self._clear(change, before)
         faint = found is None
         if found is None:
             found = self._faint(change, before)
@@ -261,6 +267,8 @@ class ContactDetector:
         mask, inner = np.zeros((2, *shape), np.uint8)
         regions = self._contacts(heights, changed)
         for rows, columns, inside, core in regions:
+            if change.dirt is not None:
+                inside &= ~change.dirt[rows, columns]
             window = self._background.window_change(change, rows, columns, inside, heights.mixtures)
             shown = relative_change(window)
             for border, surely, drawn in zip(self._borders, (core, _inner(core)), (mask, inner), strict=True):
