@@ -19,7 +19,7 @@ from tactflow.vision.contact.background_kernels import smooth_cells
 from tactflow.vision.contact.components import contact_cells
 from tactflow.vision.contact.contact_outline import draw_level, largest_nearby, outline_level
 from tactflow.vision.contact.heights import smooth_range
-from tactflow.vision.contact.level_lines import select_contacts
+from tactflow.vision.contact.level_lines import fill_region, select_contacts
 from tactflow.vision.contact.level_tree import grow_level_lines
 from tactflow.vision.depth.poisson import divergence, solve_down
 from tactflow.vision.depth.slopes import BAND_ROWS, coordinates, slopes_of_colour
@@ -27,7 +27,7 @@ from tactflow.vision.depth.surface import relative_change, slope_misfit
 from tactflow.vision.depth.surroundings import light_around
 from tactflow.vision.geometry.direction import sum_harmonics
 from tactflow.vision.geometry.downsample import halve
-from tactflow.vision.geometry.hull import convex_hull
+from tactflow.vision.geometry.hull import convex_hull, row_ends
 from tactflow.vision.geometry.region import sum_pixels
 
 needs_compiler = pytest.mark.skipif(
@@ -93,13 +93,23 @@ def test_contacts_are_the_same_in_c_and_in_numpy(seed: int) -> None:
     within, drops = np.empty(heights.shape, np.int32), np.empty(3000, np.float32)
     lines, contacts = np.empty((3000, 7), np.int32), np.empty((2, *heights.shape), np.int32)
     count = grow_level_lines(heights, (noise > 2).astype(np.uint8), levels, 9, within, drops, lines)
+    boxes = np.empty((2, count, 4), np.int32)
     found = [
-        select(lines[:count], drops[:count], within, into, 0.5, 0.5, 0.6, 0.5)
-        for select, into in zip((select_contacts.compiled, select_contacts.plain), contacts, strict=True)
+        select(lines[:count], drops[:count], within, into, box, 0.5, 0.5, 0.6, 0.5)
+        for select, into, box in zip(
+            (select_contacts.compiled, select_contacts.plain), contacts, boxes, strict=True
+        )
     ]
     assert found[0] == pytest.approx(found[1])
     assert found[0][0] > 0
     np.testing.assert_array_equal(*contacts)
+    np.testing.assert_array_equal(*boxes[:, : int(found[0][0])])
+    for near in range(1, 2 * int(found[0][0]), 2):
+        inside, cores = np.empty((2, 30, 35), np.bool_), np.empty((2, 2, 30, 35), np.uint8)
+        fill_region.compiled(contacts[0], near, 3, 9, 3, inside[0], cores[0])
+        fill_region.plain(contacts[0], near, 3, 9, 3, inside[1], cores[1])
+        np.testing.assert_array_equal(*inside)
+        np.testing.assert_array_equal(*cores)
 
 
 @needs_compiler
@@ -179,6 +189,9 @@ def test_the_shape_of_a_mask_is_the_same_in_c_and_in_numpy(seed: int) -> None:
     sum_pixels.compiled(mask, totals[0])
     sum_pixels.plain(mask, totals[1])
     np.testing.assert_array_equal(*totals)
+    ends = np.zeros((2, 2 * len(mask), 2), np.int32)
+    assert row_ends.compiled(mask, ends[0]) == row_ends.plain(mask, ends[1])
+    np.testing.assert_array_equal(*ends)
     points = np.ascontiguousarray(np.argwhere(mask)[:, ::-1], np.int32)
     if not len(points):
         return

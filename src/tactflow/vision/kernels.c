@@ -535,6 +535,32 @@ INLINE void double_line(const float *restrict line, i64 count, float *restrict o
     out[2 * count - 1] = line[count - 1];
 }
 
+/* Maximum of each value and the `side` - 1 that follow it at a distance of `step` each; wrong for the last ones. */
+INLINE void slide_maximum(float *restrict values, i64 size, i64 step, i64 side)
+{
+    for (i64 done = 1, more; done < side; done += more) {
+        more = MIN(done, side - done);
+        const float *next = values + more * step;
+        for (i64 i = 0; i < size - more * step; i++)
+            values[i] = MAX(values[i], next[i]);
+    }
+}
+
+/* The sum instead of the maximum; the values are lost. */
+INLINE void slide_sum(float *restrict values, i64 size, i64 step, i64 side, float *restrict total)
+{
+    memset(total, 0, size * sizeof(float));
+    for (i64 block = 1, done = 0; block <= side; block *= 2) {
+        if (side & block) {
+            for (i64 i = 0; i < size - done * step; i++)
+                total[i] += values[i + done * step];
+            done += block;
+        }
+        for (i64 i = 0; i < size - block * step; i++)
+            values[i] += values[i + block * step];
+    }
+}
+
 LOOP largest_nearby(const Arg *a, double *out)
 {
     const float *values = a[0].data;
@@ -568,40 +594,22 @@ LOOP largest_nearby(const Arg *a, double *out)
         changed += values[i] > clear;
     /* Largest, and the mean of that, over squares; what lies outside is 0. */
     const i64 reach = (i64)rint(sqrt((double)changed / 3.141592653589793) / 2), side = 2 * reach + 1;
-    const i64 padded = columns + 2 * reach, lines = rows + 2 * reach;
-    float *line = calloc(padded + 2 * reach + rows * padded + lines * (padded + columns) + 2 * columns, sizeof(float));
-    if (!line) {
+    const i64 padded = columns + 4 * reach, size = padded * (rows + 4 * reach);
+    float *grid = calloc(2 * size + columns, sizeof(float)), *total = grid + size, *between = total + size;
+    if (!grid) {
         free(sums);
         return OUT_OF_MEMORY;
     }
-    float *across = line + padded + 2 * reach, *largest = across + rows * padded, *summed = largest + lines * padded;
-    float *mean = summed + lines * columns, *between = mean + columns;
-    for (i64 y = 0; y < rows; y++) {
-        float *restrict into = across + y * padded;
-        memcpy(line + 2 * reach, coarse + y * columns, columns * sizeof(float));
-        for (i64 k = 0; k < side; k++)
-            for (i64 x = 0; x < padded; x++)
-                into[x] = MAX(into[x], line[x + k]);
-    }
-    for (i64 y = 0; y < lines; y++) {
-        float *restrict into = largest + y * padded, *restrict sum = summed + y * columns;
-        for (i64 from = MAX(y - 2 * reach, 0); from < MIN(y + 1, rows); from++)
-            for (i64 x = 0; x < padded; x++)
-                into[x] = MAX(into[x], across[from * padded + x]);
-        for (i64 k = 0; k < side; k++)
-            for (i64 x = 0; x < columns; x++)
-                sum[x] += into[x + k];
-    }
+    for (i64 y = 0; y < rows; y++)
+        memcpy(grid + (y + 2 * reach) * padded + 2 * reach, coarse + y * columns, columns * sizeof(float));
+    slide_maximum(grid, size, 1, side);
+    slide_maximum(grid, size, padded, side);
+    slide_sum(grid, size, 1, side, total);
+    slide_sum(total, size, padded, side, grid);
     const float weight = 1 / (float)(side * side);
-    for (i64 y = 0; y < rows; y++) {
-        float *restrict into = coarse + y * columns;
-        memset(mean, 0, columns * sizeof(float));
-        for (i64 k = 0; k < side; k++)
-            for (i64 x = 0; x < columns; x++)
-                mean[x] += summed[(y + k) * columns + x];
+    for (i64 y = 0; y < rows; y++)
         for (i64 x = 0; x < columns; x++)
-            into[x] = MAX(mean[x] * weight, least);
-    }
+            coarse[y * columns + x] = MAX(grid[y * padded + x] * weight, least);
     for (i64 y = 0; y < high; y++) {
         const float *restrict near = coarse + y / 2 * columns;
         const float *restrict far = coarse + MIN(MAX(y / 2 + (y % 2 ? 1 : -1), 0), rows - 1) * columns;
@@ -609,7 +617,7 @@ LOOP largest_nearby(const Arg *a, double *out)
             between[x] = 0.75f * near[x] + 0.25f * far[x];
         double_line(between, columns, nearby + y * wide);
     }
-    free(line);
+    free(grid);
     free(sums);
     return 0;
 }
@@ -999,13 +1007,44 @@ LOOP grow_level_lines(const Arg *a, double *out)
 
 /* ---- contact/level_lines.py -------------------------------------------------------------------------------- */
 
+LOOP fill_region(const Arg *a, double *out)
+{
+    const i32 *contacts = a[0].data, near = (i32)a[1].whole;
+    const i64 top = a[2].whole, left = a[3].whole, margin = a[4].whole, stride = a[0].shape[1];
+    const i64 high = a[5].shape[0], wide = a[5].shape[1], size = high * wide;
+    u8 *inside = a[5].data, *core = a[6].data, *inner = core + size;
+    i64 count = 0;
+    (void)out;
+    memset(inside, 0, size);
+    memset(inner, 0, size);
+    for (i64 y = 0; y < high; y++)
+        for (i64 x = 0; x < wide; x++) {
+            const i32 *cell = contacts + (top + y) * stride + left + x;
+            core[y * wide + x] = *cell == near + 1;
+            if (*cell != near && *cell != near + 1)
+                continue;
+            const i64 from = MAX(x - margin, 0), length = MIN(x + margin + 1, wide) - from;
+            for (i64 v = MAX(y - margin, 0); v < MIN(y + margin + 1, high); v++)
+                memset(inside + v * wide + from, 1, length);
+            int around = *cell == near + 1;
+            for (i64 v = MAX(y - 1, 0); v < MIN(y + 2, high); v++)
+                for (i64 u = MAX(x - 1, 0); u < MIN(x + 2, wide); u++)
+                    around &= cell[(v - y) * stride + u - x] == near + 1;
+            inner[y * wide + x] = (u8)around;
+            count += around;
+        }
+    if (!count)
+        memcpy(inner, core, size);
+    return 0;
+}
+
 LOOP select_contacts(const Arg *a, double *out)
 {
     const i32 *lines = a[0].data, *within = a[2].data;
-    const float *drops = a[1].data, climb = (float)a[4].number;
-    const double most_border = a[5].number, most_area = a[6].number, least_ratio = a[7].number;
-    i32 *contacts = a[3].data;
-    const i64 count = a[0].shape[0], size = a[2].shape[0] * a[2].shape[1];
+    const float *drops = a[1].data, climb = (float)a[5].number;
+    const double most_border = a[6].number, most_area = a[7].number, least_ratio = a[8].number;
+    i32 *contacts = a[3].data, *box = a[4].data;
+    const i64 count = a[0].shape[0], wide = a[2].shape[1], size = a[2].shape[0] * wide;
     float *slope = malloc((2 * count + 1) * sizeof(float)), *salience = slope + count, first = 0;
     u8 *taken = calloc(2 * count + 1, 1), *inside = taken + count;
     i32 number = 0;
@@ -1029,14 +1068,14 @@ LOOP select_contacts(const Arg *a, double *out)
                 steepest = i;
         if (!count || !(salience[steepest] > 0) || salience[steepest] < least_ratio * first)
             break;
-        i64 core = steepest, wide = steepest;
-        for (i64 outer; (outer = lines[7 * wide + 6]) >= 0; wide = outer) {
+        i64 core = steepest, last = steepest;
+        for (i64 outer; (outer = lines[7 * last + 6]) >= 0; last = outer) {
             if (taken[outer] || slope[outer] < climb * slope[steepest])
                 break;
-            if (wide == steepest)
+            if (last == steepest)
                 core = outer;
         }
-        if (!lines[7 * wide + 3]) {
+        if (!lines[7 * last + 3]) {
             salience[steepest] = 0;
             continue;
         }
@@ -1044,16 +1083,25 @@ LOOP select_contacts(const Arg *a, double *out)
             first = salience[steepest];
             out[1] = slope[steepest];
         }
-        for (i64 i = wide; i >= 0; i--) {
+        for (i64 i = last; i >= 0; i--) {
             const i64 outer = lines[7 * i + 6];
-            inside[i] = i == core ? 2 : i == wide ? 1 : outer >= 0 && outer <= wide ? inside[outer] : 0;
+            inside[i] = i == core ? 2 : i == last ? 1 : outer >= 0 && outer <= last ? inside[outer] : 0;
             taken[i] |= inside[i] > 0;
         }
+        box[0] = box[1] = INT32_MAX;
+        box[2] = box[3] = 0;
         for (i64 i = 0; i < size; i++)
-            if (within[i] >= 0 && within[i] <= wide && inside[within[i]])
+            if (within[i] >= 0 && within[i] <= last && inside[within[i]]) {
+                const i32 y = (i32)(i / wide), x = (i32)(i % wide);
                 contacts[i] = 2 * number + inside[within[i]];
-        for (; wide >= 0; wide = lines[7 * wide + 6])
-            taken[wide] = 1;
+                box[0] = MIN(box[0], y);
+                box[1] = MIN(box[1], x);
+                box[2] = y + 1;
+                box[3] = MAX(box[3], x + 1);
+            }
+        box += 4;
+        for (; last >= 0; last = lines[7 * last + 6])
+            taken[last] = 1;
         for (i64 i = 0; i < count; i++)
             salience[i] = taken[i] ? 0 : salience[i];
         number++;
@@ -1084,10 +1132,15 @@ LOOP sum_pixels(const Arg *a, double *out)
         box[1] = sums[0] ? box[1] : y;
         box[3] = y + 1;
         for (i64 x = 0; x < wide; x++) {
-            for (u64 eight = 0; x + 8 <= wide && !eight; x += eight ? 0 : 8)
+            for (u64 eight; x + 8 <= wide; x += 8) {
                 memcpy(&eight, row + x, 8);
-            if (x == wide || !row[x])
-                continue;
+                if (eight)
+                    break;
+            }
+            while (x < wide && !row[x])
+                x++;
+            if (x == wide)
+                break;
             /* Sums over the pixels of a run. */
             const u8 *next = memchr(row + x, 0, wide - x);
             const i64 end = next ? next - row : wide;
@@ -1105,6 +1158,29 @@ LOOP sum_pixels(const Arg *a, double *out)
         sums[4] += y * along;
         sums[5] += y * y * count;
     }
+    return 0;
+}
+
+LOOP row_ends(const Arg *a, double *out)
+{
+    const u8 *mask = a[0].data;
+    const i64 high = a[0].shape[0], wide = a[0].shape[1];
+    i32 *points = a[1].data;
+    i64 count = 0;
+    for (i64 y = 0; y < high; y++) {
+        const u8 *row = mask + y * wide;
+        i64 first = 0, last = wide - 1;
+        while (first < wide && !row[first])
+            first++;
+        if (first == wide)
+            continue;
+        while (!row[last])
+            last--;
+        const i32 ends[4] = {(i32)first, (i32)y, (i32)last, (i32)y};
+        memcpy(points + 2 * count, ends, sizeof ends);
+        count += 2;
+    }
+    out[0] = (double)count;
     return 0;
 }
 
@@ -2192,8 +2268,10 @@ static const Loop LOOPS[] = {
     {"draw_level", "f2 n n B2!", '-', draw_level},
     {"fit_light", "f3 f2 f2 f3 f3 f3 f3 f1 f2! x n x x", '-', fit_light},
     {"grow_level_lines", "f2 B2 f1 n i2! f1! i2!", 'n', grow_level_lines},
-    {"select_contacts", "i2 f1 i2 i2! x x x x", '2', select_contacts},
+    {"select_contacts", "i2 f1 i2 i2! i2! x x x x", '2', select_contacts},
+    {"fill_region", "i2 n n n n ?2! B3!", '-', fill_region},
     {"sum_pixels", "B2 q1!", '-', sum_pixels},
+    {"row_ends", "B2 i2!", 'n', row_ends},
     {"convex_hull", "i2 i2!", '2', convex_hull},
     {"sum_harmonics", "i2 d1 x n d2!", '-', sum_harmonics},
     {"cover_spots", "B3 n n B2!", '-', cover_spots},

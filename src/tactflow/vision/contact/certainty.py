@@ -39,12 +39,16 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
     (n, 2) : logarithm of the share of colour in the region's largest change; 1 if markers moved as well, else
         0.
     """
-    inside = np.ascontiguousarray(mask[::CELL_PX, ::CELL_PX])
+    inside = mask[::CELL_PX, ::CELL_PX]
     evidence = np.empty((len(parts), 2))
     for row, part in zip(evidence, parts, strict=True):
-        cells = np.zeros_like(inside)
-        cv2.fillConvexPoly(cells, (part.hull / CELL_PX).astype(np.int32), (1.0,))
-        light, colour = (cv2.minMaxLoc(values, cells & inside)[1] for values in deviations)
+        corners = (part.hull / CELL_PX).astype(np.int32)
+        left, top, wide, high = cv2.boundingRect(corners)
+        window = slice(top, top + high), slice(left, left + wide)
+        cells = np.zeros((high, wide), np.uint8)
+        cv2.fillConvexPoly(cells, corners - np.array([left, top], np.int32), (1.0,))
+        cells &= inside[window]
+        light, colour = (cv2.minMaxLoc(values[window], cells)[1] for values in deviations)
         row[:] = math.log(max(colour / max(light, 1e-9), MIN_COLOUR_SHARE)), part.evidence == "both"
     return evidence
 

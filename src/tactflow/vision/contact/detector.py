@@ -37,7 +37,7 @@ from scipy import special
 
 from tactflow.vision.arrays import Flags, Floats32, check_color_image, check_mask
 from tactflow.vision.contact.background import CELL_PX, BackgroundModel, Change
-from tactflow.vision.contact.components import MIN_CELLS, SQUARE, contact_cells, wide_change
+from tactflow.vision.contact.components import MIN_CELLS, contact_cells, wide_change
 from tactflow.vision.contact.contact_outline import (
     BORDER_SLOPE_FRACTION,
     CORE_SLOPE_FRACTION,
@@ -266,12 +266,12 @@ class ContactDetector:
         heights = self._heights(change.cells)
         mask, inner = np.zeros((2, *shape), np.uint8)
         regions = self._contacts(heights, changed)
-        for rows, columns, inside, core in regions:
+        for rows, columns, inside, *cores in regions:
             if change.dirt is not None:
                 inside &= ~change.dirt[rows, columns]
             window = self._background.window_change(change, rows, columns, inside, heights.mixtures)
             shown = relative_change(window)
-            for border, surely, drawn in zip(self._borders, (core, _inner(core)), (mask, inner), strict=True):
+            for border, surely, drawn in zip(self._borders, cores, (mask, inner), strict=True):
                 level = contact_level(shown, surely, border)
                 draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, drawn)
         if not regions:
@@ -341,9 +341,3 @@ def _contact_cells(
     last, least = np.zeros_like(found) if before is None else before, min(MIN_CELLS, found.size // 4)
     count = contact_cells(squared, LOW_THRESHOLD_FRACTION * limit, start, stay, last, least, found)
     return found if count else None
-
-
-def _inner(core: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Cells (h, w) surrounded by others of a region, if there are any: changes are smoothed by a cell."""
-    inner = cv2.erode(core, SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=(1.0,))
-    return np.asarray(inner, np.uint8) if inner.any() else core

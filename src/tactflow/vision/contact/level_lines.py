@@ -9,13 +9,15 @@ Morel, "Edge detection by Helmholtz principle", Journal of Mathematical Imaging 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Flags, Floats32, Mask, Numbers
+from tactflow.vision.arrays import Bytes, Flags, Floats32, Mask, Numbers
 from tactflow.vision.compiled import kernel
+from tactflow.vision.contact.components import SQUARE
 from tactflow.vision.contact.heights import Heights
 from tactflow.vision.contact.level_tree import grow_level_lines
 
@@ -52,12 +54,14 @@ class ContactRegion(NamedTuple):
     rows, columns : window of cells.
     inside : (h, w) bool, cells that may belong to the contact.
     core : (h, w) uint8, 1 in cells that certainly do.
+    inner : (h, w) uint8, 1 in those surrounded by others, if there are any: changes are smoothed by a cell.
     """
 
     rows: slice
     columns: slice
     inside: Flags
     core: Mask
+    inner: Mask
 
 
 class ContactFinder:
@@ -105,9 +109,11 @@ def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
     lines = np.empty((LEVEL_COUNT * heights.size // MIN_LINE_CELLS, 7), np.int32)
     drops = np.empty(len(lines), np.float32)
     count = grow_level_lines(heights, changed.view(np.uint8), levels, MIN_LINE_CELLS, within, drops, lines)
+    boxes = np.empty((count, 4), np.int32)
     limits = MIN_CLIMB_SLOPE_RATIO, MAX_BORDER_SHARE, MAX_AREA_SHARE, MIN_SALIENCE_RATIO
-    number, slope = select_contacts(lines[:count], drops[:count], within, contacts, *limits)
-    return _Contacts([_region(contacts, 2 * index + 1) for index in range(int(number))], slope)
+    number, slope = select_contacts(lines[:count], drops[:count], within, contacts, boxes, *limits)
+    found = enumerate(boxes[: int(number)].tolist())
+    return _Contacts([_region(contacts, 2 * index + 1, box) for index, box in found], slope)
 
 
 @kernel
@@ -116,6 +122,7 @@ def select_contacts(
     drops: Floats32,
     within: Numbers,
     contacts: Numbers,
+    boxes: Numbers,
     climb: float,
     most_border: float,
     most_area: float,
@@ -126,7 +133,8 @@ def select_contacts(
     Returns the number of contacts, and the slope of the first one's line; 0 without any.
 
     lines, drops, within : of `grow_level_lines`. contacts : (h, w), filled: 2 i + 2 in the core of the i-th
-    contact, 2 i + 1 in other cells inside its outer line, 0 elsewhere. climb : `MIN_CLIMB_SLOPE_RATIO`.
+    contact, 2 i + 1 in other cells inside its outer line, 0 elsewhere. boxes : (n, 4), filled from its start:
+    first row and column of each contact, last ones plus 1. climb : `MIN_CLIMB_SLOPE_RATIO`.
     most_border : `MAX_BORDER_SHARE`. most_area : `MAX_AREA_SHARE`. least_ratio : `MIN_SALIENCE_RATIO`.
     """
     _, _, cells, enclosed, sides, border, outer = lines.T
@@ -151,6 +159,8 @@ def select_contacts(
         # The gel is steepest between this line and the next one.
         core, near = (_lines_inside(line, outer) for line in (outwards[:2][-1], outwards[-1]))
         contacts += (2 * number + 1) * near[within] + core[within]
+        y, x = near[within].nonzero()
+        boxes[number] = y.min(), x.min(), y.max() + 1, x.max() + 1
         # Nested lines belong to the same contact.
         free[near[:-1]] = False
         line = outwards[-1]
@@ -171,12 +181,29 @@ def _lines_inside(line: int, outer: Numbers) -> Flags:
     return inside
 
 
-def _region(contacts: Numbers, near: int) -> ContactRegion:
+def _region(contacts: Numbers, near: int, box: Sequence[int]) -> ContactRegion:
     """The region of a contact from `select_contacts`; near : number in its cells outside the core."""
-    cells = np.asarray(cv2.inRange(contacts, (near,), (near + 1,)))
-    left, top, across, down = cv2.boundingRect(cells)
     margin = SEARCH_MARGIN_CELLS + 1
-    rows = slice(max(top - margin, 0), min(top + down + margin, contacts.shape[0]))
-    columns = slice(max(left - margin, 0), min(left + across + margin, contacts.shape[1]))
-    inside = cv2.dilate(cells[rows, columns], np.ones((2 * margin - 1, 2 * margin - 1), np.uint8))
-    return ContactRegion(rows, columns, inside > 0, (contacts[rows, columns] == near + 1).view(np.uint8))
+    rows = slice(max(box[0] - margin, 0), min(box[2] + margin, contacts.shape[0]))
+    columns = slice(max(box[1] - margin, 0), min(box[3] + margin, contacts.shape[1]))
+    inside = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.bool_)
+    cores = np.empty((2, *inside.shape), np.uint8)
+    fill_region(contacts, near, rows.start, columns.start, SEARCH_MARGIN_CELLS, inside, cores)
+    return ContactRegion(rows, columns, inside, *cores)
+
+
+@kernel
+def fill_region(
+    contacts: Numbers, near: int, top: int, left: int, margin: int, inside: Flags, cores: Bytes
+) -> None:
+    """Fill the cells of a `ContactRegion`.
+
+    contacts, near : as for `_region`. top, left : of the window. margin : cells. inside : (h, w). cores :
+    (2, h, w), the core and its inner part.
+    """
+    window = contacts[top:, left:][: inside.shape[0], : inside.shape[1]]
+    core = (window == near + 1).view(np.uint8)
+    square = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    inside[:] = cv2.dilate(core | (window == near).view(np.uint8), square)
+    inner = cv2.erode(core, SQUARE)
+    cores[:] = core, inner if inner.any() else core

@@ -190,8 +190,9 @@ def _core_area(core: Mask, region: Region) -> float | None:
     """Area of the convex hull of the core inside a region, px^2; None if there is none."""
     window = core[region.top : region.top + region.height, region.left : region.left + region.width]
     inside = cv2.bitwise_and(window, region.window)
-    contours, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return _hull(contours)[1] if contours else None
+    ends = np.empty((2 * len(inside), 2), np.int32)
+    count = row_ends(np.asarray(inside, np.uint8), ends)
+    return convex_hull(ends[:count], np.empty_like(ends))[1] if count else None
 
 
 def _hull(contours: Contours) -> tuple[Points, float]:
@@ -200,6 +201,18 @@ def _hull(contours: Contours) -> tuple[Points, float]:
     corners = np.empty_like(points)
     count, area = convex_hull(points, corners)
     return corners[: int(count)].astype(np.float64), area
+
+
+@kernel
+def row_ends(mask: Mask, ends: Numbers) -> int:
+    """The first and the last pixel of each row that has any; returns their number.
+
+    mask : (h, w), not 0 inside. ends : (2 h, 2), filled from its start.
+    """
+    rows = [(y, np.flatnonzero(row)) for y, row in enumerate(mask) if row.any()]
+    points = [(x[at], y) for y, x in rows for at in (0, -1)]
+    ends[: len(points)] = np.reshape(points, (-1, 2))
+    return len(points)
 
 
 @kernel
