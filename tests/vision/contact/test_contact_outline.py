@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.contact.contact_outline import (
-    RelativeChange,
     contact_level,
     largest_nearby,
     relative_change,
@@ -70,7 +69,7 @@ def found(change: Float, core: NDArray[np.bool_], mixtures: Float = SLOPES) -> N
     return np.asarray(contact_level(relative(change, mixtures), core.astype(np.uint8)) > 0, np.bool_)
 
 
-def relative(change: Float, mixtures: Float = SLOPES) -> RelativeChange:
+def relative(change: Float, mixtures: Float = SLOPES) -> tuple[Float, float]:
     """Of a change (h, w, 3)."""
     return relative_change(np.ascontiguousarray((change @ mixtures.T).transpose(2, 0, 1)))
 

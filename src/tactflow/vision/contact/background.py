@@ -183,33 +183,30 @@ class BackgroundModel:
         self._gel = _gel_cells(half, valid)
         self._frames = 1
         self._repeatability, self._tint, self._shift = repeatability, tint, shift
-        self._known: Derived | None = None
-        self._untouched: Floats32 | None = None
+        self._derive()
 
     @property
     def gray(self) -> bool:
         """Whether all channels are the same."""
-        return self._derived().gray
+        return self._derived.gray
 
     @property
     def colours(self) -> Floats32 | None:
         """Colours of the light of each cell, see `light_directions`."""
-        return self._derived().colours
+        return self._derived.colours
 
     def add(self, image: NDArray[np.uint8]) -> None:
         """Learn from one more frame of the same size; more frames estimate the noise better."""
-        known = self._derived()
         half = _halved(image)
         smooth = _smoothed(half)
-        coefficients = known.illumination.fit(smooth)
-        change: Floats32 = smooth - under_illumination(known.planes[:3], coefficients)
+        coefficients = self._derived.illumination.fit(smooth)
+        change: Floats32 = smooth - under_illumination(self._mean, coefficients)
         count = self._frames
         self._squares = self._squares + change * change * np.float32(count / (count + 1))
         self._mean = self._mean + change / np.float32(count + 1)
         self._half = self._half + (_planes(half) - self._half) / np.float32(count + 1)
         self._frames += 1
-        self._known = None
-        self._untouched = None
+        self._derive()
 
     def compare(self, image: NDArray[np.uint8], before: Floats32 | None) -> Change:
         """Compare a frame of the same size with the background.
@@ -217,18 +214,14 @@ class BackgroundModel:
         before : (h, w) float32, the previous frame's evidence in cells in contact, 0 elsewhere; None if
             nothing was in contact.
         """
-        known = self._derived()
-        if self._untouched is None:
-            # Computed with the reference, so that the first frame with contact does not wait for it.
-            self._untouched = self._compared_with()
         half = _halved(image)
         smooth = _smoothed(half)
         if before is None:
             before = np.zeros(smooth.shape[1:], np.float32)
         cells, deviations = np.empty((2, *smooth.shape), np.float32)
-        coefficients, largest, largest_colour, now, was = known.weigh(smooth, before, cells, deviations)
+        light, largest, largest_colour, now, was = self._derived.weigh(smooth, before, cells, deviations)
         remaining = math.sqrt(now / was) if was > 0 else 1.0
-        return Change(half, coefficients, cells, deviations, largest, largest_colour, remaining)
+        return Change(half, light, cells, deviations, largest, largest_colour, remaining)
 
     def window_change(
         self, change: Change, rows: slice, columns: slice, inside: Flags, mixtures: Floats32
@@ -238,21 +231,19 @@ class BackgroundModel:
         change : of this frame. rows, columns : the window, cells. inside : (h, w) bool, the cells of it that
         count; the result is 0 in the others. mixtures : (k, 3) float32, weights of the channels.
         """
-        assert self._untouched is not None
         picture = change.half.reshape(len(change.half), -1)
         shown = np.empty((len(mixtures), 2 * inside.shape[0], 2 * inside.shape[1]), np.float32)
         window = 2 * rows.start, 2 * columns.start, change.illumination, self._untouched, inside, mixtures
         window_change(picture, *window, shown, NEIGHBOUR_WEIGHT)
         return shown
 
-    def _derived(self) -> Derived:
-        if self._known is not None:
-            return self._known
+    def _derive(self) -> None:
+        """Derive what frames are compared with, so that the first one with contact does not wait for it."""
         mean, count = self._mean, self._frames
         noise = (PRIOR_WEIGHT_FRAMES * self._noise**2 + self._squares) / (PRIOR_WEIGHT_FRAMES + count - 1)
         steady = noise * (1 + 1 / count) + (self._shift / CELL_PX * _steepness(mean)) ** 2
-        self._known = Derived.of(mean, steady, self._repeatability, self._tint, self._gel)
-        return self._known
+        self._derived = Derived.of(mean, steady, self._repeatability, self._tint, self._gel)
+        self._untouched = self._compared_with()
 
     def _compared_with(self) -> Floats32:
         """(2, 2 h, 6 w), interleaved: mean of the untouched gel, and one over its standard deviation.

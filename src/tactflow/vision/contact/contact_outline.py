@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from functools import reduce
-from typing import Final, NamedTuple
+from typing import Final
 
 import cv2
 import numpy as np
@@ -39,21 +39,9 @@ half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 
 real outlines within 0.02."""
 
 
-class RelativeChange(NamedTuple):
-    """What a window shows of a contact.
-
-    Attributes
-    ----------
-    values : (h, w) float32, size of the slope, or depth, over its local maximum.
-    border : of these values, the usual one at the outline of a contact.
-    """
-
-    values: Floats32
-    border: float
-
-
-def relative_change(shown: Floats32) -> RelativeChange:
-    """The slope or depth of a gel over its local maximum.
+def relative_change(shown: Floats32) -> tuple[Floats32, float]:
+    """Size of the slope, or depth, of a gel over its local maximum, (h, w), and its value at the outline of a
+    contact.
 
     shown : (k, h, w) float32, in the window of the contact, h and w even, 0 outside its region: mixtures of
         the change of the channels. Several are slopes. One is a slope if the contact brightens on one flank
@@ -62,15 +50,17 @@ def relative_change(shown: Floats32) -> RelativeChange:
     size, border = _what_shows(shown)
     nearby = np.empty_like(size)
     largest_nearby(size, BORDER_SLOPE_FRACTION, nearby)
-    return RelativeChange(size / nearby, border)
+    return size / nearby, border
 
 
-def contact_level(change: RelativeChange, core: Mask, border: float = BORDER_SLOPE_FRACTION) -> Floats32:
+def contact_level(
+    change: tuple[Floats32, float], core: Mask, border: float = BORDER_SLOPE_FRACTION
+) -> Floats32:
     """Level set of one contact's outline.
 
     Parameters
     ----------
-    change : in the window of the contact.
+    change : of `relative_change`, in the window of the contact.
     core : (h / n, w / n) uint8, n whole, 1 where the contact certainly is, else 0.
     border : slope at the outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
         fraction of the local depth is in proportion.
@@ -91,9 +81,9 @@ def contact_level(change: RelativeChange, core: Mask, border: float = BORDER_SLO
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True
     """
-    fraction = min(change.border * border / BORDER_SLOPE_FRACTION, 1.0)
-    level = np.empty_like(change.values)
-    outline_level(change.values, fraction, core, level)
+    values, usual = change
+    level = np.empty_like(values)
+    outline_level(values, min(usual * border / BORDER_SLOPE_FRACTION, 1.0), core, level)
     return level
 
 

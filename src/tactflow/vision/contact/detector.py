@@ -155,22 +155,16 @@ class ContactDetector:
         border: float = BORDER_SLOPE_FRACTION,
         core: float = CORE_SLOPE_FRACTION,
     ) -> None:
-        if not 0 < false_alarms < 1:
-            raise ValueError(f"false_alarms: required in (0, 1), got {false_alarms}")
-        if not 0 <= repeatability <= 1:
-            raise ValueError(f"repeatability: required in [0, 1], got {repeatability}")
-        if not 0 <= tint <= 1:
-            raise ValueError(f"tint: required in [0, 1], got {tint}")
+        for name, value in {"false_alarms": false_alarms, "border": border, "core": core}.items():
+            if not 0 < value < 1:
+                raise ValueError(f"{name}: required in (0, 1), got {value}")
+        for name, value in {"repeatability": repeatability, "tint": tint, "creep": creep}.items():
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name}: required in [0, 1], got {value}")
         if not (shift >= 0 and math.isfinite(shift)):
             raise ValueError(f"shift: required >= 0 px, got {shift}")
         if not 0 <= relaxation < 1:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
-        if not 0 <= creep <= 1:
-            raise ValueError(f"creep: required in [0, 1], got {creep}")
-        if not 0 < border < 1:
-            raise ValueError(f"border: required in (0, 1), got {border}")
-        if not 0 < core < 1:
-            raise ValueError(f"core: required in (0, 1), got {core}")
         self._false_alarms = false_alarms
         self._repeatability = repeatability
         self._tint = min(tint, repeatability)

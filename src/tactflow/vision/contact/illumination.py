@@ -6,9 +6,8 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tactflow.vision.arrays import SATURATED_GREY, Floats32
+from tactflow.vision.arrays import SATURATED_GREY, Flags, Floats32
 from tactflow.vision.compiled import kernel
 
 BLOCK_CELLS: Final = 8
@@ -64,34 +63,25 @@ class IlluminationModel:
     True
     """
 
-    def __init__(self, reference: Floats32, variance: Floats32, gel: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, reference: Floats32, variance: Floats32, gel: Flags | None = None) -> None:
         height, width = reference.shape[1:]
-        self._row_weights = _block_weights(max(1, height // BLOCK_CELLS), height)
-        self._column_weights = _block_weights(max(1, width // BLOCK_CELLS), width)
-        self._center: Floats32 = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))
-        relative = reference / self._center[:, None, None]
+        self._weights = tuple(_block_weights(max(1, side // BLOCK_CELLS), side) for side in (height, width))
+        center: Floats32 = np.maximum(reference.mean(axis=(1, 2)), np.float32(1))
+        relative = reference / center[:, None, None]
         slopes = np.stack([relative * positions(width), relative * positions(height)[:, None]], axis=1)
         terms = np.concatenate([relative[:, None], slopes, np.ones_like(relative)[:, None]], axis=1)
         basis = np.stack([self._block_means(channel) for channel in terms])
-        self._fitted = self._fitted_blocks(gel)
-        weight = 1 / self._block_means(variance)[:, None]
-        if self._fitted is not None:
-            weight = weight * self._fitted
+        gel_blocks = self._gel_blocks(np.ones((height, width), np.bool_) if gel is None else gel)
+        weight = gel_blocks / self._block_means(variance)[:, None]
         fitted = basis * weight
         penalty = weight.sum(axis=2)[:, :, None] * np.diag(RIDGE_PENALTIES)
         inverse = np.linalg.inv(fitted @ basis.transpose(0, 2, 1) + penalty + 1e-6 * np.eye(4))
-        self._basis: Floats32 = np.ascontiguousarray(basis, np.float32)
-        brightness = self._basis[:, 0]
-        lit = (
-            brightness > MIN_BLOCK_BRIGHTNESS
-            if self._fitted is None
-            else (brightness > MIN_BLOCK_BRIGHTNESS) & self._fitted
-        )
-        per_brightness = np.where(lit, 1 / np.maximum(brightness, MIN_BLOCK_BRIGHTNESS), np.float32(0))
-        self._step: Floats32 = np.ascontiguousarray(inverse @ fitted, np.float32)
-        self._shrink: Floats32 = np.ascontiguousarray((inverse @ penalty).transpose(0, 2, 1), np.float32)
+        lit = (basis[:, 0] > MIN_BLOCK_BRIGHTNESS) & gel_blocks
+        per_brightness = np.where(lit, 1 / np.maximum(basis[:, 0], MIN_BLOCK_BRIGHTNESS), 0)
         limit = np.float32(CLIP_STDDEVS) * np.sqrt(self._block_means(variance))
-        self._blocks: Floats32 = np.stack([self._block_means(reference), per_brightness, limit])
+        blocks = np.stack([self._block_means(reference), per_brightness, limit])
+        fit = blocks, basis, inverse @ fitted, (inverse @ penalty).transpose(0, 2, 1), center
+        self._fit = [np.ascontiguousarray(values, np.float32) for values in fit]
 
     def fit(self, cells: Floats32) -> Floats32:
         """Coefficients of the change of illumination between the reference and a frame.
@@ -101,34 +91,21 @@ class IlluminationModel:
         grey levels.
         """
         coefficients = np.zeros((3, 4), np.float32)
-        fit_light(
-            cells,
-            self._row_weights,
-            self._column_weights,
-            self._blocks,
-            self._basis,
-            self._step,
-            self._shrink,
-            self._center,
-            coefficients,
-            SATURATED_GREY,
-            MAX_STEPS,
-            MIN_STEP_GREY,
-            REJECT_CLIP_RATIO,
-        )
+        limits = SATURATED_GREY, MAX_STEPS, MIN_STEP_GREY, REJECT_CLIP_RATIO
+        rows, columns = self._weights
+        blocks, basis, step, shrink, center = self._fit
+        fit_light(cells, rows, columns, blocks, basis, step, shrink, center, coefficients, *limits)
         return coefficients
 
-    def _fitted_blocks(self, gel: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-        """Blocks (n,) of which at least half is gel; None for all, also if there is no such block."""
-        if gel is None:
-            return None
-        fitted = self._block_means(gel[None].astype(np.float32))[0] >= np.float32(0.5)
-        return fitted if fitted.any() else None
+    def _gel_blocks(self, gel: Flags) -> Flags:
+        """Whether at least half of each block, (n,), is gel; all are if there is no such block."""
+        found = self._block_means(gel[None].astype(np.float32))[0] >= np.float32(0.5)
+        return np.asarray(found if found.any() else ~found, np.bool_)
 
     def _block_means(self, planes: Floats32) -> Floats32:
         """(n, blocks) float32: means over blocks of planes (n, h, w); two blocks may share a cell in
         parts."""
-        means = self._row_weights @ planes @ self._column_weights.T
+        means = self._weights[0] @ planes @ self._weights[1].T
         return np.asarray(means.reshape(len(planes), -1), np.float32)
 
 

@@ -80,30 +80,19 @@ class ContactFinder:
         heights : of the gel's cells. changed : (h, w) bool; each contact encloses some of these cells.
         """
         values = heights.values if self._bumps >= 0 or not heights.sloping else -heights.values
-        found = _contacts(values, changed)
-        if heights.sloping and abs(self._bumps) <= SIGN_EVIDENCE_SLOPES * found.slope:
-            others = _contacts(-values, changed)
-            more = found.slope - others.slope
+        regions, slope = _contacts(values, changed)
+        if heights.sloping and abs(self._bumps) <= SIGN_EVIDENCE_SLOPES * slope:
+            others, other_slope = _contacts(-values, changed)
+            more = slope - other_slope
             if abs(self._bumps) + more < 0:
-                found = others
+                regions = others
             self._bumps += more if values is heights.values else -more
-        return found.regions
+        return regions
 
 
-class _Contacts(NamedTuple):
-    """The contacts of a surface, the most salient first.
-
-    Attributes
-    ----------
-    slope : of the first one's line; 0 without any.
-    """
-
-    regions: list[ContactRegion]
-    slope: float
-
-
-def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
-    """The contacts at evenly spaced levels; heights : (h, w) float32. changed : (h, w) bool."""
+def _contacts(heights: Floats32, changed: Flags) -> tuple[list[ContactRegion], float]:
+    """The contacts at evenly spaced levels, the most salient first, and the slope of the first one's line, 0
+    without any; heights : (h, w) float32. changed : (h, w) bool."""
     levels = LEVELS * (heights.max() / np.float32(LEVEL_COUNT + 1))
     within, contacts = np.empty((2, *heights.shape), np.int32)
     lines = np.empty((LEVEL_COUNT * heights.size // MIN_LINE_CELLS, 7), np.int32)
@@ -113,7 +102,7 @@ def _contacts(heights: Floats32, changed: Flags) -> _Contacts:
     limits = MIN_CLIMB_SLOPE_RATIO, MAX_BORDER_SHARE, MAX_AREA_SHARE, MIN_SALIENCE_RATIO
     number, slope = select_contacts(lines[:count], drops[:count], within, contacts, boxes, *limits)
     found = enumerate(boxes[: int(number)].tolist())
-    return _Contacts([_region(contacts, 2 * index + 1, box) for index, box in found], slope)
+    return [_region(contacts, 2 * index + 1, box) for index, box in found], slope
 
 
 @kernel
