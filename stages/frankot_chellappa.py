@@ -9,7 +9,7 @@ from tactflow.calibration.file import Calibration
 from tactflow.engine.contract import Stage, StageParams
 from tactflow.engine.frame import Absent
 from tactflow.ports import ContactMask, Unmarked, Untouched
-from tactflow.vision.depth.surface import Rest, colour_change, measured
+from tactflow.vision.depth.surface import Rest, colour_change, half_resolution, measured
 from tactflow.vision.types import Depth, Scale
 
 
@@ -50,7 +50,7 @@ class FrankotChellappa(Stage):
             return Absent("no_contact")
         rest = self.once(Rest, untouched)
         everywhere = np.ones((rest.window.height, rest.window.width), np.uint8)
-        change = colour_change(unmarked, rest, rest.window, np.ones(3, np.float32))
+        change = colour_change(half_resolution(unmarked), rest, rest.window, np.ones(3, np.float32))
         height, width = contact_mask.shape
         model = self.once(known.at, scale, (width, height)).slopes if known.kind else known.slopes
         assert model is not None

@@ -166,7 +166,7 @@ def test_loops_of_the_height_map_are_the_same_in_c_and_in_numpy() -> None:
         growth, rings = np.empty(3, np.float32), np.zeros((2, 9))
         getattr(light_around, name)(change, level, distance, 2, 0.5, growth, rings)
         relative = np.empty((30, 90), np.float32)
-        getattr(relative_change, name)(picture[:30, 60:150].copy(), picture, 5, 30, gain, 20.0, relative)
+        getattr(relative_change, name)(picture, picture[::-1].copy(), 5, 30, gain, 20.0, relative)
         slope = np.zeros((2, 37, 61), np.float32)
         place = coordinates((61, 37))
         getattr(slopes_of_colour, name)(change, coefficients, *place, near, 0.6, slope, BAND_ROWS, 12, 0.95)

@@ -20,7 +20,7 @@ from tactflow.calibration.samples import reach
 from tactflow.engine.errors import ConfigError
 from tactflow.vision.arrays import Floats
 from tactflow.vision.depth.darkness import DarknessModel
-from tactflow.vision.depth.surface import Rest, colour_change
+from tactflow.vision.depth.surface import Rest, colour_change, half_resolution
 from tactflow.vision.depth.surroundings import surroundings
 from tactflow.vision.types import Scale
 
@@ -106,8 +106,9 @@ def _rings(press: Press, rest: Rest, scale: Scale, ball_radius: float) -> list[R
     contact = min(contact, ball_radius)
     fall = float(np.sqrt(ball_radius**2 - contact**2))
     window = surroundings(press.mask, rest.window).window
-    gain = rest.around(press.image, press.mask).gain
-    darkening = -colour_change(press.image, rest, window, gain).mean(axis=2)
+    half = half_resolution(press.image)
+    gain = rest.around(half, press.mask).gain
+    darkening = -colour_change(half, rest, window, gain).mean(axis=2)
     rows, columns = np.mgrid[window.part]
     # The centre of a pixel at half resolution lies between two of the processed frame.
     x, y = (2 * columns + 0.5 - press.center[0]) * scale.x, (2 * rows + 0.5 - press.center[1]) * scale.y

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tactflow.calibration.presses import Press, Session
 from tactflow.vision.arrays import Floats
 from tactflow.vision.depth.slopes import COLOUR_TERMS, PLACE_TERMS, SlopeModel, colour_terms, place_terms
-from tactflow.vision.depth.surface import Rest, Surface, colour_change
+from tactflow.vision.depth.surface import Rest, Surface, colour_change, half_resolution
 from tactflow.vision.depth.surroundings import Window, surroundings
 from tactflow.vision.types import Scale
 
@@ -213,11 +213,11 @@ def _prepare(
     """smoothed : the picture of the press. rests : the untouched gel, as it is and smoothed."""
     rest = rests[0]
     window = surroundings(press.mask, rest.window).window
-    gain = rest.around(press.image, press.mask).gain
-    change = colour_change(smoothed, rests[1], window, gain)
-    size = (window.width, window.height)
-    dark = cv2.resize(smoothed[window.whole], size, interpolation=cv2.INTER_AREA).min(axis=2) < DARK
-    change[dark] = colour_change(press.image, rest, window, gain)[dark]
+    half, smooth = half_resolution(press.image), half_resolution(smoothed)
+    gain = rest.around(half, press.mask).gain
+    change = colour_change(smooth, rests[1], window, gain)
+    dark = smooth[window.part].min(axis=2) < DARK
+    change[dark] = colour_change(half, rest, window, gain)[dark]
     place = place_terms((rest.window.right, rest.window.bottom))[(slice(None), *window.part)]
     terms = place.reshape(PLACE_TERMS, 1, -1) * colour_terms(change)
     rows, columns = np.mgrid[window.part]

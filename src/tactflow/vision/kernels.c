@@ -2129,7 +2129,7 @@ LOOP relative_change(const Arg *a, double *out)
     const u8 *picture = a[0].data, *untouched = a[1].data;
     const float *gain = a[4].data, offset = (float)a[5].number;
     float *change = a[6].data;
-    const i64 stride = a[1].shape[1], top = a[2].whole, left = a[3].whole, high = a[0].shape[0], wide = a[0].shape[1];
+    const i64 stride = a[1].shape[1], top = a[2].whole, left = a[3].whole, high = a[6].shape[0], wide = a[6].shape[1];
     float *restrict inverse = malloc((wide + 1) * sizeof(float));
     (void)out;
     if (!inverse)
@@ -2137,7 +2137,8 @@ LOOP relative_change(const Arg *a, double *out)
     for (i64 i = 0; i < wide; i++)
         inverse[i] = 1 / gain[i % 3];
     for (i64 y = 0; y < high; y++) {
-        const u8 *restrict now = picture + y * wide, *restrict light = untouched + (top + y) * stride + left;
+        const i64 start = (top + y) * stride + left;
+        const u8 *restrict now = picture + start, *restrict light = untouched + start;
         float *restrict row = change + y * wide;
         for (i64 i = 0; i < wide; i++)
             row[i] = (now[i] * inverse[i] - light[i]) / (light[i] + offset);

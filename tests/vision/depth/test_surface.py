@@ -7,7 +7,7 @@ import pytest
 
 from tactflow.vision.depth.poisson import ALL_OPEN, Sides, integrate
 from tactflow.vision.depth.slopes import BAND_ROWS, MAX_HORIZONTAL_PART, SlopeModel, coordinates, place_terms
-from tactflow.vision.depth.surface import Rest, Surface, SurfaceErrors, colour_change
+from tactflow.vision.depth.surface import Rest, Surface, SurfaceErrors, colour_change, half_resolution
 from tactflow.vision.depth.surroundings import resting, surroundings
 from tactflow.vision.types import Scale
 
@@ -174,7 +174,7 @@ def test_a_grainy_gel_that_is_not_touched_has_no_change_of_colour_however_its_me
 ) -> None:
     gel = np.random.default_rng(3).integers(80, 140, GEL.shape).astype(dtype)
     rest = Rest(gel)
-    assert np.abs(colour_change(gel, rest, rest.window, np.ones(3, np.float32))).max() == 0
+    assert np.abs(colour_change(half_resolution(gel), rest, rest.window, np.ones(3, np.float32))).max() == 0
 
 
 def test_slopes_are_those_of_normals_that_are_a_polynomial_of_colour_and_place_and_never_too_steep() -> None:

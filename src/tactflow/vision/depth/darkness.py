@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactflow.vision.arrays import Bytes, Floats, Floats32
-from tactflow.vision.depth.surface import Rest, colour_change, measured
+from tactflow.vision.depth.surface import Rest, colour_change, half_resolution, measured
 from tactflow.vision.depth.surroundings import surroundings
 from tactflow.vision.types import Depth, Scale
 
@@ -91,9 +91,10 @@ class DarkSurface:
 
     def depth(self, image: Bytes, rest: Rest, mask: Bytes) -> Depth:
         """The height map of a frame, of the contact and its surroundings, see `Surface.depth`."""
-        at_rest = rest.around(image, mask)
+        half = half_resolution(image)
+        at_rest = rest.around(half, mask)
         window = surroundings(mask, rest.window, at_rest.margin).window
-        low = self._model(-colour_change(image, rest, window, at_rest.gain).mean(axis=2))
+        low = self._model(-colour_change(half, rest, window, at_rest.gain).mean(axis=2))
         greatest, relative_error = float(low.max()), None
         # Errors of the curve are common to all pixels.
         if self._stderr is not None and 0 < greatest < self._model.deepest:

@@ -69,32 +69,37 @@ class Rest:
 
     def __init__(self, untouched: Bytes | Floats32) -> None:
         self.window = Window(0, untouched.shape[0] // 4 * 2, 0, untouched.shape[1] // 4 * 2)
-        self.light = _halved(untouched, self.window)
+        self.light = half_resolution(untouched)
         self.x, self.y = coordinates((self.window.right, self.window.bottom))
-        self._cells = cell_means(untouched, CELL_PX)
+        self._cells = cell_means(self.light, CELL_PX // 2)
         self._cell_weight = np.reciprocal(self._cells + np.float32(LIGHT_OFFSET_GREY), dtype=np.float32)
         self._cell_level: Floats32 = self._cells * self._cell_weight
 
-    def around(self, image: Bytes | Floats32, mask: Bytes) -> Resting:
-        """Where the gel around a contact is at rest. image, mask : as `Surface.depth` takes them."""
+    def around(self, half: Bytes | Floats32, mask: Bytes) -> Resting:
+        """Where the gel around a contact is at rest. half : `half_resolution` of a picture. mask : as
+        `Surface.depth` takes it."""
         change = np.asarray(
-            cv2.subtract(cell_means(image, CELL_PX), self._cells, dtype=cv2.CV_32F), np.float32
+            cv2.subtract(cell_means(half, CELL_PX // 2), self._cells, dtype=cv2.CV_32F), np.float32
         )
         return resting(change * self._cell_weight, self._cell_level, mask)
 
 
-def colour_change(image: Bytes | Floats32, rest: Rest, window: Window, gain: Floats32) -> Floats32:
-    """(h, w, 3) float32: change of the light at half resolution, relative to the light at rest.
+def half_resolution(image: Bytes | Floats32) -> Bytes | Floats32:
+    """(H // 2, W // 2, 3) of the picture's dtype: means of 2 x 2 pixels of (H, W, 3), of uint8 rounded."""
+    return halved(np.asarray(image, np.uint8)) if image.dtype == np.uint8 else cell_means(image, 2)
 
-    image : (H, W, 3) uint8 or float32, grey levels, BGR, without markers; means of 2 x 2 pixels of uint8 are
-    rounded. gain : (3,), `Resting.gain`: the picture is divided by it, so that a change of exposure or white
-    balance is not a change of colour, and does not make slopes steeper or flatter.
+
+def colour_change(half: Bytes | Floats32, rest: Rest, window: Window, gain: Floats32) -> Floats32:
+    """(h, w, 3) float32: change of the light in a window, relative to the light at rest.
+
+    half : `half_resolution` of a picture without markers, grey levels, BGR. gain : (3,), `Resting.gain`: the
+    picture is divided by it, so that a change of exposure or white balance is not a change of colour, and
+    does not make slopes steeper or flatter.
     """
-    half, light = _rows(_halved(image, window)), _rows(rest.light)
-    change: Floats32 = np.empty(half.shape, np.float32)
-    loop = relative_change if half.dtype == light.dtype == np.uint8 else relative_change.plain
+    change: Floats32 = np.empty((window.height, 3 * window.width), np.float32)
+    loop = relative_change if half.dtype == rest.light.dtype == np.uint8 else relative_change.plain
     gain = np.maximum(gain, np.float32(MIN_GAIN))
-    loop(half, light, window.top, 3 * window.left, gain, LIGHT_OFFSET_GREY, change)  # type: ignore[arg-type]
+    loop(_rows(half), _rows(rest.light), window.top, 3 * window.left, gain, LIGHT_OFFSET_GREY, change)  # type: ignore[arg-type]
     return change.reshape(window.height, window.width, 3)
 
 
@@ -104,11 +109,12 @@ def relative_change(
 ) -> None:
     """Fill `change`, (h, 3 w), of `colour_change`; exactly 0 where the gel has not changed.
 
-    half : (h, 3 w), of the picture. light : (H, 3 W), of the untouched gel, used from row `top` and element
-    `left` on. gain : (3,). offset : grey levels, `LIGHT_OFFSET_GREY`.
+    half, light : (H, 3 W), of the picture and of the untouched gel, used from row `top` and element `left`
+    on. gain : (3,). offset : grey levels, `LIGHT_OFFSET_GREY`.
     """
-    resting = light[top : top + len(half), left : left + half.shape[1]].astype(np.float32)
-    change[:] = (half / np.tile(gain, half.shape[1] // 3) - resting) / (resting + np.float32(offset))
+    part = np.s_[top : top + len(change), left : left + change.shape[1]]
+    resting = light[part].astype(np.float32)
+    change[:] = (half[part] / np.tile(gain, change.shape[1] // 3) - resting) / (resting + np.float32(offset))
 
 
 class Slopes(NamedTuple):
@@ -207,15 +213,16 @@ class Surface:
 
     def slopes(self, image: Bytes, rest: Rest, mask: Bytes, gradients: Floats32 | None = None) -> Slopes:
         """The slopes of a frame; parameters as in `depth`."""
-        at_rest = rest.around(image, mask)
+        half = half_resolution(image)
+        at_rest = rest.around(half, mask)
         around = surroundings(mask, rest.window, at_rest.margin)
         window = around.window
         open_sides = window.open_sides(rest.window)
         if gradients is not None:
             # The model's slopes fall where the gel is pushed in.
-            slope = -np.moveaxis(_halved(gradients, window), -1, 0).astype(np.float32)
+            slope = -np.moveaxis(cell_means(gradients[window.whole], 2), -1, 0).astype(np.float32)
             return Slopes(slope, window, open_sides, None)
-        change = colour_change(image, rest, window, at_rest.gain)
+        change = colour_change(half, rest, window, at_rest.gain)
         assert self._model is not None, "without a model, gradients are given"
         rows, columns = window.part
         steepest = None if self._errors is None else self._errors.steepest
@@ -320,10 +327,3 @@ def _steep_part(slope: Floats32, steepest: float | None) -> float:
 def _rows(planes: Bytes | Floats32) -> Bytes | Floats32:
     """(h, 3 w), from (h, w, 3)."""
     return planes.reshape(len(planes), -1)
-
-
-def _halved(image: Bytes | Floats32, window: Window) -> Bytes | Floats32:
-    """(h, w, 3) of the picture's dtype: a window of it at half resolution."""
-    if image.dtype == np.uint8:
-        return halved(np.asarray(image, np.uint8), window.whole)
-    return cv2.resize(image[window.whole], (window.width, window.height), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
