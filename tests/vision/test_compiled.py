@@ -16,6 +16,7 @@ import tactflow
 from tactflow.tools.stress.compare import difference, numbers
 from tactflow.vision import compiled
 from tactflow.vision.contact.background_kernels import smooth_cells
+from tactflow.vision.contact.certainty import largest_deviations
 from tactflow.vision.contact.components import contact_cells
 from tactflow.vision.contact.contact_outline import draw_level, largest_nearby, outline_level
 from tactflow.vision.contact.heights import smooth_range
@@ -204,6 +205,10 @@ def test_the_shape_of_a_mask_is_the_same_in_c_and_in_numpy(seed: int) -> None:
     hulls = [part[: int(found[0][0])].tolist() for part in corners]
     start = hulls[1].index(hulls[0][0])
     assert hulls[0] == hulls[1][start:] + hulls[1][:start]
+    cells = draw.random((2, -(-size[0] // 4), -(-size[1] // 4)), np.float32)
+    hull = corners[0][: int(found[0][0])].astype(float)
+    largest = [getattr(largest_deviations, kind)(cells, mask, hull, 4) for kind in ("compiled", "plain")]
+    assert largest[0] == largest[1]
     harmonics = np.ones((2, 7, 2))
     to_circle = np.array([*points.mean(axis=0), 3.0, 0.4, 2.5])
     sum_harmonics.compiled(points, to_circle, 1e-9, 3, harmonics[0])

@@ -700,6 +700,41 @@ LOOP draw_level(const Arg *a, double *out)
     return 0;
 }
 
+/* ---- contact/certainty.py ---------------------------------------------------------------------------------- */
+
+LOOP largest_deviations(const Arg *a, double *out)
+{
+    const float *light = a[0].data, *colour = light + a[0].shape[1] * a[0].shape[2];
+    const u8 *mask = a[1].data;
+    const double *hull = a[2].data;
+    const i64 wide = a[0].shape[2], stride = a[1].shape[1], count = a[2].shape[0], side = a[3].whole;
+    double left = INFINITY, top = INFINITY, right = 0, bottom = 0;
+    for (i64 i = 0; i < count; i++) {
+        left = MIN(left, hull[2 * i]);
+        right = MAX(right, hull[2 * i]);
+        top = MIN(top, hull[2 * i + 1]);
+        bottom = MAX(bottom, hull[2 * i + 1]);
+    }
+    for (i64 y = side * (i64)ceil(top / (double)side); count && y <= (i64)bottom; y += side)
+        for (i64 x = side * (i64)ceil(left / (double)side); x <= (i64)right; x += side) {
+            const i64 cell = y / side * wide + x / side;
+            if (!mask[y * stride + x] || (light[cell] <= out[0] && colour[cell] <= out[1]))
+                continue;
+            i64 at = 0;
+            for (; at < count; at++) {
+                /* No pixel is to the left of a side of the hull. */
+                const double *one = hull + 2 * at, *next = hull + 2 * ((at + 1) % count);
+                if ((next[0] - one[0]) * ((double)y - one[1]) < (next[1] - one[1]) * ((double)x - one[0]))
+                    break;
+            }
+            if (at < count) /* outside */
+                continue;
+            out[0] = MAX(out[0], light[cell]);
+            out[1] = MAX(out[1], colour[cell]);
+        }
+    return 0;
+}
+
 /* ---- contact/illumination.py ------------------------------------------------------------------------------- */
 
 /* The value that is larger than half of them. */
@@ -2267,6 +2302,7 @@ static const Loop LOOPS[] = {
     {"largest_nearby", "f2 x f2!", '-', largest_nearby},
     {"outline_level", "f2 x B2 f2!", '-', outline_level},
     {"draw_level", "f2 n n B2!", '-', draw_level},
+    {"largest_deviations", "f3 B2 d2 n", '2', largest_deviations},
     {"fit_light", "f3 f2 f2 f3 f3 f3 f3 f1 f2! x n x x", '-', fit_light},
     {"grow_level_lines", "f2 B2 f1 n i2! f1! i2!", 'n', grow_level_lines},
     {"select_contacts", "i2 f1 i2 i2! i2! x x x x", '2', select_contacts},

@@ -14,7 +14,8 @@ from typing import Final
 import cv2
 import numpy as np
 
-from tactflow.vision.arrays import Floats, Floats32, Mask
+from tactflow.vision.arrays import Floats, Floats32, Mask, Points
+from tactflow.vision.compiled import kernel
 from tactflow.vision.contact.background import CELL_PX
 from tactflow.vision.types import Contact
 
@@ -39,18 +40,28 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
     (n, 2) : logarithm of the share of colour in the region's largest change; 1 if markers moved as well, else
         0.
     """
-    inside = mask[::CELL_PX, ::CELL_PX]
+    whole = np.ascontiguousarray(mask)
     evidence = np.empty((len(parts), 2))
     for row, part in zip(evidence, parts, strict=True):
-        corners = (part.hull / CELL_PX).astype(np.int32)
-        left, top, wide, high = cv2.boundingRect(corners)
-        window = slice(top, top + high), slice(left, left + wide)
-        cells = np.zeros((high, wide), np.uint8)
-        cv2.fillConvexPoly(cells, corners - np.array([left, top], np.int32), (1.0,))
-        cells &= inside[window]
-        light, colour = (cv2.minMaxLoc(values[window], cells)[1] for values in deviations)
+        light, colour = largest_deviations(deviations, whole, part.hull, CELL_PX)
         row[:] = math.log(max(colour / max(light, 1e-9), MIN_COLOUR_SHARE)), part.evidence == "both"
     return evidence
+
+
+@kernel
+def largest_deviations(deviations: Floats32, mask: Mask, hull: Points, side: int) -> tuple[float, float]:
+    """Largest deviations among the cells of a region; 0 if it has none.
+
+    deviations : (2, h, w), >= 0. mask : (H, W), not 0 inside of regions. hull : (n, 2), the region's corners,
+    clockwise on the screen. side : of cells, px; a cell belongs to the region if its first pixel does.
+    """
+    y, x = side * np.array(mask[::side, ::side].nonzero())
+    # No pixel is to the left of a side of the hull.
+    (corner_x, corner_y), (right, down) = hull.T[:, :, None], (np.roll(hull, -1, axis=0) - hull).T[:, :, None]
+    inside = (right * (y - corner_y) >= down * (x - corner_x)).all(axis=0)
+    inside &= (x >= corner_x.min()) & (x <= corner_x.max()) & (y >= corner_y.min()) & (y <= corner_y.max())
+    light, colour = deviations[:, y[inside] // side, x[inside] // side].max(axis=1, initial=0)
+    return float(light), float(colour)
 
 
 def with_probability(parts: Sequence[Contact], mask: Mask, deviations: Floats32) -> list[Contact]:
