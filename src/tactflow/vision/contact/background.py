@@ -11,9 +11,8 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED_GREY, Flags, Floats32
+from tactflow.vision.arrays import MAD_TO_SIGMA, SATURATED_GREY, Bytes, Flags, Floats32, Mask
 from tactflow.vision.contact.background_kernels import (
     NEIGHBOUR_WEIGHT,
     smooth_cells,
@@ -63,7 +62,7 @@ class Change(NamedTuple):
     dirt : (h, w) bool, cells that have been left out, or None.
     """
 
-    half: NDArray[np.uint8]
+    half: Bytes
     illumination: Floats32
     cells: Floats32
     deviations: Floats32
@@ -98,12 +97,7 @@ class Derived(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        mean: NDArray[np.floating],
-        steady: NDArray[np.floating],
-        repeatability: float,
-        tint: float,
-        gel: NDArray[np.bool_] | None = None,
+        cls, mean: Floats32, steady: Floats32, repeatability: float, tint: float, gel: Flags | None = None
     ) -> Derived:
         """mean : grey levels. steady : variance that does not grow with the light, of the same shape.
         repeatability, tint : see `ContactDetector`. gel : (h, w) bool, cells that show it; None: all do.
@@ -168,12 +162,7 @@ class BackgroundModel:
     """
 
     def __init__(
-        self,
-        image: NDArray[np.uint8],
-        repeatability: float,
-        tint: float,
-        shift: float,
-        valid: NDArray[np.uint8] | None = None,
+        self, image: Bytes, repeatability: float, tint: float, shift: float, valid: Mask | None = None
     ) -> None:
         half = _halved(image)
         self._half = _planes(half)
@@ -195,7 +184,7 @@ class BackgroundModel:
         """Colours of the light of each cell, see `light_directions`."""
         return self._derived.colours
 
-    def add(self, image: NDArray[np.uint8]) -> None:
+    def add(self, image: Bytes) -> None:
         """Learn from one more frame of the same size; more frames estimate the noise better."""
         half = _halved(image)
         smooth = _smoothed(half)
@@ -208,7 +197,7 @@ class BackgroundModel:
         self._frames += 1
         self._derive()
 
-    def compare(self, image: NDArray[np.uint8], before: Floats32 | None) -> Change:
+    def compare(self, image: Bytes, before: Floats32 | None) -> Change:
         """Compare a frame of the same size with the background.
 
         before : (h, w) float32, the previous frame's evidence in cells in contact, 0 elsewhere; None if
@@ -260,12 +249,12 @@ class BackgroundModel:
         return interleaved.reshape(2, mean.shape[1], -1)
 
 
-def _planes(picture: NDArray[np.uint8]) -> Floats32:
+def _planes(picture: Bytes) -> Floats32:
     """(3, h, w) float32 of (h, w, 3)."""
     return np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32)
 
 
-def _smoothed(half: NDArray[np.uint8]) -> Floats32:
+def _smoothed(half: Bytes) -> Floats32:
     """(3, h, w) float32: means over 3 x 3 cells of a picture at half resolution, (2 h, 2 w, 3)."""
     high, wide = half.shape[:2]
     planes = np.empty((3, high // 2, wide // 2), np.float32)
@@ -273,7 +262,7 @@ def _smoothed(half: NDArray[np.uint8]) -> Floats32:
     return planes
 
 
-def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _halved(image: Bytes) -> Bytes:
     """Means over 2 x 2 px; the border is replicated to make whole cells."""
     bottom, right = -image.shape[0] % CELL_PX, -image.shape[1] % CELL_PX
     whole = np.ascontiguousarray(image)
@@ -282,7 +271,7 @@ def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return halved(whole)
 
 
-def _gel_cells(half: NDArray[np.uint8], valid: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
+def _gel_cells(half: Bytes, valid: Mask | None) -> Flags | None:
     """Cells (h, w) that show lit gel; None if all do. half : the gel at half resolution."""
     if valid is None:
         return None
@@ -303,7 +292,7 @@ def _steepness(planes: Floats32) -> Floats32:
     return steepness
 
 
-def _spatial_noise(picture: NDArray[np.uint8]) -> Floats32:
+def _spatial_noise(picture: Bytes) -> Floats32:
     """Standard deviation of smoothed cells, estimated from one frame as a function of brightness: (3, h, w).
 
     Second differences of neighbouring cells respond to noise and hardly to shading; their median is robust

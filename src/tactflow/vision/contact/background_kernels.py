@@ -17,8 +17,7 @@ from tactflow.vision.contact.illumination import under_illumination
 
 BLUR_SIGMA_PX: Final = 0.8
 """Standard deviation of the smoothing of changes, pixels of the window. Chosen by hand."""
-_AT_ONE: Final = math.exp(-1 / (2 * BLUR_SIGMA_PX**2))
-NEIGHBOUR_WEIGHT: Final = _AT_ONE / (1 + 2 * _AT_ONE)
+NEIGHBOUR_WEIGHT: Final = 1 / (2 + math.exp(1 / (2 * BLUR_SIGMA_PX**2)))
 """Weight of each of the two neighbours of a pixel: a Gaussian with that standard deviation."""
 
 

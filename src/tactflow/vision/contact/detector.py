@@ -166,11 +166,8 @@ class ContactDetector:
         if not 0 <= relaxation < 1:
             raise ValueError(f"relaxation: required in [0, 1), got {relaxation}")
         self._false_alarms = false_alarms
-        self._repeatability = repeatability
-        self._tint = min(tint, repeatability)
-        self._shift = shift
-        self._relaxation = relaxation
-        self._creep = creep
+        self._steadiness = repeatability, min(tint, repeatability), shift
+        self._relaxation, self._creep = relaxation, creep
         self._borders = border, max(border, core)
         self.reset()
 
@@ -205,7 +202,7 @@ class ContactDetector:
             self._background.add(image)
             return
         self._shape = image.shape
-        self._background = BackgroundModel(image, self._repeatability, self._tint, self._shift, valid)
+        self._background = BackgroundModel(image, *self._steadiness, valid)
         if valid is not None and not valid.all():
             self._gel = np.asarray((valid > 0) * np.uint8(255))
 

@@ -42,8 +42,6 @@ wrong one is flatter by at least a tenth in all outlined frames, by three quarte
 MIN_SALIENCE_RATIO: Final = 0.5
 """Minimum salience of further contacts, relative to the first: less is gel that wrinkles, or light that has
 changed elsewhere. Chosen on outlines of fifteen labs (0.2 and 0.35 overlap equally well within 0.01)."""
-LEVELS: Final = np.arange(1, LEVEL_COUNT + 1, dtype=np.float32)
-"""The levels, in units of their distance."""
 
 
 class ContactRegion(NamedTuple):
@@ -93,7 +91,7 @@ class ContactFinder:
 def _contacts(heights: Floats32, changed: Flags) -> tuple[list[ContactRegion], float]:
     """The contacts at evenly spaced levels, the most salient first, and the slope of the first one's line, 0
     without any; heights : (h, w) float32. changed : (h, w) bool."""
-    levels = LEVELS * (heights.max() / np.float32(LEVEL_COUNT + 1))
+    levels = np.arange(1, LEVEL_COUNT + 1, dtype=np.float32) * (heights.max() / np.float32(LEVEL_COUNT + 1))
     within, contacts = np.empty((2, *heights.shape), np.int32)
     lines = np.empty((LEVEL_COUNT * heights.size // MIN_LINE_CELLS, 7), np.int32)
     drops = np.empty(len(lines), np.float32)
