@@ -13,7 +13,7 @@ import numpy as np
 
 from tactflow.vision.arrays import Bytes, Flags, Floats32
 from tactflow.vision.compiled import kernel
-from tactflow.vision.contact.illumination import under_illumination
+from tactflow.vision.contact.illumination import SATURATION_GREY, positions, under_illumination
 
 BLUR_SIGMA_PX: Final = 0.8
 """Standard deviation of the smoothing of changes, pixels of the window. Chosen by hand."""
@@ -55,7 +55,10 @@ def weigh_change(
     change, deviations : (3, h, w), filled as in `background.Change`.
     """
     mean, weight, (brightness, colour_factor, scale) = untouched[:3], untouched[3:6], untouched[6:]
-    shift = cells - under_illumination(mean, coefficients)
+    gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
+    down, across = (positions(count) for count in cells.shape[1:])
+    light = mean * (gain + slope_y * down[:, None] + slope_x * across) + offset
+    shift = np.maximum(cells - mean - light, cells - SATURATION_GREY)
     change[:] = shift * scale
     deviation = shift * weight
     squared, colour, evidence = deviations
