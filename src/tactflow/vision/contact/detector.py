@@ -260,7 +260,11 @@ class ContactDetector:
         for rows, columns, inside, *cores in regions:
             if change.dirt is not None:
                 inside &= ~change.dirt[rows, columns]
-            window = self._background.window_change(change, rows, columns, inside, heights.mixtures)
+            if heights.slopes is None:
+                window = self._background.window_change(change, rows, columns, inside, heights.mixtures)
+            else:
+                slopes = heights.slopes[:, rows, columns] * inside
+                window = np.stack([cv2.resize(plane, None, fx=2, fy=2) for plane in slopes])
             shown = relative_change(window)
             for border, surely, drawn in zip(self._borders, cores, (mask, inner), strict=True):
                 level = contact_level(shown, surely, border)

@@ -8,12 +8,12 @@ to a factor, and that surface is the gel's (R. Frankot, R. Chellappa, "A method 
 shape from shading algorithms", PAMI 10, 1988).
 
 If all channels change alike, as in a gray camera, one slope is seen at most, along the direction in which the
-change is closest to the slope of a surface. Nothing shows across it, so of all surfaces with that slope the
-one with the smallest slopes is taken (ridge regression; A. Hoerl, R. Kennard, Technometrics 12, 1970). There
-is no such direction if lamps stand all around, or if the light responds to depth. Then the change itself
-stands in for the height: if contacts brighten on one flank and darken on the other, by the amplitude of the
-monogenic signal, an envelope of both (M. Felsberg, G. Sommer, "The monogenic signal", IEEE Transactions on
-Signal Processing 49, 2001); if they do either as a whole, by its size.
+change is closest to the slope of a surface. It may be another one for each contact, as lamps stand all around
+many gels. A flank in the shade darkens by more than a lit one brightens, though an object is as steep on both
+sides; a quadratic response makes them equal. Nothing shows across the direction, so of all surfaces with that
+slope the one that is flattest and nearest to rest is taken (ridge regression; A. Hoerl, R. Kennard,
+Technometrics 12, 1970). If contacts brighten or darken as a whole, rather than brighten on one flank and
+darken on the other, the light responds to depth, and the size of the change stands in for the height.
 
 As long as no mixtures of different channels are nearly integrable, the size of the change stands in for the
 height as well.
@@ -39,19 +39,16 @@ MIN_WAVELENGTH_CELLS: Final = 4
 MAX_CURL_SHARE: Final = 0.2
 """Largest fraction of the slopes' power that an integrable pair may lack. A single slope of a round contact,
 as seen in light from one side, lacks 0.25; sensors with lamps on several sides lack 0.00 to 0.15."""
-MAX_CURL_SHARE_GREY: Final = 3 / 8
-"""The same if all channels change alike: one slope of a round contact lacks a quarter, depth a half."""
 UNSEEN_SLOPE_WEIGHT: Final = 0.2
 """Weight of the squared slopes of a surface against the squared errors of the one slope that is seen. With
-0.03 to 0.3, outlines of gray pictures overlap equally well with real ones within 0.02."""
+0.05 to 0.5, outlines of gray pictures overlap equally well with real ones within 0.02."""
+HEIGHT_WEIGHT: Final = 0.002
+"""Weight of the squared heights, per cell^2, against the same errors: along what is not seen, the surface
+returns to rest within 1 / sqrt(0.002) = 22 cells. With 0.001 to 0.03, outlines of gray pictures overlap
+equally well with real ones within 0.03."""
 MIN_MIXTURE_POWER: Final = 0.01
 """Minimum power of a mixture of channels, relative to the strongest one, to count as a slope: a tenth in
 amplitude. Weaker ones are noise, in a faint contact that brightens as a whole."""
-MIN_CHANGE_STDDEVS: Final = 2.0
-"""Minimum size of a change that is more than noise, standard deviations."""
-MIN_DARKNESS_COHERENCE: Final = 1 / 3
-"""Length of the sum of clear changes over the sum of their lengths from which they are depth: slopes go up
-as well as down. In gray pictures of fifteen labs it is 0.0 to 0.3, or 0.4 to 0.9."""
 MIN_FLANK_RATIO: Final = 0.45
 """Minimum ratio of the largest brightening and darkening, the smaller one to the other, if both are flanks of
 contacts: the halo of a contact that darkens as a whole has up to 0.4 of it. With 0.39 to 0.5, outlines of
@@ -70,15 +67,17 @@ class Heights(NamedTuple):
         its change.
     mixtures : (k, 3) float32, weights of the channels: two are the slopes along x and y; one is the only
         change there is; three, the identity, if neither is known yet.
+    slopes : (2, h, w) float32, along x and y, if they follow from the only change there is; or None.
     """
 
     values: Floats32
     mixtures: Floats32
+    slopes: Floats32 | None = None
 
     @property
     def sloping(self) -> bool:
         """Whether slopes are known, so that the values are heights."""
-        return len(self.mixtures) == 2
+        return len(self.mixtures) == 2 or self.slopes is not None
 
 
 class HeightModel:
@@ -102,7 +101,6 @@ class HeightModel:
 
     def __init__(self) -> None:
         self._missing, self._power = np.zeros((6, 6)), np.zeros((3, 3))
-        self._one_way = self._size = 0.0
         self.alike = False
         self._mixtures = np.eye(3, dtype=np.float32)
         self._before = np.zeros((2, 3), np.float32)
@@ -116,10 +114,13 @@ class HeightModel:
         high, wide = change.shape[1:]
         shown = (self._mixtures @ change.reshape(3, -1)).reshape(-1, high, wide)
         if len(shown) == 1:
-            return Heights(_amplitude(shown[0]), self._mixtures)
+            if not has_two_flanks(shown[0]):
+                return Heights(np.abs(shown[0]), self._mixtures)
+            surface, *slopes = _surface_of_one_slope(shown[0])
+            return Heights(surface, self._mixtures, np.stack(slopes))
         down, across = _waves(high), _waves(wide)
         climbs = down.values @ shown[0] @ across.slopes.T + down.slopes @ shown[1] @ across.values.T
-        climbs = _ridge(climbs, self._mixtures, high, wide) if self.alike else climbs / _squares(high, wide)
+        climbs /= _squares(high, wide)
         return Heights(np.asarray(down.values.T @ climbs @ across.values, np.float32), self._mixtures)
 
     def _learn(self, change: Floats32) -> None:
@@ -136,10 +137,6 @@ class HeightModel:
         power = np.asarray(flat @ flat.T, np.float64)
         self._power += power
         self._missing += _twice(power) - both @ both.T
-        sizes = np.linalg.norm(flat, axis=0)
-        clear = sizes > MIN_CHANGE_STDDEVS
-        self._one_way += float(np.linalg.norm(flat[:, clear].sum(axis=1)))
-        self._size += float(sizes[clear].sum())
         self._mixtures = self._showing()
         if len(self._mixtures) == 2:
             # The sign is arbitrary, so keep it.
@@ -151,13 +148,14 @@ class HeightModel:
         powers, directions = np.linalg.eigh(self._power)
         basis = _twice(directions[:, powers >= MIN_MIXTURE_POWER * powers[-1]])
         self.alike = basis.shape[1] == 2
+        if self.alike:
+            return np.asarray(directions[:, -1:].T, np.float32)
         power = basis.T @ _twice(self._power) @ basis
         missing, found = linalg.eigh(basis.T @ self._missing @ basis, power)
-        one_way = self.alike and self._one_way >= MIN_DARKNESS_COHERENCE * self._size
-        if missing[0] <= (MAX_CURL_SHARE_GREY if self.alike else MAX_CURL_SHARE) and not one_way:
-            slopes = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
-            return slopes / np.linalg.norm(slopes)
-        return np.asarray(directions[:, -1:].T if self.alike else np.eye(3), np.float32)
+        if missing[0] > MAX_CURL_SHARE:
+            return np.eye(3, dtype=np.float32)
+        slopes = np.asarray((basis @ found[:, 0]).reshape(2, 3), np.float32)
+        return slopes / np.linalg.norm(slopes)
 
 
 def _twice(block: Floats) -> Floats:
@@ -217,25 +215,40 @@ def _squares(high: int, wide: int) -> Floats32:
     return squares
 
 
-def _ridge(climbs: Floats32, mixtures: Floats32, high: int, wide: int) -> Floats32:
-    """Waves (k, l) of the surface with the smallest slopes among those with the only slope that is seen.
+def _surface_of_one_slope(change: Floats32) -> Floats32:
+    """The surface of which a change (h, w) is the slope along one direction: (3, h, w), the surface and its
+    slopes along x and y.
 
-    climbs : (k, l) float32, along the slopes of each wave, summed over the picture.
-    mixtures : (2, 3) float32, the direction of that slope times the weights of the channels.
+    The direction is the one in which most of the change is a slope. The highest place of the surface is
+    farther from rest than the lowest.
     """
+    darkest, brightest = smooth_range(change)
+    # It stays monotonic, as the smaller one has more than sqrt(2) - 1 of the other.
+    curvature = -(brightest + darkest) / (brightest**2 + darkest**2)
+    change = change * (1 + np.float32(curvature) * change)
+    high, wide = change.shape
     down, across = _waves(high), _waves(wide)
-    shares = mixtures @ mixtures.T
-    seen = np.add.outer(shares[1, 1] * down.frequencies**2, shares[0, 0] * across.frequencies**2)
-    power = seen + np.float32(UNSEEN_SLOPE_WEIGHT) * _squares(high, wide)
+    climbs = np.stack([down.values @ change @ across.slopes.T, down.slopes @ change @ across.values.T])
+    squares = _squares(high, wide)
+    along = (climbs / np.sqrt(squares)).reshape(2, -1)
+    toward = np.asarray(np.linalg.eigh(along @ along.T)[1][:, -1], np.float32)
+    seen = np.add.outer(toward[1] ** 2 * down.frequencies**2, toward[0] ** 2 * across.frequencies**2)
+    power = seen + np.float32(UNSEEN_SLOPE_WEIGHT) * squares + np.float32(HEIGHT_WEIGHT)
     power[0, 0] = 1
     # Along an oblique direction, cosines along both sides also show as sines along both.
-    mixed = (
-        2
-        * shares[0, 1]
-        * np.multiply.outer(down.parity * down.frequencies, across.parity * across.frequencies)
+    mixed = np.multiply.outer(down.parity * down.frequencies, across.parity * across.frequencies)
+    mixed *= 2 * toward[0] * toward[1]
+    shown = np.tensordot(toward, climbs, 1)
+    partners = shown[down.partners[:, None], across.partners]
+    waves = (power * shown + mixed * partners) / (power**2 - mixed**2)
+    surface = np.stack(
+        [
+            down.values.T @ waves @ across.values,
+            down.values.T @ waves @ across.slopes,
+            down.slopes.T @ waves @ across.values,
+        ]
     )
-    partners = climbs[down.partners[:, None], across.partners]
-    return np.asarray((power * climbs + mixed * partners) / (power**2 - mixed**2), np.float32)
+    return np.asarray(surface if surface[0].max() >= -surface[0].min() else -surface, np.float32)
 
 
 def has_two_flanks(change: Floats32) -> bool:
@@ -249,17 +262,3 @@ def smooth_range(change: Floats32) -> tuple[float, float]:
     """The smallest and the largest mean over 3 x 3 values of a plane."""
     smooth = cv2.blur(change, (3, 3))
     return float(smooth.min()), float(smooth.max())
-
-
-def _amplitude(change: Floats32) -> Floats32:
-    """Size (h, w) of a change (h, w); the amplitude of its monogenic signal if it has two flanks.
-
-    That is the length of the change and its two Riesz transforms.
-    """
-    if not has_two_flanks(change):
-        return np.asarray(np.abs(change), np.float32)
-    high, wide = change.shape
-    down, across, lengths = _waves(high), _waves(wide), np.sqrt(_squares(high, wide))
-    along_x = down.values.T @ (down.values @ change @ across.slopes.T / lengths) @ across.values
-    along_y = down.values.T @ (down.slopes @ change @ across.values.T / lengths) @ across.values
-    return np.asarray(cv2.magnitude(change, cv2.magnitude(along_x, along_y)), np.float32)

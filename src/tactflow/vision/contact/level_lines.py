@@ -77,9 +77,10 @@ class ContactFinder:
 
         heights : of the gel's cells. changed : (h, w) bool; each contact encloses some of these cells.
         """
-        values = heights.values if self._bumps >= 0 or not heights.sloping else -heights.values
+        unsigned = heights.sloping and heights.slopes is None
+        values = -heights.values if unsigned and self._bumps < 0 else heights.values
         regions, slope = _contacts(values, changed)
-        if heights.sloping and abs(self._bumps) <= SIGN_EVIDENCE_SLOPES * slope:
+        if unsigned and abs(self._bumps) <= SIGN_EVIDENCE_SLOPES * slope:
             others, other_slope = _contacts(-values, changed)
             more = slope - other_slope
             if abs(self._bumps) + more < 0:
