@@ -1,7 +1,7 @@
 """What each compiled loop gains a frame: `python -m lab.kernels [--scene press] [--frames 90]`.
 
 Every call of a loop is timed; every `PLAIN_CALL_STEP`-th one is repeated in NumPy on copies of its
-arguments. A loop earns its place with 0.1 ms a frame (`tactflow.vision.compiled`); one that NumPy is this
+arguments. A loop earns its place with 0.03 ms a frame (`tactflow.vision.compiled`); one that NumPy is this
 near to should be NumPy alone. Loops that the pipeline does not call are listed with no time."""
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ IEEE Transactions on Image Processing 15, 2006).
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes, label
+from scipy.ndimage import label
 
 from tactflow.vision.arrays import Floats32, Mask, Numbers
 from tactflow.vision.compiled import kernel
@@ -39,8 +39,16 @@ def grow_level_lines(
     """
     count, inner = 0, 0
     within[:] = -1
+    high = np.argwhere(heights > levels[0]) if len(levels) else np.empty((0, 2), np.int64)
+    if not len(high):
+        return 0
+    # All lines lie in a window, and touch its border only where it is the picture's.
+    window = tuple(map(slice, np.maximum(high.min(axis=0) - 1, 0), high.max(axis=0) + 2))
+    cell_of = np.arange(heights.size).reshape(heights.shape)[window].ravel()
+    heights, marked, within = heights[window], marked[window], within[window]
     for level in range(len(levels) - 1, -1, -1):
-        inside = binary_fill_holes(heights > levels[level], np.ones((3, 3), np.bool_))
+        outside, _ = label(np.pad(heights <= levels[level], 1, constant_values=True), np.ones((3, 3)))
+        inside = outside[1:-1, 1:-1] != outside[0, 0]
         found, number = label(inside)
         parts = np.asarray(found, np.int32)
         sizes = np.bincount(parts.ravel(), minlength=number + 1)
@@ -58,6 +66,7 @@ def grow_level_lines(
         lines[inner:outer, 6] = line_of[parts.ravel()[lines[inner:outer, 1]]]
         within[:] = np.where(within < 0, line_of[parts], within)
         inner = outer
+    lines[:count, 1] = cell_of[lines[:count, 1]]
     return count
 
 
