@@ -56,6 +56,27 @@ def test_the_black_between_bright_pins_is_gel_and_has_no_light() -> None:
     assert not lit_area(picture)[50:198, 50:198].any()
 
 
+def test_folds_beside_the_gel_are_no_gel() -> None:
+    picture = GEL.copy()
+    picture[:, :110] += np.uint8(60 + 60 * np.sin(np.arange(110) * 2 * np.pi / 18))[None, :, None]
+    lit = lit_area(picture)
+    assert not lit[:, :85].any()
+    assert lit[:, 135:].all()
+
+
+@pytest.mark.parametrize("step", [40, 130])
+def test_gel_reaches_up_to_an_edge(step: int) -> None:
+    picture = GEL.copy()
+    picture[:, :160] += np.uint8(step)
+    assert lit_area(picture)[4:-4].all()
+
+
+@pytest.mark.parametrize("scene", ["press", "dense", "bright_dots"])
+def test_dots_that_were_not_removed_are_no_edges(scene: str) -> None:
+    # Those that the border of the picture cuts are.
+    assert lit_area(open_scene(f"{scene}?frames=2").frame(0)).mean() > 0.99
+
+
 def test_a_lamp_that_saturates_all_channels_is_no_gel() -> None:
     valid = valid_area(with_disc(GEL, (160, 120), 30, 255))
     assert valid[120, 160] == 0

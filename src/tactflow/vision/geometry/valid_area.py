@@ -33,6 +33,13 @@ MIN_RADIUS_SHARE: Final = 0.05
 """Smallest radius of a disc that fits into a place without gel, over the shorter side of the picture. Smaller
 places are marks, or the gaps between bright ones. Chosen by hand: the largest marks of the development
 recordings have 0.04."""
+MAX_EDGE_GREY: Final = 85.0
+"""Largest change of the light along one direction across a place of gel, a square whose side is twice that
+radius, grey levels. The gel under the contacts of 13 labs has at most 78; the folds, lamps and housings
+around two gels in jars have 180 and more (measured)."""
+SURROUND_RADIUS_SIDES: Final = 1.2
+"""Smallest radius of surroundings full of edges, in sides of that square. One edge is felt within 0.5 of it;
+with 0.8, contacts beside the border of a gel are cut off (wedge_grasp)."""
 MIN_LIT_SURROUNDINGS_SHARE: Final = 0.5
 """Smallest share of the surroundings of a place that is not black where the light counts. Derived: marks
 cover less than half."""
@@ -72,10 +79,13 @@ def valid_area(image: NDArray[np.uint8]) -> Mask:
 
 
 def lit_area(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Where a gel without its marks has light that can change: most of the surroundings are not black.
+    """Where a gel without its marks has light that can change: most of the surroundings are not black, and
+    they are not full of edges.
 
     On a black gel with white pins there is none, although a pin that was not removed is bright. Marks cover
-    less than half of a place.
+    less than half of a place. The light on a gel changes smoothly, while housings, lamps and cloth around it
+    have edges, which change with every shake of the camera; a single edge, such as the border of the gel,
+    does not count.
 
     image : (H, W, 3) uint8, grey levels, without markers. Returns (H, W) bool.
 
@@ -85,7 +95,25 @@ def lit_area(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """
     lit = (image.max(axis=2) >= BLACK_GREY).astype(np.float32)
     side = 2 * math.ceil(MIN_RADIUS_SHARE * min(lit.shape)) + 1
-    return np.asarray(cv2.blur(lit, (side, side)) >= MIN_LIT_SURROUNDINGS_SHARE)
+    edges = side * _oriented_slope(image, side) > MAX_EDGE_GREY
+    around = _opened(edges, SURROUND_RADIUS_SIDES * side)
+    return np.asarray((cv2.blur(lit, (side, side)) >= MIN_LIT_SURROUNDINGS_SHARE) & ~around)
+
+
+def _oriented_slope(image: NDArray[np.uint8], side: int) -> NDArray[np.float32]:
+    """(H, W) float32, grey levels per px: how much the RMS slope of the light within a square exceeds that
+    across it, by the structure tensor; the largest of the channels.
+
+    Across an edge or a fold it is steep, along it even; a dot is as steep in all directions.
+
+    References
+    ----------
+    Bigün and Granlund, "Optimal orientation detection of linear symmetry", ICCV (1987).
+    """
+    smooth = cv2.blur(image, (3, 3)).astype(np.float32)
+    right, down = (cv2.Sobel(smooth, -1, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    difference, mixed = (cv2.blur(a, (side, side)) for a in (right**2 - down**2, 2 * right * down))
+    return np.asarray(np.sqrt(np.atleast_3d(np.hypot(difference, mixed)).max(axis=2)), np.float32)
 
 
 def polygon_mask(polygon: Sequence[Sequence[float]], width: int, height: int) -> Mask:
