@@ -54,6 +54,15 @@ def test_a_simulated_contact_says_how_probable_it_is_and_so_does_its_message() -
         ]
 
 
+def test_a_contact_under_white_lamps_is_probable_without_a_change_of_colour() -> None:
+    settings = {"sinks.zmq": None, "sinks.view": None}
+    results = tactflow.stream("default", source="sim:press?light=bright&frames=24", settings=settings)
+    probabilities = [result.contact.probability or 0.0 for result in results if result.contact is not None]
+    # The first touch is too faint to tell that all channels change alike.
+    assert len(probabilities) > 2
+    assert min(probabilities[1:]) > 0.5
+
+
 def test_what_is_improbable_beside_another_does_not_count_and_is_reported() -> None:
     small = MASK.copy()
     small[48:64, 80:96] = 0

@@ -241,6 +241,9 @@ class ContactDetector:
             mask, core = self._masks = self._outlined(change, found, image.shape[:2])
         deviations = change.deviations * found
         self._before = deviations[2]
+        if self._heights.alike and not self._background.gray:
+            # Under white lamps a contact has no colour: what would be its change is that of the light.
+            deviations[1] = deviations[0]
         return ContactResult(mask, True, strength, deviations[:2], core)
 
     def _check(self, image: NDArray[np.uint8]) -> None:
