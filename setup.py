@@ -34,6 +34,7 @@ STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
 kernels = Extension(
     "tactflow.vision._kernels",
     ["src/tactflow/vision/kernels.c"],
+    depends=[str(path) for path in sorted(Path("src/tactflow/vision/loops").glob("*.h"))],
     define_macros=[("Py_LIMITED_API", "0x030B0000")] if STABLE else [],
     extra_compile_args=["/O2", "/fp:fast"] if sys.platform == "win32" else ["-O3", "-g0", *ORDER],
     py_limited_api=STABLE,
@@ -44,6 +45,7 @@ readme = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
 published = {"Source": ADDRESS, "Changes": f"{ADDRESS}/blob/{VERSION}/CHANGELOG.md"}
 setup(
     ext_modules=[kernels],
+    exclude_package_data={"": ["*.c", "*.h"]},
     options={"bdist_wheel": {"py_limited_api": "cp311"}} if STABLE else {},
     packages=[
         *find_packages("src"),
@@ -52,10 +54,7 @@ setup(
         "tactflow.sinks",
         "tactflow.pipelines",
         "tactflow.plugins",
-        *(
-            f"tactflow.plugins.{name}"
-            for name in ("arrays", "lerobot", "onnx", "parquet", "replay_buffer", "rosbags", "shm")
-        ),
+        *(f"tactflow.plugins.{path.parent.name}" for path in sorted(Path("plugins").glob("*/__init__.py"))),
     ],
     long_description=re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", absolute, readme) if REPOSITORY else readme,
     long_description_content_type="text/markdown",

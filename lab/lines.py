@@ -49,7 +49,7 @@ def place(file: Path) -> tuple[str, str]:
 def code_lines(file: Path) -> int:
     """Number of lines with code."""
     text = file.read_text(encoding="utf-8")
-    if file.suffix == ".c":
+    if file.suffix in (".c", ".h"):
         return sum(
             bool(line.strip()) for line in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines()
         )
@@ -74,7 +74,7 @@ def code_lines(file: Path) -> int:
 def count(repository: Path) -> dict[tuple[str, str], Counter[str]]:
     """(house, room) -> numbers of files, lines and lines of code."""
     rooms: dict[tuple[str, str], Counter[str]] = {}
-    for file in sorted([*repository.rglob("*.py"), *repository.rglob("*.c")]):
+    for file in sorted([*repository.rglob("*.py"), *repository.rglob("*.[ch]")]):
         inside = file.relative_to(repository)
         if inside.parts[0].startswith(".") or inside.parts[0] in ("build", "dist"):
             continue

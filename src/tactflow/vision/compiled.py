@@ -1,4 +1,4 @@
-"""Loops over pixels and markers, which are compiled from `kernels.c`.
+"""Loops over pixels and markers, which are compiled from `kernels.c` and the folder `loops`.
 
 A loop is worth compiling where one pass takes the place of several calls of NumPy or OpenCV, and saves a
 frame 0.03 ms or more; everything else is NumPy, OpenCV or SciPy.
@@ -64,7 +64,7 @@ class Kernel(Generic[P, R]):
 
 
 def kernel(function: Callable[P, R]) -> Kernel[P, R]:
-    """Decorator of a function whose namesake in `kernels.c` does the same."""
+    """Decorator of a function whose namesake in C does the same."""
     found = Kernel(function)
     _kernels.append(found)
     return found
