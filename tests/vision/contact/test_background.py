@@ -88,7 +88,8 @@ def test_the_loops_see_the_change_that_the_plain_version_sees(size: tuple[int, i
                 np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=slack)
             assert one.largest == pytest.approx(other.largest, rel=1e-2, abs=1e-2)
             assert one.largest_colour == pytest.approx(other.largest_colour, rel=1e-2, abs=1e-2)
-            assert one.remaining == pytest.approx(other.remaining, rel=1e-2)
+            # A ratio, of which decisions ask whether it is above 0.2 or more: one of 1e-6 may be 2e-6.
+            assert one.remaining == pytest.approx(other.remaining, rel=1e-2, abs=1e-4)
 
 
 @settings(max_examples=60, deadline=None)
