@@ -30,6 +30,7 @@ from tactflow.vision.geometry.direction import sum_harmonics
 from tactflow.vision.geometry.downsample import halve
 from tactflow.vision.geometry.hull import convex_hull, row_ends
 from tactflow.vision.geometry.region import sum_pixels
+from tactflow.vision.markers.detection import move_to_centroids
 
 needs_compiler = pytest.mark.skipif(
     not compiled.are_compiled(), reason="tactflow was installed without a C compiler"
@@ -59,6 +60,21 @@ def test_results_are_the_same_in_c_and_in_numpy(
         monkeypatch.setattr(loop, "compiled", loop.plain)
     for one, other in zip(fast, results(), strict=True):
         assert max(difference(one, other).values()) < 1e-3
+
+
+@needs_compiler
+@pytest.mark.parametrize("seed", range(4))
+def test_centroids_are_the_same_in_c_and_in_numpy(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    gray = random.uniform(0, 255, (30, 41)).astype(np.float32)
+    radii = random.uniform(1.0, 4.0, 25)
+    # Some lie beyond the border.
+    fast = random.uniform(-2, 42, (25, 2))
+    slow = fast.copy()
+    arguments = gray, radii, 1.4 * radii, 1.9 * radii + 1.5, 1.6 * radii + 0.5
+    move_to_centroids.compiled(*arguments, fast)
+    move_to_centroids.plain(*arguments, slow)
+    np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9)
 
 
 @needs_compiler

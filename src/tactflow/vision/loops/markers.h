@@ -1,6 +1,66 @@
 /* Marks: mask, inpainting, templates, which of them move. */
 #include "loop.h"
 
+/* ---- markers/detection.py ---------------------------------------------------------------------------------- */
+
+#define MIN_DARKNESS 1e-3
+
+/* The step from a point to the centroid of what is darker than the plane through the ring around it. */
+INLINE void step_to_centroid(const float *gray, i64 high, i64 wide, i64 reach, double inner, double outer,
+                             double window, const double *center, double *step)
+{
+    const i64 column = MAX(MIN((i64)rint(center[0]), wide - 1), 0), row = MAX(MIN((i64)rint(center[1]), high - 1), 0);
+    double n = 0, sx = 0, sy = 0, xx = 0, xy = 0, yy = 0, g = 0, gx = 0, gy = 0;
+    for (i64 v = row - reach; v <= row + reach; v++) {
+        const float *line = gray + MAX(MIN(v, high - 1), 0) * wide;
+        for (i64 u = column - reach; u <= column + reach; u++) {
+            const double x = u - center[0], y = v - center[1], away = sqrt(x * x + y * y);
+            const double weight = MAX(MIN(away - inner, 1), 0) * MAX(MIN(outer - away, 1), 0);
+            const double light = weight * line[MAX(MIN(u, wide - 1), 0)];
+            n += weight, sx += weight * x, sy += weight * y;
+            xx += weight * x * x, xy += weight * x * y, yy += weight * y * y;
+            g += light, gx += light * x, gy += light * y;
+        }
+    }
+    /* Cramer's rule. */
+    const double a = xx * yy - xy * xy, b = sy * xy - sx * yy, c = sx * xy - sy * xx;
+    const double whole = n * a + sx * b + sy * c;
+    const double level = (g * a + gx * b + gy * c) / whole;
+    const double along_x = (g * b + gx * (n * yy - sy * sy) + gy * (sx * sy - n * xy)) / whole;
+    const double along_y = (g * c + gx * (sx * sy - n * xy) + gy * (n * xx - sx * sx)) / whole;
+    double total = 0, to_x = 0, to_y = 0;
+    for (i64 v = row - reach; v <= row + reach; v++) {
+        const float *line = gray + MAX(MIN(v, high - 1), 0) * wide;
+        for (i64 u = column - reach; u <= column + reach; u++) {
+            const double x = u - center[0], y = v - center[1], away = sqrt(x * x + y * y);
+            const double darker = level + along_x * x + along_y * y - line[MAX(MIN(u, wide - 1), 0)];
+            const double darkness = MAX(darker, 0) * MAX(MIN(window - away, 1), 0);
+            total += darkness, to_x += darkness * x, to_y += darkness * y;
+        }
+    }
+    step[0] = total > MIN_DARKNESS ? to_x / total : 0;
+    step[1] = total > MIN_DARKNESS ? to_y / total : 0;
+}
+
+LOOP move_to_centroids(const Arg *a, double *out)
+{
+    const double *radii = a[1].data, *inner = a[2].data, *outer = a[3].data, *window = a[4].data;
+    double *center = a[5].data, largest = 0;
+    (void)out;
+    for (i64 i = 0; i < a[1].shape[0]; i++)
+        largest = MAX(largest, outer[i]);
+    for (i64 i = 0; i < a[1].shape[0]; i++, center += 2) {
+        for (int turn = 0; turn < 4; turn++) {
+            double step[2];
+            step_to_centroid(a[0].data, a[0].shape[0], a[0].shape[1], (i64)ceil(largest), inner[i], outer[i],
+                             window[i], center, step);
+            for (int axis = 0; axis < 2; axis++)
+                center[axis] += MAX(MIN(step[axis], radii[i]), -radii[i]);
+        }
+    }
+    return 0;
+}
+
 /* ---- markers/mask.py --------------------------------------------------------------------------------------- */
 
 LOOP cover_spots(const Arg *a, double *out)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
-from tactflow.vision.arrays import Floats, check_mask
+from tactflow.vision.arrays import Floats, Floats32, check_mask
+from tactflow.vision.compiled import kernel
 from tactflow.vision.markers.lattice import MAX_LINK_PITCHES, Lattice, nearest, neighbour_graph, pitch_of
 from tactflow.vision.markers.selection import (
     Candidate,
@@ -56,6 +57,9 @@ CENTROID_WINDOW_RADII: Final = 1.6
 BACKGROUND_RING_RADII: Final = (1.4, 1.9)
 """Inner and outer radius of the ring for the background of a mark, in radii of the mark; the outer one is 1.5
 px wider. Chosen by hand."""
+
+MIN_DARKNESS: Final = 1e-3
+"""Grey levels, summed over a window, below which it has no centroid: rounding."""
 
 LONE_PITCH_RADII: Final = 8.0
 """Pitch assumed for a single mark, in radii. Chosen by hand."""
@@ -286,7 +290,7 @@ def _detection(
     return Detection(centers, radius, best.polarity, pitch, edges, sizes, best, rival, evidence(gray, marks))
 
 
-def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Floats:
+def _centroids(gray: Floats32, centers: Floats, radii: Floats) -> Floats:
     """Centroids (N, 2) of dark marks in windows that follow them, px.
 
     The background is a plane fitted to a ring around the mark, so a gradient of the light does not bias them.
@@ -295,36 +299,47 @@ def _centroids(gray: NDArray[np.float32], centers: Floats, radii: Floats) -> Flo
     about a radius; they stay where nothing is darker than the background. radii : (N,) float64, of the marks,
     px.
     """
-    radius = radii[:, None]
-    inner, outer = BACKGROUND_RING_RADII[0] * radius, BACKGROUND_RING_RADII[1] * radius + 1.5
+    result = np.array(centers, np.float64)
+    inner, outer = BACKGROUND_RING_RADII[0] * radii, BACKGROUND_RING_RADII[1] * radii + 1.5
+    move_to_centroids(gray, radii, inner, outer, CENTROID_WINDOW_RADII * radii + 0.5, result)
+    return result
+
+
+@kernel
+def move_to_centroids(
+    gray: Floats32, radii: Floats, inner: Floats, outer: Floats, window: Floats, centers: Floats
+) -> None:
+    """Move points four times to the centroid of what is darker than the background around them.
+
+    gray : (H, W) float32. radii : (N,), px, the largest step along an axis. inner, outer : (N,), px, of the
+    ring of the background. window : (N,), px, radius of what is counted, less than `outer`. centers : (N, 2),
+    px, changed in place.
+    """
     reach = int(np.ceil(outer.max(initial=0)))
     axis = np.arange(-reach, reach + 1)
     grid_x, grid_y = (part.ravel() for part in np.meshgrid(axis, axis))
     padded = cv2.copyMakeBorder(gray, reach, reach, reach, reach, cv2.BORDER_REPLICATE).astype(np.float64)
-    height, width = gray.shape
-    result = np.array(centers, np.float64)
-    limits = np.array([width - 1, height - 1])
+    limits = np.array(gray.shape[::-1]) - 1
     # Each step is a fraction of the one before.
     for _ in range(4):
-        corner = np.clip(np.rint(result).astype(np.int64), 0, limits)
+        corner = np.clip(np.rint(centers).astype(np.int64), 0, limits)
         patches = padded[corner[:, 1:] + grid_y + reach, corner[:, :1] + grid_x + reach]
-        x = grid_x + corner[:, :1] - result[:, :1]
-        y = grid_y + corner[:, 1:] - result[:, 1:]
+        x = grid_x + corner[:, :1] - centers[:, :1]
+        y = grid_y + corner[:, 1:] - centers[:, 1:]
         distance = np.hypot(x, y)
-        ring = np.clip(distance - inner, 0, 1) * np.clip(outer - distance, 0, 1)
+        ring = np.clip(distance - inner[:, None], 0, 1) * np.clip(outer[:, None] - distance, 0, 1)
         basis = np.stack([np.ones_like(x), x, y], axis=1)
         weighted = basis * ring[:, None]
         normal = weighted @ basis.transpose(0, 2, 1)
         plane = np.linalg.solve(normal, weighted @ patches[:, :, None])
         darkness = np.maximum((basis.transpose(0, 2, 1) @ plane)[:, :, 0] - patches, 0)
-        darkness *= np.clip(CENTROID_WINDOW_RADII * radius + 0.5 - distance, 0, 1)
+        darkness *= np.clip(window[:, None] - distance, 0, 1)
         total = darkness.sum(axis=1)
-        good = total > 1e-3
-        move = np.zeros_like(result)
+        good = total > MIN_DARKNESS
+        move = np.zeros_like(centers)
         move[good, 0] = (darkness * x).sum(axis=1)[good] / total[good]
         move[good, 1] = (darkness * y).sum(axis=1)[good] / total[good]
-        result += np.clip(move, -radius, radius)
-    return result
+        centers += np.clip(move, -radii[:, None], radii[:, None])
 
 
 def _same(other: Candidate, centers: Floats, radii: Floats) -> bool:
