@@ -78,3 +78,7 @@ def test_only_a_loss_of_light_in_proportion_is_dirt(change: tuple[int, ...], is_
     found = attenuated_cells(signed, colours, changed)
     assert (found is not None) == is_dirt
     assert found is None or found[changed].all()
+
+
+def test_a_gel_without_light_has_no_colours() -> None:
+    assert light_directions(np.ones((3, 4, 5), np.float32), np.zeros((4, 5), np.bool_)) is None

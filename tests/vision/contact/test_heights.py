@@ -197,6 +197,14 @@ def test_a_shaded_flank_that_shows_more_than_the_lit_one_does_not_pull_the_conta
     assert 0.9 < left / right < 1.1
 
 
+def test_without_any_change_a_gray_camera_shows_a_gel_at_rest() -> None:
+    model = HeightModel()
+    model(20 * seen(bump(40, 30, 10), np.array([(1, 0)] * 3)))
+    heights = model(np.zeros((3, *SHAPE), np.float32))
+    assert not heights.values.any()
+    assert regions(heights) == []
+
+
 @pytest.mark.parametrize("place", [(20, 20), (60, 40), (30, 45)])
 def test_lamps_all_around_a_gray_camera_show_both_flanks_of_one_contact(place: tuple[int, int]) -> None:
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]]

@@ -293,3 +293,10 @@ def test_bad_input_is_refused_with_a_reason(mask: Any, kwargs: dict[str, Any], m
     for describe in (contact_geometry, contact_parts):
         with pytest.raises(ValueError, match=message):
             describe(mask, **kwargs)
+
+
+def test_a_core_is_where_its_mask_is_not_0() -> None:
+    mask, core = blank(), blank()
+    mask[20:40, 20:50] = 1
+    core[25:35, 25:45] = 2
+    assert described(mask, core=core).core_area == 200

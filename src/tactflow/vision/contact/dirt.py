@@ -26,7 +26,8 @@ more for the outlined contacts of fifteen labs, and below 0.01 for most specks d
 
 
 def light_directions(light: Floats32, gel: Flags | None) -> Floats32 | None:
-    """Colour of the light of each cell, (3, h, w) float32 unit vectors; None under lamps of one colour.
+    """Colour of the light of each cell, (3, h, w) float32 unit vectors; None under lamps of one colour, or
+    without any cell of gel.
 
     light : (3, h, w) float32, grey levels of the untouched gel. gel : (h, w) bool, cells that show it; None:
     all do.
@@ -35,6 +36,8 @@ def light_directions(light: Floats32, gel: Flags | None) -> Floats32 | None:
     >>> light_directions(red_to_blue, None) is None, light_directions(np.ones_like(red_to_blue), None) is None
     (False, True)
     """
+    if gel is not None and not gel.any():
+        return None
     colours = light / np.maximum(np.linalg.norm(light, axis=0), np.float32(1e-6))
     mean = (colours if gel is None else colours[:, gel]).reshape(3, -1).mean(axis=1)
     coloured = 1 - float(mean @ mean) >= MIN_COLOUR_SPREAD**2

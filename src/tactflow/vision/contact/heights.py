@@ -252,9 +252,10 @@ def _surface_of_one_slope(change: Floats32) -> Floats32:
 
 
 def has_two_flanks(change: Floats32) -> bool:
-    """Whether a change (h, w) is about as strong in both directions, as slopes are and depth is not."""
+    """Whether a change (h, w) is about as strong in both directions, as slopes are and depth is not; False
+    without any change."""
     least, largest = smooth_range(change)
-    return min(-least, largest) >= MIN_FLANK_RATIO * max(-least, largest)
+    return min(-least, largest) > MIN_FLANK_RATIO * max(-least, largest)
 
 
 @kernel

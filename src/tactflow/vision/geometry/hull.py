@@ -189,7 +189,7 @@ def _describe(
 def _core_area(core: Mask, region: Region) -> float | None:
     """Area of the convex hull of the core inside a region, px^2; None if there is none."""
     window = core[region.top : region.top + region.height, region.left : region.left + region.width]
-    inside = cv2.bitwise_and(window, region.window)
+    inside = cv2.bitwise_and(window, window, mask=region.window)
     ends = np.empty((2 * len(inside), 2), np.int32)
     count = row_ends(np.asarray(inside, np.uint8), ends)
     return convex_hull(ends[:count], np.empty_like(ends))[1] if count else None
