@@ -15,6 +15,7 @@ import pytest
 import tactflow
 from tactflow.tools.stress.compare import difference, numbers
 from tactflow.vision import compiled
+from tactflow.vision.change.rest import find_excess, sum_tiles
 from tactflow.vision.contact.background_kernels import smooth_cells
 from tactflow.vision.contact.certainty import largest_deviations
 from tactflow.vision.contact.components import contact_cells
@@ -26,11 +27,13 @@ from tactflow.vision.depth.poisson import divergence, solve_down
 from tactflow.vision.depth.slopes import BAND_ROWS, coordinates, slopes_of_colour
 from tactflow.vision.depth.surface import relative_change, slope_misfit
 from tactflow.vision.depth.surroundings import light_around
+from tactflow.vision.flow.registration import compare_light
 from tactflow.vision.geometry.direction import sum_harmonics
 from tactflow.vision.geometry.downsample import halve
 from tactflow.vision.geometry.hull import convex_hull, row_ends
 from tactflow.vision.geometry.region import sum_pixels
 from tactflow.vision.markers.detection import move_to_centroids
+from tactflow.vision.pose.align import compare_points
 
 needs_compiler = pytest.mark.skipif(
     not compiled.are_compiled(), reason="tactflow was installed without a C compiler"
@@ -230,6 +233,56 @@ def test_the_shape_of_a_mask_is_the_same_in_c_and_in_numpy(seed: int) -> None:
     sum_harmonics.compiled(points, to_circle, 1e-9, 3, harmonics[0])
     sum_harmonics.plain(points, to_circle, 1e-9, 3, harmonics[1])
     np.testing.assert_allclose(*harmonics, rtol=1e-9, atol=1e-9 * np.abs(harmonics).max())
+
+
+@needs_compiler
+def test_sums_over_tiles_are_the_same_in_c_and_in_numpy() -> None:
+    draw = np.random.default_rng(0)
+    picture = draw.integers(0, 256, (40, 90), np.uint8)
+    used = np.sort(draw.permutation(40)[:15])
+    slopes = draw.integers(-1020, 1021, (2, 15, 24)).astype(np.int16)
+    at_rest = draw.integers(-(10**6), 10**6, (2, 3, 4))
+    factor = draw.random((2, 3, 4), np.float32)
+    found = []
+    for kind in ("compiled", "plain"):
+        light, shift = np.empty((3, 3, 4), np.float32), np.empty((2, 3, 4), np.float32)
+        getattr(sum_tiles, kind)(picture, 9, used, slopes, at_rest, factor, light, shift)
+        excess = getattr(find_excess, kind)(light[0], light[1], 0.05, shift, shift[::-1].copy(), factor)
+        found.append((light, shift, np.array(excess)))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6 * np.abs(other).max())
+
+
+@needs_compiler
+def test_comparisons_with_a_template_are_the_same_in_c_and_in_numpy() -> None:
+    draw = np.random.default_rng(0)
+    count = 60
+    change = draw.normal(0, 20, (20, 30, 4)).astype(np.float32)
+    change[..., 3] = draw.random((20, 30)) < 0.95
+    away = draw.uniform(-14, 14, (count, 2)).astype(np.float32)
+    light = draw.normal(0, 20, (count, 3)).astype(np.float32)
+    by = draw.normal(size=(count, 3, 5)).astype(np.float32)
+    patches = np.arange(count) // 7
+    planes = np.concatenate([draw.uniform(-0.6, 0.6, (20, 30, 3)), draw.random((20, 30, 1))], axis=2)
+    motion = np.eye(4)
+    motion[:3, 3] = 0.1, -0.2, 0.05
+    motion[:2, :2] = [[0.995, -0.1], [0.1, 0.995]]
+    points = draw.uniform(0, 2, (count, 6))
+    found = []
+    for kind in ("compiled", "plain"):
+        error, sums = np.empty((count, 3), np.float32), np.empty(10)
+        warp = np.array([0.9, 0.2, 15.0, 10.0])
+        visible = getattr(compare_light, kind)(change, warp, 1.1, away, light, by, patches, error, sums)
+        parts = [np.zeros(shape) for shape in ((count, 2), count, (7, 7), 8, 2)]
+        getattr(compare_points, kind)(
+            planes.astype(np.float32), np.zeros(2), np.array([0.08, 0.1]), motion, points,
+            np.arange(count * 18.0).reshape(count, 3, 6), 0.3, *parts,
+        )  # fmt: skip
+        found.append((np.array(visible), error, sums, *parts))
+    assert 0 < found[0][0] < count
+    assert 0 < found[0][-1][0] < count
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6 * np.abs(other).max())
 
 
 @needs_compiler
