@@ -35,7 +35,8 @@ CoreMask = Annotated[NDArray[np.uint8], ArrayPort("core_mask", ("H", "W"), "uint
 """255 where the gel clings to what touches it, inside the contact mask; 0 where that is not known."""
 
 Deviations = Annotated[NDArray[np.float32], ArrayPort("deviations", (2, "h", "w"), "float32", "variances")]
-"""Squared change of each cell of 4 x 4 px, of its light and of its colour alone, in variances of noise."""
+"""Squared change of each cell of 4 x 4 px, of its light and of its colour alone, in variances of noise. On a
+gray camera, the second is that of the light minus its mean nearby."""
 
 Picture = Annotated[NDArray[np.uint8], ArrayPort("annotated", ("H", "W", 3), "uint8", "grey levels, BGR")]
 """The processed frame with the results drawn on it."""

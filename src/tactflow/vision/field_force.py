@@ -125,6 +125,9 @@ class FieldForce:
         """
         cells = self.modes.shape[1] // 2
         if len(moved) != cells:
-            raise ValueError(f"required the displacement of {cells} cells, got {len(moved)}")
+            raise ValueError(
+                f"required the displacement of {cells} cells, got {len(moved)}: calibrate the force again, "
+                "as the grid or the shape of the frame has changed"
+            )
         scores = self.modes @ moved.ravel()
         return np.asarray(polynomial_terms(scores[None])[0] @ self.weights)

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from tactflow.vision.contact.contact_outline import (
+    change_over_maximum,
     contact_level,
     largest_nearby,
-    relative_change,
 )
 
 Float = NDArray[np.float32]
@@ -71,7 +71,7 @@ def found(change: Float, core: NDArray[np.bool_], mixtures: Float = SLOPES) -> N
 
 def relative(change: Float, mixtures: Float = SLOPES) -> tuple[Float, float]:
     """Of a change (h, w, 3)."""
-    return relative_change(np.ascontiguousarray((change @ mixtures.T).transpose(2, 0, 1)))
+    return change_over_maximum(np.ascontiguousarray((change @ mixtures.T).transpose(2, 0, 1)))
 
 
 def hull_of(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

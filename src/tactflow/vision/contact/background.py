@@ -132,7 +132,8 @@ class Derived(NamedTuple):
         squared, local, evidence = deviations
         light = np.copysign(np.sqrt(squared / len(cells)), change[0])
         side = max(round(NEARBY_SHARE * max(light.shape)), 1)
-        local[:] = np.square(light - cv2.blur(light, (side, side))) * self.planes[7]
+        _, factor, _ = self.planes[6:]
+        local[:] = np.square(light - cv2.blur(light, (side, side))) * factor
         np.maximum(squared, local, out=evidence)
         return coefficients, found[0], float(local.max()), float(evidence[before > 0].sum()), found[3]
 

@@ -33,7 +33,7 @@ def contact_evidence(parts: Sequence[Contact], mask: Mask, deviations: Floats32)
     Parameters
     ----------
     parts : the separate regions. mask : (H, W) uint8, non-zero inside them.
-    deviations : (2, h, w) float32, squared deviations of each cell, of its light and of its colour alone.
+    deviations : (2, h, w) float32, `ContactResult.deviations`, of the light and of the colour of each cell.
 
     Returns
     -------

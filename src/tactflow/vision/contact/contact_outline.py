@@ -39,7 +39,7 @@ half-space (Johnson, ch. 4) and 0 on a thin layer; a gel lies between. 0.15 and 
 real outlines within 0.02."""
 
 
-def relative_change(shown: Floats32) -> tuple[Floats32, float]:
+def change_over_maximum(shown: Floats32) -> tuple[Floats32, float]:
     """Size of the slope, or depth, of a gel over its local maximum, (h, w), and its value at the outline of a
     contact.
 
@@ -60,7 +60,7 @@ def contact_level(
 
     Parameters
     ----------
-    change : of `relative_change`, in the window of the contact.
+    change : of `change_over_maximum`, in the window of the contact.
     core : (h / n, w / n) uint8, n whole, 1 where the contact certainly is, else 0.
     border : slope at the outline as a fraction of its local maximum, in (0, 1). Where depth is shown, the
         fraction of the local depth is in proportion.
@@ -76,7 +76,7 @@ def contact_level(
     >>> rows, columns = np.mgrid[:32, :32] - 15.5
     >>> disc = np.clip(8.5 - np.hypot(rows, columns), 0, 1).astype(np.float32)
     >>> core = (disc == 1).astype(np.uint8)
-    >>> change = relative_change(disc[None])
+    >>> change = change_over_maximum(disc[None])
     >>> level = contact_level(change, core)
     >>> bool(abs((level > 0).sum() / np.pi - 8.4**2) < 3)
     True

@@ -11,9 +11,10 @@ of false alarms, and then *where*, by a rule that does not depend on the noise:
    A fainter change of colour is a contact if it is wide, which noise and compression blocks are not. A gray
    camera has no colour; there the light minus its mean nearby takes its place, because the light of lamps
    changes more smoothly than that of contacts.
-5. A contact ends at the noise level, or at a fraction of the strongest recent change, because a released gel
+5. Where lamps have different colours, a change that a loss of light explains is dirt or a shadow (`dirt`).
+6. A contact ends at the noise level, or at a fraction of the strongest recent change, because a released gel
    creeps back. While it fades faster than by creep, it is still being unloaded and has not ended.
-6. The shape of the gel gives the contact region (`heights`, `level_lines`), and the outline is found there at
+7. The shape of the gel gives the contact region (`heights`, `level_lines`), and the outline is found there at
    half resolution (`contact_outline`).
 
 References
@@ -41,9 +42,9 @@ from tactflow.vision.contact.components import MIN_CELLS, contact_cells, wide_ch
 from tactflow.vision.contact.contact_outline import (
     BORDER_SLOPE_FRACTION,
     CORE_SLOPE_FRACTION,
+    change_over_maximum,
     contact_level,
     draw_level,
-    relative_change,
 )
 from tactflow.vision.contact.dirt import attenuated_cells
 from tactflow.vision.contact.heights import HeightModel
@@ -78,8 +79,9 @@ class ContactResult:
     touching : whether any pixel is in contact.
     strength : largest change anywhere, in standard deviations of the untouched gel.
     deviations : (2, h, w) float32, squared changes of each cell that belongs to a contact, of its light and
-        of its colour alone, in variances of the untouched gel; 0 elsewhere. Where all channels change alike
-        both are the same. None without contact.
+        of its colour alone, in variances of the untouched gel; 0 elsewhere. The second is that of the light
+        minus its mean nearby on a gray camera, and the same as the first where all channels of a colour
+        camera change alike. None without contact.
     core : (H, W) uint8, 255 where the gel clings to the object, inside the mask; 0 where that is not known.
         None without contact.
     """
@@ -268,7 +270,7 @@ class ContactDetector:
             else:
                 slopes = heights.slopes[:, rows, columns] * inside
                 window = np.stack([cv2.resize(plane, None, fx=2, fy=2) for plane in slopes])
-            shown = relative_change(window)
+            shown = change_over_maximum(window)
             for border, surely, drawn in zip(self._borders, cores, (mask, inner), strict=True):
                 level = contact_level(shown, surely, border)
                 draw_level(level, CELL_PX * rows.start, CELL_PX * columns.start, drawn)

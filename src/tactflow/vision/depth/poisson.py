@@ -43,7 +43,8 @@ def integrate(
 
     Parameters
     ----------
-    slope : (2, h, w) float32, growth to the right and down; quick where w is a product of 2, 3 and 5.
+    slope : (2, h, w) float32, growth to the right and down, h and w at least 2; quick where w is a product
+        of 2, 3 and 5.
     step : from a pixel to the next one, to the right and down, in the unit of the heights.
     sides : open ones.
 
@@ -118,8 +119,8 @@ def divergence(
     Between two pixels it rises by the mean of their slopes; beyond an open side the slope is that of the
     mirror image, and beyond a side at rest that of the mirror image upside down.
 
-    slope : (2, h, w), growth to the right and down. across, along : steps, see `integrate`. left, ... : see
-    `MIRROR_IMAGE`. total : (h, w), filled.
+    slope : (2, h, w), growth to the right and down; h and w at least 2. across, along : steps, see
+    `integrate`. left, ... : see `MIRROR_IMAGE`. total : (h, w), filled.
     """
     x, y = slope[0] * (across / 2), slope[1] * (along / 2)
     total[1:-1] = y[2:] - y[:-2]

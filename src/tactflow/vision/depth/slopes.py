@@ -125,11 +125,10 @@ def slopes_of_colour(
     halvings: int,
     most: float,
 ) -> None:
-    """Add the slopes of the pixels near the contact to 0.
+    """Fill `slope`, (2, h, w) of 0, with the slopes of the pixels near the contact.
 
-    change, x, y, near, steepest : of `SlopeModel.slopes`. coefficients : (2, 19, 6). slope : (2, h, w), all
-    0. band : rows per row of `near`. halvings : of the search for
-    `steepest`. most : largest horizontal part of a unit normal.
+    change, x, y, near, steepest : of `SlopeModel.slopes`. coefficients : (2, 19, 6). band : rows per row of
+    `near`. halvings : of the search for `steepest`. most : largest horizontal part of a unit normal.
     """
     dtype = coefficients.dtype
     for row in range(len(y)):
@@ -138,9 +137,7 @@ def slopes_of_colour(
             continue
         part = slice(columns[0], columns[-1] + 1)
         terms = colour_terms(change[row, part]).astype(dtype)
-        place = np.array([np.ones_like(x[part]), x[part], np.full_like(x[part], y[row]), x[part] ** 2,
-                          x[part] * y[row], np.full_like(x[part], y[row] ** 2)], dtype)  # fmt: skip
-        parts = terms * (coefficients @ place)
+        parts = terms * (coefficients @ _place_products(x[part], np.full_like(x[part], y[row])))
         # The parts of the normals of the first degree, of the first two, and of all.
         first, second, normal = parts[:, :3].sum(axis=1), parts[:, :9].sum(axis=1), parts.sum(axis=1)
         steep = (normal**2).sum(axis=0) > steepest**2
@@ -199,5 +196,9 @@ def place_terms(size: tuple[int, int]) -> Floats32:
     >>> place_terms((3, 2))[1].tolist()
     [[-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]]
     """
-    x, y = np.meshgrid(*coordinates(size))
+    return _place_products(*np.meshgrid(*coordinates(size)))
+
+
+def _place_products(x: Floats32, y: Floats32) -> Floats32:
+    """(6, ...): 1, x, y, x^2, x y and y^2 of coordinates (...)."""
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])

@@ -40,7 +40,6 @@ STEEP_FRACTION: Final = 0.95
 """A slope is steep above this fraction of the steepest of the calibration, by the horizontal part of the
 normal."""
 
-
 MIRRORED_RATIO: Final = 1.2
 """Share of the slopes that no surface explains, over that after left and right are exchanged, above which a
 picture is mirrored. 122 presses of balls and an edge on five Minis, and mugs in a gripper, have at most 0.7,

@@ -20,8 +20,6 @@ CELL_PX: Final = 8
 REST_CHANGE_RATIO: Final = 0.05
 """Change of the light at which the gel counts as at rest, over that at the rim of the contact, both less that
 far away: what lies beyond adds a hundredth to the depth."""
-
-
 MIN_LIT_LEVEL: Final = 0.5
 """Least `level` of a cell that shows how much the light has changed: its light at rest is then at least
 `LIGHT_OFFSET_GREY` of `surface`, so that grey levels of noise are a small part of it."""
