@@ -82,7 +82,3 @@ def test_only_a_loss_of_light_in_proportion_is_dirt(change: tuple[int, ...], is_
 
 def test_a_gel_without_light_has_no_colours() -> None:
     assert light_directions(np.ones((3, 4, 5), np.float32), np.zeros((4, 5), np.bool_)) is None
-
-
-def test_a_picture_without_gel_has_no_colours() -> None:
-    assert light_directions(np.ones((3, 4, 4), np.float32), np.zeros((4, 4), np.bool_)) is None

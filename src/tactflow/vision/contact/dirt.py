@@ -39,8 +39,6 @@ def light_directions(light: Floats32, gel: Flags | None) -> Floats32 | None:
     if gel is not None and not gel.any():
         return None
     colours = light / np.maximum(np.linalg.norm(light, axis=0), np.float32(1e-6))
-    if gel is not None and not gel.any():
-        return None
     mean = (colours if gel is None else colours[:, gel]).reshape(3, -1).mean(axis=1)
     coloured = 1 - float(mean @ mean) >= MIN_COLOUR_SPREAD**2
     return np.asarray(colours, np.float32) if coloured else None
