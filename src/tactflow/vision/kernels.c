@@ -20,8 +20,8 @@
 #include "loops/flow.h"
 #include "loops/depth.h"
 
-/* arguments : one word for each. A letter is the type of an array's elements (u1 ? i2 i4 i8 f4 f8), the digit after
- * it the number of dimensions, and `!` that it is written to; `n` is a whole number, `x` a real one.
+/* arguments : one word for each. A letter is the type of an array's elements as in the module struct (B ? h i q f d),
+ * the digit after it the number of dimensions, and `!` that it is written to; `n` is a whole number, `x` a real one.
  * result : what `out` becomes, `-` nothing, `?` a bool, `n` an int, `2` and `4` a tuple of as many floats. */
 typedef struct {
     const char *name, *arguments;

@@ -13,7 +13,7 @@ import numpy as np
 
 from tactflow.vision.arrays import Bytes, Flags, Floats32
 from tactflow.vision.compiled import kernel
-from tactflow.vision.contact.illumination import SATURATION_GREY, positions, under_illumination
+from tactflow.vision.contact.illumination import MAX_GREY, positions, under_illumination
 
 BLUR_SIGMA_PX: Final = 0.8
 """Standard deviation of the smoothing of changes, pixels of the window. Chosen by hand."""
@@ -58,7 +58,7 @@ def weigh_change(
     gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
     down, across = (positions(count) for count in cells.shape[1:])
     light = mean * (gain + slope_y * down[:, None] + slope_x * across) + offset
-    shift = np.maximum(cells - mean - light, cells - SATURATION_GREY)
+    shift = np.maximum(cells - mean - light, cells - MAX_GREY)
     change[:] = shift * scale
     deviation = shift * weight
     squared, colour, evidence = deviations

@@ -25,7 +25,7 @@ RIDGE_PENALTIES: Final = (0.0, 0.05, 0.05, 0.1)
 """Ridge penalties of gain, slopes and offset, relative to the data: on a gel of uniform brightness an offset
 is nearly the same as a gain, and slopes follow wide, faint contacts. Chosen on wedge_grasp, where 0.01 for
 the slopes misses 8 of 324 frames more than 0.1, and seu_a, whose light smaller values follow better."""
-SATURATION_GREY: Final = np.float32(255)
+MAX_GREY: Final = np.float32(255)
 """Grey level at which a camera saturates."""
 MIN_BLOCK_BRIGHTNESS: Final = 0.25
 """Minimum brightness of a block, relative to the mean of its channel, to take part in the initial estimate.
@@ -117,7 +117,7 @@ def under_illumination(untouched: Floats32, coefficients: Floats32) -> Floats32:
     height, width = untouched.shape[1:]
     gain, slope_x, slope_y, offset = coefficients.T[:, :, None, None]
     gains = 1 + gain + slope_y * positions(height)[:, None] + slope_x * positions(width)
-    return np.asarray(np.minimum(untouched * gains + offset, SATURATION_GREY), np.float32)
+    return np.asarray(np.minimum(untouched * gains + offset, MAX_GREY), np.float32)
 
 
 @lru_cache(maxsize=16)

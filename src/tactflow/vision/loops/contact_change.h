@@ -3,7 +3,7 @@
 
 /* ---- contact/background_kernels.py ------------------------------------------------------------------------- */
 
-#define SATURATION_GREY 255.0f
+#define MAX_GREY 255.0f
 
 /* Position of a pixel along a line, as `positions`. */
 INLINE float position(i64 pixel, i64 count)
@@ -43,7 +43,7 @@ LOOP weigh_change(const Arg *a, double *out)
                     total[x] = along[x] = 0;
             for (i64 x = 0; x < wide; x++) {
                 const float light = usual[x] * (gain + slope * across[x]) + offset;
-                const float more = line[x] - usual[x] - light, least = line[x] - SATURATION_GREY;
+                const float more = line[x] - usual[x] - light, least = line[x] - MAX_GREY;
                 const float shift = more > least ? more : least, deviation = shift * part[x];
                 signed_[x] = shift * unit[x];
                 total[x] += deviation * deviation;
@@ -107,7 +107,7 @@ LOOP window_change(const Arg *a, double *out)
             const float place = position(top + row, a[0].shape[0]);
             for (i64 i = 0; i < 3 * wide; i++) {
                 const float value = values[i], light = usual[i] * (gain[i] + slope[i] * place) + offset[i];
-                const float more = value - usual[i] - light, least = value - SATURATION_GREY;
+                const float more = value - usual[i] - light, least = value - MAX_GREY;
                 line[i] = (more > least ? more : least) * unit[i];
             }
             for (i64 k = 0; k < count; k++) {
@@ -410,13 +410,15 @@ LOOP largest_deviations(const Arg *a, double *out)
     const double *hull = a[2].data;
     const i64 wide = a[0].shape[2], stride = a[1].shape[1], count = a[2].shape[0], side = a[3].whole;
     double left = INFINITY, top = INFINITY, right = 0, bottom = 0;
+    if (!count)
+        return 0;
     for (i64 i = 0; i < count; i++) {
         left = MIN(left, hull[2 * i]);
         right = MAX(right, hull[2 * i]);
         top = MIN(top, hull[2 * i + 1]);
         bottom = MAX(bottom, hull[2 * i + 1]);
     }
-    for (i64 y = side * (i64)ceil(top / (double)side); count && y <= (i64)bottom; y += side)
+    for (i64 y = side * (i64)ceil(top / (double)side); y <= (i64)bottom; y += side)
         for (i64 x = side * (i64)ceil(left / (double)side); x <= (i64)right; x += side) {
             const i64 cell = y / side * wide + x / side;
             if (!mask[y * stride + x] || (light[cell] <= out[0] && colour[cell] <= out[1]))
