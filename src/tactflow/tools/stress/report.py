@@ -241,7 +241,7 @@ def save_picture(report: Report, path: Path, subject: str) -> None:
         plain_numbers(grid[0])
         for axes in grid[len(panels) :]:
             axes.set_visible(False)
-        grid[0].set_ylabel("error, relative to the undisturbed scene")
+        figure.supylabel("error, relative to the undisturbed scene", fontsize="medium")
         handles, labels = grid[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(PANELS))
 
