@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tactflow.engine.frame import Frame
 from tactflow.stages.tracker import Tracker
+from tactflow.vision.markers.detection import NoMarkersError
 from tactflow.vision.types import Markers, MarkerStatus
 from tests.vision.dots import grid, render
 
@@ -50,6 +51,25 @@ def test_several_reference_frames_are_averaged_and_keep_the_index_of_every_marke
         size[count] = np.sqrt(np.mean((mean - [3, 1]) ** 2))
     # Without noise in the frames the ratio would be 1 / sqrt(8).
     assert size[8] < 0.8 * size[1]
+
+
+def test_a_later_reference_without_dots_leaves_the_earlier_ones(caplog: pytest.LogCaptureFixture) -> None:
+    stage, covered = Tracker(Tracker.Params()), np.full_like(picture((0, 0)), 120)
+    feed(stage, picture((0, 0)), 0)
+    stage.reset()
+    lost = stage.process(covered, Frame("test", 1, 1 / 60, covered, reference=True, epoch=1))
+    assert (lost.status != MarkerStatus.TRACKED).all()
+    assert "frame 1: the new reference shows no dots" in caplog.text
+    markers = feed(stage, picture((2, 1), seed=2), 2)
+    np.testing.assert_allclose(markers.displacement, np.tile([2.0, 1.0], (36, 1)), atol=0.08)
+
+
+def test_a_first_reference_without_dots_is_refused() -> None:
+    stage, covered = Tracker(Tracker.Params()), np.full_like(picture((0, 0)), 120)
+    feed(stage, picture((0, 0)), 0)
+    stage.reset()
+    with pytest.raises(NoMarkersError):
+        feed(stage, covered, 0, reference=True)
 
 
 def test_reset_takes_a_new_reference() -> None:
