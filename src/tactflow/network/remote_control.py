@@ -46,7 +46,7 @@ class RemoteControl(Connection):
     ...         print(run.take_reference()["message"])
     ...     except TimeoutError as error:
     ...         print(error)
-    no answer from tcp://127.0.0.1:5557 within 0.1 s; is tactflow running with sinks.zmq.control set to it?
+    no answer from tcp://127.0.0.1:5557 within 0.1 s; does tactflow run, with sinks.zmq.control=tcp://127.0.0.1:5557?
     """
 
     def __init__(
@@ -96,8 +96,8 @@ class RemoteControl(Connection):
                 return self._checked(self._socket.recv(zmq.NOBLOCK))
         keys_hint = ", and are these its keys" if self._has_keys else ""
         raise TimeoutError(
-            f"no answer from {self.endpoint} within {self.timeout:g} s; is tactflow running with "
-            f"sinks.zmq.control set to it{keys_hint}?"
+            f"no answer from {self.endpoint} within {self.timeout:g} s; does tactflow run, with "
+            f"sinks.zmq.control={self.endpoint}{keys_hint}?"
         )
 
     def _checked(self, received: bytes) -> Answer:
