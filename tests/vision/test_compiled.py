@@ -74,7 +74,7 @@ def test_centroids_are_the_same_in_c_and_in_numpy(seed: int) -> None:
     # Some lie beyond the border.
     fast = random.uniform(-2, 42, (25, 2))
     slow = fast.copy()
-    arguments = gray, radii, 1.4 * radii, 1.9 * radii + 1.5, 1.6 * radii + 0.5
+    arguments = gray, radii, 1.4 * radii, 1.9 * radii + 1.5, 1.6 * radii + 0.5, 1e-3
     move_to_centroids.compiled(*arguments, fast)
     move_to_centroids.plain(*arguments, slow)
     np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9)

@@ -50,7 +50,7 @@ static const Loop LOOPS[] = {
     {"row_ends", "B2 i2!", 'n', row_ends},
     {"convex_hull", "i2 i2!", '2', convex_hull},
     {"sum_harmonics", "i2 d1 x n d2!", '-', sum_harmonics},
-    {"move_to_centroids", "f2 d1 d1 d1 d1 d2!", '-', move_to_centroids},
+    {"move_to_centroids", "f2 d1 d1 d1 d1 x d2!", '-', move_to_centroids},
     {"cover_spots", "B3 n n B2!", '-', cover_spots},
     {"fill_masked", "B2! B2 B2 q1 q1 n x x x", '-', fill_masked},
     {"weigh_motion", "d2 f1 ?1 q2 d2 x d1! n x x", '?', weigh_motion},

@@ -144,6 +144,7 @@ class RestTest:
         energy = _near(np.square(slopes).reshape(tiles).sum(axis=(2, 4)))
         energy += np.float32(ROUNDING_VARIANCE * self._pixels)
         self._px_per_edge = np.asarray(1 / np.sqrt(energy), np.float32)
+        self._px_per_step = self._px_per_edge / np.float32(SLOPE_STEPS_PER_GREY)
         self._at_rest: Indices = (self._slopes * green[used].astype(np.int64)).reshape(tiles).sum(axis=(2, 4))
         self._z = np.float32(-NormalDist().inv_cdf(false_alarms / (4 * rows * columns)))
         self._light = _LightTest(self._sums(frame)[0], repeatability, tint)
@@ -207,7 +208,7 @@ class RestTest:
         shift = np.empty_like(self._px_per_edge)
         picture = np.ascontiguousarray(frame).reshape(len(frame), -1)
         left = 3 * self._window[1].start
-        sum_tiles(picture, left, self._used, self._slopes, self._at_rest, self._px_per_edge, light, shift)
+        sum_tiles(picture, left, self._used, self._slopes, self._at_rest, self._px_per_step, light, shift)
         return light, shift
 
     def _learn(self, step: Floats32) -> None:
@@ -285,16 +286,16 @@ def sum_tiles(
     used: Indices,
     slopes: NDArray[np.int16],
     at_rest: Indices,
-    px_per_edge: Floats32,
+    factor: Floats32,
     light: Floats32,
     shift: Floats32,
 ) -> None:
     """Fill `light`, the means of blue, green and red over tiles, and `shift`, that of the edges near them.
 
     picture : (H, 3 W). left : its first byte in a line. used : (n * rows,), its lines that are read; n < 258.
-    slopes : (2, n * rows, m * columns), of green along x and y, `SLOPE_STEPS_PER_GREY` a level per px.
+    slopes : (2, n * rows, m * columns), of green along x and y, in any unit.
     at_rest : (2, rows, columns), the sums over tiles of green of the untouched gel times its slopes.
-    px_per_edge : (2, rows, columns), factor of the means over `WINDOW_TILES` tiles a side of the same sums of
+    factor : (2, rows, columns), of the means over `WINDOW_TILES` tiles a side of the same sums of
     the picture, less `at_rest`. light : (3, rows, columns). shift : (2, rows, columns).
     """
     _, rows, columns = light.shape
@@ -302,7 +303,7 @@ def sum_tiles(
     pictures = picture[used, left : left + 3 * slopes.shape[2]].reshape(*tiles, 3)
     light[:] = pictures.mean(axis=(1, 3)).transpose(2, 0, 1)
     moved = (slopes.reshape(2, *tiles) * pictures[..., 1].astype(np.int64)).sum(axis=(2, 4)) - at_rest
-    shift[:] = _near(moved.astype(np.float32)) * px_per_edge / SLOPE_STEPS_PER_GREY
+    shift[:] = _near(moved.astype(np.float32)) * factor
 
 
 @kernel

@@ -87,13 +87,11 @@ class Derived(NamedTuple):
         each; one over the squared length of the weighted mean; how much more a change of colour counts than
         one of brightness; and the factor of `Change.cells`, one over the standard deviation.
     gray : whether all channels are the same.
-    colours : from `light_directions`.
     """
 
     illumination: IlluminationModel
     planes: Floats32
     gray: bool
-    colours: Floats32 | None
 
     @classmethod
     def of(
@@ -114,8 +112,7 @@ class Derived(NamedTuple):
         if gel is not None:
             weight, scale = weight * gel, scale * gel
         planes = np.concatenate([mean, weight, [1 / length**2, factor, scale]])
-        gray, colours = bool((mean == mean[0]).all()), light_directions(mean, gel)
-        return cls(illumination, np.asarray(planes, np.float32), gray, colours)
+        return cls(illumination, np.asarray(planes, np.float32), bool((mean == mean[0]).all()))
 
     def weigh(
         self, cells: Floats32, before: Floats32, change: Floats32, deviations: Floats32
@@ -150,6 +147,10 @@ class BackgroundModel:
     valid : (H, W) uint8, 0 where there is no gel. Cells there never differ, and neither do cells where the
         gel is black. None: all cells show gel.
 
+    Attributes
+    ----------
+    colours : of the light of each cell, see `light_directions`.
+
     Examples
     --------
     >>> import numpy as np
@@ -179,11 +180,6 @@ class BackgroundModel:
     def gray(self) -> bool:
         """Whether all channels are the same."""
         return self._derived.gray
-
-    @property
-    def colours(self) -> Floats32 | None:
-        """Colours of the light of each cell, see `light_directions`."""
-        return self._derived.colours
 
     def add(self, image: Bytes) -> None:
         """Learn from one more frame of the same size; more frames estimate the noise better."""
@@ -234,6 +230,7 @@ class BackgroundModel:
         steady = noise * (1 + 1 / count) + (self._shift / CELL_PX * _steepness(mean)) ** 2
         self._derived = Derived.of(mean, steady, self._repeatability, self._tint, self._gel)
         self._untouched = self._compared_with()
+        self.colours = light_directions(mean, self._gel)
 
     def _compared_with(self) -> Floats32:
         """(2, 2 h, 6 w), interleaved: mean of the untouched gel, and one over its standard deviation.

@@ -440,21 +440,6 @@ LOOP largest_deviations(const Arg *a, double *out)
 
 /* ---- contact/illumination.py ------------------------------------------------------------------------------- */
 
-/* The value that is larger than half of them. */
-INLINE float upper_median(const float *restrict values, i64 count)
-{
-    for (i64 i = 0; i < count; i++) {
-        i32 less = 0, equal = 0;
-        for (i64 k = 0; k < count; k++) {
-            less += values[k] < values[i];
-            equal += values[k] == values[i];
-        }
-        if (less <= count / 2 && count / 2 < less + equal)
-            return values[i];
-    }
-    return NAN;
-}
-
 LOOP fit_light(const Arg *a, double *out)
 {
     const float *cells = a[0].data, *row_weights = a[1].data, *column_weights = a[2].data, *blocks = a[3].data;
@@ -465,11 +450,12 @@ LOOP fit_light(const Arg *a, double *out)
     const float saturated = (float)a[9].number, least_step = (float)a[11].number;
     const float rejections[2] = {INFINITY, (float)a[12].number};
     const float *reference = blocks, *per_brightness = blocks + 3 * n, *usual_limit = blocks + 6 * n;
-    float *restrict line = malloc((wide + 7 * n) * sizeof(float));
+    double *ratios = malloc(n * sizeof(double) + (wide + 6 * n) * sizeof(float));
     (void)out;
-    if (!line)
+    if (!ratios)
         return OUT_OF_MEMORY;
-    float *ratios = line + wide, *excess = ratios + n, *limit = excess + 3 * n;
+    float *restrict line = (float *)(ratios + n);
+    float *excess = line + wide, *limit = excess + 3 * n;
     for (int c = 0; c < 3; c++) {
         i64 count = 0;
         float most = 0;
@@ -490,13 +476,14 @@ LOOP fit_light(const Arg *a, double *out)
                 excess[at] = mean - reference[at];
                 limit[at] = mean < saturated ? usual_limit[at] : 0;
                 if (per_brightness[at] > 0) {
-                    ratios[count] = excess[at] * per_brightness[at];
-                    most = MAX(most, ratios[count]);
+                    const float ratio = excess[at] * per_brightness[at];
+                    ratios[count] = ratio;
+                    most = MAX(most, ratio);
                     count += limit[at] > 0;
                 }
             }
         }
-        coefficients[4 * c] = count ? upper_median(ratios, count) : most;
+        coefficients[4 * c] = count ? (float)upper_median_of(ratios, count) : most;
     }
     for (int pass = 0; pass < 2; pass++)
         for (i64 turn = 0; turn < most_steps; turn++) {
@@ -534,6 +521,6 @@ LOOP fit_light(const Arg *a, double *out)
     for (int c = 0; c < 3; c++)
         for (int k = 0; k < 3; k++)
             coefficients[4 * c + k] /= center[c];
-    free(line);
+    free(ratios);
     return 0;
 }

@@ -63,6 +63,46 @@ typedef struct {
     ((cell)[-(stride) - 1] with (cell)[-(stride)] with (cell)[1 - (stride)] with (cell)[-1] with (cell)[0] with       \
      (cell)[1] with (cell)[(stride) - 1] with (cell)[stride] with (cell)[(stride) + 1])
 
+/* The upper one of the middle values, which are reordered (Hoare's selection). */
+INLINE double upper_median_of(double *values, i64 count)
+{
+    const i64 upper = count / 2;
+    i64 first = 0, last = count - 1;
+    while (first < last) {
+        const double middle = values[upper];
+        i64 i = first, j = last;
+        while (i <= j) {
+            while (values[i] < middle)
+                i++;
+            while (values[j] > middle)
+                j--;
+            if (i <= j) {
+                const double kept = values[i];
+                values[i++] = values[j];
+                values[j--] = kept;
+            }
+        }
+        if (j < upper)
+            first = i;
+        if (i > upper)
+            last = j;
+    }
+    return values[upper];
+}
+
+/* The median of values, which are reordered. */
+INLINE double median_of(double *values, i64 count)
+{
+    const i64 upper = count / 2;
+    const double middle = upper_median_of(values, count);
+    if (count % 2)
+        return middle;
+    double below = values[0];
+    for (i64 k = 1; k < upper; k++)
+        below = MAX(below, values[k]);
+    return (below + middle) / 2;
+}
+
 /* Neighbouring pixels of a row, from `first` up to `end`, all of which are set or not. At the root of its component,
  * whether that has been `found`. */
 typedef struct {

@@ -3,11 +3,9 @@
 
 /* ---- markers/detection.py ---------------------------------------------------------------------------------- */
 
-#define MIN_DARKNESS 1e-3
-
 /* The step from a point to the centroid of what is darker than the plane through the ring around it. */
 INLINE void step_to_centroid(const float *gray, i64 high, i64 wide, i64 reach, double inner, double outer,
-                             double window, const double *center, double *step)
+                             double window, double least, const double *center, double *step)
 {
     const i64 column = MAX(MIN((i64)rint(center[0]), wide - 1), 0), row = MAX(MIN((i64)rint(center[1]), high - 1), 0);
     double n = 0, sx = 0, sy = 0, xx = 0, xy = 0, yy = 0, g = 0, gx = 0, gy = 0;
@@ -38,14 +36,14 @@ INLINE void step_to_centroid(const float *gray, i64 high, i64 wide, i64 reach, d
             total += darkness, to_x += darkness * x, to_y += darkness * y;
         }
     }
-    step[0] = total > MIN_DARKNESS ? to_x / total : 0;
-    step[1] = total > MIN_DARKNESS ? to_y / total : 0;
+    step[0] = total > least ? to_x / total : 0;
+    step[1] = total > least ? to_y / total : 0;
 }
 
 LOOP move_to_centroids(const Arg *a, double *out)
 {
     const double *radii = a[1].data, *inner = a[2].data, *outer = a[3].data, *window = a[4].data;
-    double *center = a[5].data, largest = 0;
+    double *center = a[6].data, largest = 0;
     (void)out;
     for (i64 i = 0; i < a[1].shape[0]; i++)
         largest = MAX(largest, outer[i]);
@@ -53,7 +51,7 @@ LOOP move_to_centroids(const Arg *a, double *out)
         for (int turn = 0; turn < 4; turn++) {
             double step[2];
             step_to_centroid(a[0].data, a[0].shape[0], a[0].shape[1], (i64)ceil(largest), inner[i], outer[i],
-                             window[i], center, step);
+                             window[i], a[5].number, center, step);
             for (int axis = 0; axis < 2; axis++)
                 center[axis] += MAX(MIN(step[axis], radii[i]), -radii[i]);
         }

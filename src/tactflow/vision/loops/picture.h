@@ -94,14 +94,13 @@ LOOP smooth_cells(const Arg *a, double *out)
     return 0;
 }
 
-#define SLOPE_STEPS_PER_GREY 8
 
 LOOP sum_tiles(const Arg *a, double *out)
 {
     const u8 *picture = a[0].data;
     const i64 left = a[1].whole, *used = a[2].data, *at_rest = a[4].data, stride = a[0].shape[1];
     const i16 *slopes = a[3].data;
-    const float *px_per_edge = a[5].data;
+    const float *factors = a[5].data;
     float *light = a[6].data, *shift = a[7].data;
     const i64 rows = a[6].shape[1], columns = a[6].shape[2], high = a[2].shape[0], width = a[3].shape[2];
     const i64 thick = high / rows, wide = width / columns, tiles = rows * columns;
@@ -154,12 +153,12 @@ LOOP sum_tiles(const Arg *a, double *out)
     }
     for (i64 row = 0; row < 2 * rows; row++) {
         const float *restrict sums = moved + row / rows * plane + row % rows * padded;
-        const float *restrict factor = px_per_edge + row * columns;
+        const float *restrict factor = factors + row * columns;
         for (i64 x = 0; x < columns; x++) {
             float total = 0;
             for (int y = 0; y < 3; y++)
                 total += sums[y * padded + x] + sums[y * padded + x + 1] + sums[y * padded + x + 2];
-            shift[row * columns + x] = total * factor[x] / (9 * SLOPE_STEPS_PER_GREY);
+            shift[row * columns + x] = total * factor[x] / 9;
         }
     }
     free(moved);

@@ -301,18 +301,26 @@ def _centroids(gray: Floats32, centers: Floats, radii: Floats) -> Floats:
     """
     result = np.array(centers, np.float64)
     inner, outer = BACKGROUND_RING_RADII[0] * radii, BACKGROUND_RING_RADII[1] * radii + 1.5
-    move_to_centroids(gray, radii, inner, outer, CENTROID_WINDOW_RADII * radii + 0.5, result)
+    window = CENTROID_WINDOW_RADII * radii + 0.5
+    move_to_centroids(gray, radii, inner, outer, window, MIN_DARKNESS, result)
     return result
 
 
 @kernel
 def move_to_centroids(
-    gray: Floats32, radii: Floats, inner: Floats, outer: Floats, window: Floats, centers: Floats
+    gray: Floats32,
+    radii: Floats,
+    inner: Floats,
+    outer: Floats,
+    window: Floats,
+    least: float,
+    centers: Floats,
 ) -> None:
     """Move points four times to the centroid of what is darker than the background around them.
 
     gray : (H, W) float32. radii : (N,), px, the largest step along an axis. inner, outer : (N,), px, of the
-    ring of the background. window : (N,), px, radius of what is counted, less than `outer`. centers : (N, 2),
+    ring of the background. window : (N,), px, radius of what is counted, less than `outer`. least : sum of
+    the darkness that has a centroid. centers : (N, 2),
     px, changed in place.
     """
     reach = int(np.ceil(outer.max(initial=0)))
@@ -335,7 +343,7 @@ def move_to_centroids(
         darkness = np.maximum((basis.transpose(0, 2, 1) @ plane)[:, :, 0] - patches, 0)
         darkness *= np.clip(window[:, None] - distance, 0, 1)
         total = darkness.sum(axis=1)
-        good = total > MIN_DARKNESS
+        good = total > least
         move = np.zeros_like(centers)
         move[good, 0] = (darkness * x).sum(axis=1)[good] / total[good]
         move[good, 1] = (darkness * y).sum(axis=1)[good] / total[good]
