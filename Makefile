@@ -65,12 +65,15 @@ types-%: $(VENV)/.installed-test
 $(VENV)/bin/python:
 	python3 -m venv $(VENV)
 
-$(VENV)/.installed: pyproject.toml setup.py requirements.lock | $(VENV)/bin/python
+# Compiled by installing.
+LOOPS := $(wildcard src/tactflow/vision/*.c src/tactflow/vision/loops/*.h)
+
+$(VENV)/.installed: pyproject.toml setup.py requirements.lock $(LOOPS) | $(VENV)/bin/python
 	$(PY) $(LOCKED) run
 	$(PY) $(PIP) $(ITSELF)
 	@touch $@
 
-$(VENV)/.installed-test: pyproject.toml setup.py requirements.lock | $(VENV)/bin/python
+$(VENV)/.installed-test: pyproject.toml setup.py requirements.lock $(LOOPS) | $(VENV)/bin/python
 	$(PY) $(LOCKED) test
 	$(PY) $(PIP) $(ITSELF)
 	@touch $@ $(VENV)/.installed

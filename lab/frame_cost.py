@@ -156,13 +156,20 @@ def measure_recording(
     return {name: samples[name] for name in trees}
 
 
+def finish(tree: Path, *words: str) -> None:
+    """Run Python in a checkout; ends this program if it fails, with its last words."""
+    ended = subprocess.run(python(tree, *words), cwd=tree, capture_output=True, text=True, check=False)
+    if ended.returncode:
+        sys.exit(f"{tree}: python {shlex.join(words)}: {ended.stderr.strip()}")
+
+
 def measure_start(trees: dict[str, Path]) -> Samples:
     """Wall time of the commands of `START_COMMANDS`, ms."""
     samples: Samples = {name: [{}] for name in trees}
     for name, tree in trees.items():
         for title, arguments in START_COMMANDS.items():
             began = time.perf_counter()
-            subprocess.run(python(tree, *shlex.split(arguments)), cwd=tree, capture_output=True, check=True)
+            finish(tree, *shlex.split(arguments))
             samples[name][0][title] = 1e3 * (time.perf_counter() - began)
     return samples
 
@@ -227,20 +234,21 @@ def main() -> None:
     trees = {"old": args.against.resolve()} if args.against else {}
     trees["new"] = ROOT
     for tree in trees.values():
-        subprocess.run(python(tree, "-m", "tactflow", "warmup"), cwd=tree, capture_output=True, check=True)
+        finish(tree, "-m", "tactflow", "warmup")
     what = "mean, ms" if args.grasps else "median, ms; p99 / p50"
     print(f"{what:<32}" + "".join(f"{name:>10}{'':>7}" for name in trees) + "   ratio")
     if args.grasps is not None:
         for name, pipeline, pattern, every, settings in GRASPS:
             recordings = sorted(args.grasps.glob(pattern))[::every]
+            if not recordings:
+                sys.exit(f"--grasps: no {pattern} in {args.grasps}")
             print_means(name, [measure_recording(trees, pipeline, path, settings) for path in recordings])
         return
     with tempfile.TemporaryDirectory() as folder:
         for scene in args.scene or SCENES:
             recording = Path(folder) / f"{scene}.npy".replace("?", "-")
             options = f"{'&' if '?' in scene else '?'}frames={SCENE_FRAMES}"
-            command = ("sim", f"{scene}{options}", "--out", recording)
-            subprocess.run(python(ROOT, "-m", "tactflow", *command), capture_output=True, check=True)
+            finish(ROOT, "-m", "tactflow", "sim", f"{scene}{options}", "--out", str(recording))
             turns = [measure_recording(trees, args.pipeline, recording) for _ in range(args.turns)]
             print_rows(f"{scene}, ", turns)
     print_rows("", [measure_start(trees) for _ in range(args.turns)])
